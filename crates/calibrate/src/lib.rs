@@ -1,0 +1,1 @@
+//! Parameter estimation by multiple shooting and output error, with covariance.

@@ -1,0 +1,2 @@
+//! The `greybox` command.
+fn main() {}

@@ -1,0 +1,1 @@
+//! Finds the physics a simulation leaves out.

@@ -1,0 +1,131 @@
+//! The model as data: names, values, units and equations, everything in SI.
+
+use crate::expr::Expr;
+use crate::units::Unit;
+
+/// A mechanistic model: ordinary differential equations as a textbook writes them.
+///
+/// All numbers are SI; [`Unit`] keeps how the user wrote the unit and the factor to SI.
+/// Names are unique over inputs, states and parameters.
+#[derive(Debug, Clone)]
+pub struct Model {
+    /// Free text.
+    pub name: String,
+    /// Exogenous signals, in the order of the file.
+    pub inputs: Vec<Input>,
+    /// Generalised coordinates and other states, in the order of the file.
+    pub states: Vec<State>,
+    /// Constants, in the order of the file.
+    pub parameters: Vec<Parameter>,
+    /// As many equations as states.
+    pub equations: Vec<Equation>,
+    /// What the recording's channels measure: for each measured state its own channel, then the
+    /// explicit `[measurements]`.
+    pub measurements: Vec<Measurement>,
+}
+
+/// What a digital or sampled input does between two samples.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, Default)]
+pub enum Hold {
+    /// The sample's value is kept until the next sample (a digital-to-analogue converter).
+    Zero,
+    /// Straight line between samples.
+    #[default]
+    Linear,
+    /// The band-limited signal through the samples (sinc interpolation).
+    BandLimited,
+}
+
+/// An exogenous signal.
+#[derive(Debug, Clone)]
+pub struct Input {
+    /// Name in the equations.
+    pub name: String,
+    /// Channel of the recording.
+    pub channel: String,
+    /// Unit of the signal in the equations.
+    pub unit: Unit,
+    /// Behaviour between samples.
+    pub hold: Hold,
+}
+
+/// A coordinate (or any other state) with its time derivatives up to `order - 1`.
+#[derive(Debug, Clone)]
+pub struct State {
+    /// Name in the equations.
+    pub name: String,
+    /// Unit of the undifferentiated state.
+    pub unit: Unit,
+    /// Highest number of primes in the equations (≥ 1).
+    pub order: usize,
+    /// Channel that measures it; `None` for `measured = false`.
+    pub channel: Option<String>,
+    /// Given start values [q, q', …] in SI; those missing are estimated from the recording.
+    pub initial: Vec<f64>,
+}
+
+/// A constant of the model.
+#[derive(Debug, Clone)]
+pub struct Parameter {
+    /// Name in the equations.
+    pub name: String,
+    /// Value in SI.
+    pub value: f64,
+    /// Unit as written; a parameter without `unit` gets the one its equation implies.
+    pub unit: Unit,
+    /// Prior 1-sigma in SI, if stated.
+    pub std: Option<f64>,
+    /// Known exactly: calibration never moves it.
+    pub fixed: bool,
+}
+
+/// `lhs = rhs`
+#[derive(Debug, Clone)]
+pub struct Equation {
+    /// Name in the file.
+    pub name: String,
+    /// Left side.
+    pub lhs: Expr,
+    /// Right side.
+    pub rhs: Expr,
+}
+
+impl Equation {
+    /// `lhs - rhs`, which is zero along solutions.
+    pub fn residual(&self) -> Expr {
+        if self.rhs == Expr::Num(0.0) { self.lhs.clone() } else { self.lhs.clone() - self.rhs.clone() }
+    }
+}
+
+/// A channel of the recording as an expression of states, inputs and parameters.
+#[derive(Debug, Clone)]
+pub struct Measurement {
+    /// The recording's channel.
+    pub channel: String,
+    /// What it measures.
+    pub expr: Expr,
+    /// Unit of the expression (in which results for this channel are printed).
+    pub unit: Unit,
+}
+
+impl Model {
+    /// Index of the state called `name`.
+    pub fn state(&self, name: &str) -> Option<usize> {
+        self.states.iter().position(|s| s.name == name)
+    }
+
+    /// Index of the input called `name`.
+    pub fn input(&self, name: &str) -> Option<usize> {
+        self.inputs.iter().position(|s| s.name == name)
+    }
+
+    /// Index of the parameter called `name`.
+    pub fn parameter(&self, name: &str) -> Option<usize> {
+        self.parameters.iter().position(|s| s.name == name)
+    }
+
+    /// Index of the equation called `name`.
+    pub fn equation(&self, name: &str) -> Option<usize> {
+        self.equations.iter().position(|s| s.name == name)
+    }
+}

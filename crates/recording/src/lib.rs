@@ -1,0 +1,1 @@
+//! Recordings of experiments: time series with units, CSV reader, data health, smoothing.

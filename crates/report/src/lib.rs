@@ -1,0 +1,1 @@
+//! Reports of a diagnosis: JSON by contract, improved model, self-contained HTML.

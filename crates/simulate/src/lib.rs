@@ -1,0 +1,1 @@
+//! Simulation of greybox models: events, stick-slip, delays, forward sensitivities.
