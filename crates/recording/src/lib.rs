@@ -1,1 +1,55 @@
-//! Recordings of experiments: time series with units, CSV reader, data health, smoothing.
+//! Recordings of experiments: time series with units, read from CSV, checked and smoothed.
+//!
+//! A recording is one continuous experiment: a strictly increasing time tᵢ and, for every channel c, the
+//! samples y_c(tᵢ) in the channel's unit, some of them missing (NaN). The reader turns it into *pieces*, each
+//! on a uniform grid with the step Δt that all pieces of the recording share,
+//!
+//! ```text
+//! t = start + k Δt ,   k = 0 … len − 1 ,
+//! ```
+//!
+//! so that everything downstream (differences, filters, simulation) may rely on a constant step and never
+//! works across a gap.
+//!
+//! | module | what it answers |
+//! |---|---|
+//! | [`csv`](mod@csv) | what stands in the file, or exactly which cell is wrong and how to mend it |
+//! | [`noise`] | how large the measurement noise is, and whether a channel is quantised |
+//! | [`smooth`] | value, first and second derivative of a noisy channel (Savitzky–Golay) |
+//! | [`interpolate`] | what an input did between its samples (band-limited, linear) |
+//! | [`health`] | is this recording good enough to identify anything from, in plain sentences |
+//!
+//! The functions of `noise`, `smooth` and `interpolate` take slices and return values; only [`csv`](mod@csv)
+//! touches files.
+//!
+//! ```
+//! use greybox_recording::{health, parse_csv};
+//! let mut text = String::from("t,u [V],y [m]\n");
+//! for k in 0..200 {
+//!     let t = 0.01 * f64::from(k);
+//!     text += &format!("{t:.2},{:.4},{:.5}\n", (9.0 * t).sin(), 0.1 * (9.0 * t - 0.4).sin());
+//! }
+//! let recording = parse_csv(text.as_bytes(), "run1.csv")?;
+//! assert_eq!(recording.pieces.len(), 1);
+//! assert_eq!(recording.pieces[0].dt, 0.01);
+//! for finding in health::check(&recording, &["u"], &["y"]) {
+//!     println!("{finding}");
+//! }
+//! # Ok::<(), greybox_recording::RecordingError>(())
+//! ```
+
+pub mod csv;
+mod error;
+mod finding;
+mod grid;
+pub mod health;
+pub mod interpolate;
+pub mod noise;
+mod recording;
+pub mod smooth;
+mod spectrum;
+
+pub use crate::csv::{parse_csv, read_csv, write_csv, write_csv_file};
+pub use crate::error::{Place, RecordingError};
+pub use crate::finding::{Finding, Severity};
+pub use crate::recording::{Channel, MIN_SAMPLES, Piece, Recording};

@@ -1,0 +1,449 @@
+//! Reading and writing CSV files.
+//!
+//! UTF-8, comma separated, one header row; the first column is the time `t` in seconds (`t [ms]` and `t [us]`
+//! are converted). A header cell is `name` or `name [unit]`. An empty cell is a missing sample. A byte order
+//! mark, quoted cells, CRLF line ends and empty lines at the end are tolerated; everything else is an error
+//! that names the cell.
+
+use crate::error::{Place, RecordingError};
+use crate::recording::{Channel, Recording};
+use ::csv::{ByteRecord, ReaderBuilder, WriterBuilder};
+use std::fs;
+use std::io::{ErrorKind, Read, Write};
+use std::path::Path;
+
+const MISSING_MEND: &str = "write a number, or leave the cell empty for a missing sample";
+
+/// Reads the recording in the file at `path`.
+///
+/// # Errors
+/// Any [`RecordingError`]; its place names the file as given, the line and the column.
+pub fn read_csv(path: impl AsRef<Path>) -> Result<Recording, RecordingError> {
+    let path = path.as_ref();
+    let label = path.display().to_string();
+    let failed = |source: std::io::Error| match source.kind() {
+        ErrorKind::NotFound => RecordingError::NotFound { place: Place::file(&label) },
+        _ => RecordingError::Io { place: Place::file(&label), action: "read", source },
+    };
+    if fs::metadata(path).map_err(failed)?.is_dir() {
+        return Err(RecordingError::IsDirectory { place: Place::file(&label) });
+    }
+    let bytes = fs::read(path).map_err(failed)?;
+    let name = path.file_name().map_or_else(|| label.clone(), |name| name.to_string_lossy().into_owned());
+    parse(&bytes, &label, &name)
+}
+
+/// Reads a recording called `name` from anything that yields the bytes of a CSV file.
+///
+/// # Errors
+/// Any [`RecordingError`]; its place names `name`, the line and the column.
+pub fn parse_csv(mut reader: impl Read, name: &str) -> Result<Recording, RecordingError> {
+    let mut bytes = Vec::new();
+    reader.read_to_end(&mut bytes).map_err(|source| RecordingError::Io {
+        place: Place::file(name),
+        action: "read",
+        source,
+    })?;
+    parse(&bytes, name, name)
+}
+
+/// Writes a time and columns of the same length as CSV: header `t` and the given headers (`name` or
+/// `name [unit]`), numbers with as many digits as their exact value needs, missing samples (NaN) as empty
+/// cells.
+///
+/// # Errors
+/// A column length that differs from the time's, an infinite value, or the writer's own failure.
+///
+/// ```
+/// let mut file = Vec::new();
+/// greybox_recording::write_csv(&mut file, &[0.0, 0.5], &[("y [m]", &[1.25, f64::NAN])])?;
+/// assert_eq!(file, b"t,y [m]\n0,1.25\n0.5,\n");
+/// # Ok::<(), greybox_recording::RecordingError>(())
+/// ```
+pub fn write_csv(writer: impl Write, time: &[f64], columns: &[(&str, &[f64])]) -> Result<(), RecordingError> {
+    write(writer, "CSV output", time, columns)
+}
+
+/// Writes the file at `path` as [`write_csv`] does; the file appears whole or not at all (it is written beside
+/// its place under a temporary name, then renamed).
+///
+/// # Errors
+/// As [`write_csv`], with the file named.
+pub fn write_csv_file(
+    path: impl AsRef<Path>,
+    time: &[f64],
+    columns: &[(&str, &[f64])],
+) -> Result<(), RecordingError> {
+    let path = path.as_ref();
+    let label = path.display().to_string();
+    let failed = |source| RecordingError::Io { place: Place::file(&label), action: "written", source };
+    let mut bytes = Vec::new();
+    write(&mut bytes, &label, time, columns)?;
+    let mut beside = path.as_os_str().to_owned();
+    beside.push(format!(".{}.tmp", std::process::id()));
+    fs::write(&beside, &bytes).and_then(|()| fs::rename(&beside, path)).map_err(|source| {
+        // The temporary file may not exist; the first error is the one to report.
+        let _ = fs::remove_file(&beside);
+        failed(source)
+    })
+}
+
+fn write(
+    writer: impl Write,
+    label: &str,
+    time: &[f64],
+    columns: &[(&str, &[f64])],
+) -> Result<(), RecordingError> {
+    for (c, (header, values)) in columns.iter().enumerate() {
+        if values.len() != time.len() {
+            return Err(RecordingError::ColumnLength {
+                place: Place::file(label).column(c + 1, header),
+                found: values.len(),
+                expected: time.len(),
+            });
+        }
+    }
+    let failed = |source: ::csv::Error| RecordingError::Io {
+        place: Place::file(label),
+        action: "written",
+        source: source.into(),
+    };
+    let mut out = WriterBuilder::new().from_writer(writer);
+    out.write_record(std::iter::once("t").chain(columns.iter().map(|(header, _)| *header)))
+        .map_err(failed)?;
+    let mut row = vec![String::new(); columns.len() + 1];
+    for (k, &t) in time.iter().enumerate() {
+        let values = std::iter::once(t).chain(columns.iter().map(|(_, values)| values[k]));
+        for (c, value) in values.enumerate() {
+            if value.is_infinite() || (c == 0 && value.is_nan()) {
+                let name = if c == 0 { "t" } else { columns[c - 1].0 };
+                return Err(RecordingError::NotFinite {
+                    place: Place::line(label, k as u64 + 2).column(c, name),
+                    found: value.to_string(),
+                });
+            }
+            row[c] = cell(value);
+        }
+        out.write_record(&row).map_err(failed)?;
+    }
+    out.flush().map_err(|source| failed(source.into()))
+}
+
+/// The shortest text that reads back as exactly `value`; empty for NaN.
+fn cell(value: f64) -> String {
+    let size = value.abs();
+    if value.is_nan() {
+        String::new()
+    } else if size != 0.0 && !(1e-5..1e15).contains(&size) {
+        format!("{value:e}")
+    } else {
+        format!("{value}")
+    }
+}
+
+/// The bytes of a file and what to call it.
+struct Source<'a> {
+    text: &'a [u8],
+    label: &'a str,
+}
+
+impl Source<'_> {
+    /// Line of the record that the CSV reader started at byte `offset`: it may still have had to skip line
+    /// ends.
+    fn line(&self, offset: u64) -> u64 {
+        let mut start = usize::try_from(offset).map_or(self.text.len(), |o| o.min(self.text.len()));
+        while start < self.text.len() && matches!(self.text[start], b'\r' | b'\n') {
+            start += 1;
+        }
+        let before = &self.text[..start];
+        let ends = before
+            .iter()
+            .enumerate()
+            .filter(|&(i, &b)| b == b'\n' || (b == b'\r' && before.get(i + 1) != Some(&b'\n')));
+        1 + ends.count() as u64
+    }
+
+    fn place(&self, record: &ByteRecord) -> Place {
+        Place::line(self.label, self.line(record.position().map_or(0, ::csv::Position::byte)))
+    }
+}
+
+fn parse(bytes: &[u8], label: &str, name: &str) -> Result<Recording, RecordingError> {
+    let text = check_text(bytes, label)?;
+    let source = Source { text, label };
+    let mut reader = ReaderBuilder::new().has_headers(false).flexible(true).from_reader(text);
+    let mut record = ByteRecord::new();
+    let mut next = |record: &mut ByteRecord| {
+        // Reading from memory, with flexible rows and bytes for cells, leaves nothing to fail but the reader.
+        reader.read_byte_record(record).map_err(|error| RecordingError::Io {
+            place: Place::file(label),
+            action: "read",
+            source: error.into(),
+        })
+    };
+
+    let mut found = next(&mut record)?;
+    while found && is_blank(&record) {
+        found = next(&mut record)?;
+    }
+    if !found {
+        return Err(RecordingError::Empty { place: Place::file(label) });
+    }
+    let header_place = source.place(&record);
+    let header = header(&record, &header_place, text)?;
+    let width = header.columns.len() + 1;
+
+    let mut columns: Vec<Vec<f64>> = vec![Vec::new(); width];
+    let mut decimals = Some(0);
+    let mut blank: Option<Place> = None;
+    while next(&mut record)? {
+        if is_blank(&record) {
+            blank.get_or_insert_with(|| source.place(&record));
+            continue;
+        }
+        if let Some(place) = blank {
+            // Rows without a single value are harmless at the end of a file only.
+            return Err(RecordingError::MissingTime { place: place.column(0, "t") });
+        }
+        if record.len() != width {
+            return Err(cell_count(&record, width, source.place(&record)));
+        }
+        for (c, cell) in record.iter().enumerate() {
+            let cell = cell.trim_ascii();
+            let value = match number(cell) {
+                Some(value) => value,
+                None => {
+                    let name = if c == 0 { "t" } else { header.columns[c - 1].0.as_str() };
+                    return Err(bad_cell(cell, c, source.place(&record).column(c, name)));
+                }
+            };
+            columns[c].push(value);
+        }
+        decimals = match (decimals, printed_decimals(record[0].trim_ascii())) {
+            (Some(most), Some(here)) => Some(most.max(here)),
+            _ => None,
+        };
+        let time = &mut columns[0];
+        let last = time.len() - 1;
+        time[last] *= header.time_scale;
+        if last > 0 && time[last] <= time[last - 1] {
+            return Err(RecordingError::TimeNotIncreasing {
+                place: source.place(&record).column(0, "t"),
+                found: time[last],
+                previous: time[last - 1],
+                mend: if time[last] == time[last - 1] {
+                    "remove the repeated row, or write the times with more digits"
+                } else {
+                    "one file holds one continuous experiment: split the file here, or sort the rows"
+                },
+            });
+        }
+    }
+
+    let mut columns = columns.into_iter();
+    let time = columns.next().unwrap_or_default();
+    if time.is_empty() {
+        return Err(RecordingError::TooFewRows {
+            place: Place::file(label),
+            rows: 0,
+            needed: crate::recording::MIN_SAMPLES,
+            mend: "there is a header and nothing under it, export the samples too",
+        });
+    }
+    let channels = header
+        .columns
+        .into_iter()
+        .zip(columns)
+        .map(|((name, unit), values)| Channel { name, unit, values })
+        .collect();
+    let resolution = decimals.map_or(0.0, |d| header.time_scale * 10f64.powi(-d));
+    Recording::assemble(label, name, time, channels, resolution)
+}
+
+/// Drops the byte order mark and makes sure that the rest is UTF-8 text.
+fn check_text<'a>(bytes: &'a [u8], label: &str) -> Result<&'a [u8], RecordingError> {
+    let refuse =
+        |line: u64, found: String| RecordingError::NotUtf8 { place: Place::line(label, line), found };
+    if bytes.starts_with(&[0xff, 0xfe]) || bytes.starts_with(&[0xfe, 0xff]) {
+        return Err(refuse(1, "it is UTF-16, as spreadsheets write under `Unicode text`".to_owned()));
+    }
+    let text = bytes.strip_prefix(&[0xef, 0xbb, 0xbf]).unwrap_or(bytes);
+    match std::str::from_utf8(text) {
+        Err(error) => {
+            let at = error.valid_up_to();
+            let line = 1 + text[..at].iter().filter(|&&b| b == b'\n').count() as u64;
+            Err(refuse(line, format!("byte 0x{:02x} has no meaning there", text[at])))
+        }
+        Ok(_) => match text.iter().position(|&b| b == 0) {
+            Some(at) => {
+                let line = 1 + text[..at].iter().filter(|&&b| b == b'\n').count() as u64;
+                Err(refuse(line, "it holds zero bytes, like a binary file".to_owned()))
+            }
+            None => Ok(text),
+        },
+    }
+}
+
+fn is_blank(record: &ByteRecord) -> bool {
+    record.iter().all(|cell| cell.trim_ascii().is_empty())
+}
+
+struct Header {
+    /// Seconds per unit of the time column.
+    time_scale: f64,
+    /// Name and unit of every column after the time.
+    columns: Vec<(String, Option<String>)>,
+}
+
+fn header(record: &ByteRecord, place: &Place, text: &[u8]) -> Result<Header, RecordingError> {
+    let cells: Vec<String> =
+        record.iter().map(|cell| String::from_utf8_lossy(cell).trim().to_owned()).collect();
+    let first = cells.first().cloned().unwrap_or_default();
+    let line = cells.join(",");
+    for (separator, found) in [(';', "semicolons"), ('\t', "tabs"), ('|', "vertical bars")] {
+        let Some((head, _)) = line.split_once(separator) else { continue };
+        if cells.len() > 1 && !head.trim().trim_matches('"').starts_with('t') {
+            continue;
+        }
+        if first.contains(separator) {
+            let rows = text.splitn(2, |&b| b == b'\n').nth(1).unwrap_or(&[]);
+            let mend = if rows.iter().take(4096).any(|&b| b == b',') {
+                "first replace the decimal commas by points, then the separators by commas (or export with an \
+                 English number format)"
+            } else {
+                "replace the separators by commas, or export as `CSV (comma separated)`"
+            };
+            return Err(RecordingError::Separator { place: place.clone(), found, mend });
+        }
+    }
+    if first.parse::<f64>().is_ok() {
+        return Err(RecordingError::NoHeader { place: place.clone(), found: first });
+    }
+
+    let parsed = cells
+        .iter()
+        .enumerate()
+        .map(|(c, cell)| header_cell(cell, || place.clone().column(c, cell)))
+        .collect::<Result<Vec<_>, _>>();
+    let time_column =
+        |mend: String| RecordingError::TimeColumn { place: place.clone(), found: first.clone(), mend };
+    let time = header_cell(&first, || place.clone().column(0, &first));
+    let time_scale = match &time {
+        Ok((name, unit)) if name == "t" => match unit.as_deref() {
+            None | Some("s") => 1.0,
+            Some("ms") => 1e-3,
+            Some("us" | "µs" | "μs") => 1e-6,
+            Some(unit) => return Err(time_column(format!("convert the times from {unit} to s"))),
+        },
+        Ok(_) | Err(_) => {
+            let elsewhere = parsed.as_ref().ok().and_then(|p| p.iter().position(|(name, _)| name == "t"));
+            return Err(time_column(match elsewhere {
+                Some(c) => format!("move column {} (`t`) to the front", c + 1),
+                None => "rename the time column to `t` and make it the first".to_owned(),
+            }));
+        }
+    };
+    let parsed = parsed?;
+    if parsed.len() < 2 {
+        return Err(RecordingError::NoChannels { place: place.clone() });
+    }
+    for (c, (name, _)) in parsed.iter().enumerate() {
+        if let Some(first) = parsed[..c].iter().position(|(other, _)| other == name) {
+            return Err(RecordingError::DuplicateName {
+                place: place.clone().column(c, name),
+                name: name.clone(),
+                first: first + 1,
+            });
+        }
+    }
+    Ok(Header { time_scale, columns: parsed.into_iter().skip(1).collect() })
+}
+
+/// `name` or `name [unit]`.
+fn header_cell(cell: &str, place: impl Fn() -> Place) -> Result<(String, Option<String>), RecordingError> {
+    let refuse = |mend| RecordingError::HeaderCell { place: place(), found: cell.to_owned(), mend };
+    let (name, unit) = match cell.split_once('[') {
+        Some((name, rest)) => match rest.strip_suffix(']') {
+            Some(unit) if !unit.contains(['[', ']']) => (name.trim(), Some(unit.trim())),
+            _ => return Err(refuse("close the unit's bracket at the end of the cell")),
+        },
+        None if cell.contains(']') => return Err(refuse("open the unit's bracket with `[`")),
+        None => (cell, None),
+    };
+    if name.is_empty() {
+        return Err(refuse("give the column a name, or delete it"));
+    }
+    Ok((name.to_owned(), unit.filter(|unit| !unit.is_empty()).map(str::to_owned)))
+}
+
+/// The number in a cell; NaN for an empty cell, `None` for anything that is not a finite number.
+fn number(cell: &[u8]) -> Option<f64> {
+    if cell.is_empty() {
+        return Some(f64::NAN);
+    }
+    let value: f64 = std::str::from_utf8(cell).ok()?.parse().ok()?;
+    value.is_finite().then_some(value)
+}
+
+/// Digits after the decimal point, `None` where the number has an exponent.
+fn printed_decimals(cell: &[u8]) -> Option<i32> {
+    if cell.iter().any(|b| matches!(b, b'e' | b'E')) {
+        return None;
+    }
+    let point = cell.iter().position(|&b| b == b'.');
+    Some(point.map_or(0, |p| (cell.len() - p - 1) as i32))
+}
+
+fn bad_cell(cell: &[u8], c: usize, place: Place) -> RecordingError {
+    let text = String::from_utf8_lossy(cell);
+    let found: String = if text.chars().count() > 40 {
+        text.chars().take(40).chain(['…']).collect()
+    } else {
+        text.into_owned()
+    };
+    let number_like = |s: &str| s.parse::<f64>().is_ok();
+    if number_like(&found) {
+        return RecordingError::NotFinite { place, found };
+    }
+    if found.matches(',').count() == 1 && number_like(&found.replace(',', ".")) {
+        return RecordingError::DecimalComma { place, found: format!("`{found}`") };
+    }
+    let mend = if c == 0 { "write the time as a number of seconds" } else { MISSING_MEND };
+    RecordingError::NotANumber { place, found, mend }
+}
+
+/// A row with the wrong number of cells: a decimal comma where all cells are whole numbers and too many.
+fn cell_count(record: &ByteRecord, width: usize, place: Place) -> RecordingError {
+    let whole = |cell: &[u8]| {
+        let digits = cell.trim_ascii().strip_prefix(b"-").unwrap_or(cell.trim_ascii());
+        !digits.is_empty() && digits.iter().all(u8::is_ascii_digit)
+    };
+    if record.len() > width && record.len() <= 2 * width && record.iter().all(whole) {
+        let cells: Vec<_> = record.iter().take(6).map(String::from_utf8_lossy).collect();
+        return RecordingError::DecimalComma { place, found: format!("the row `{}…`", cells.join(",")) };
+    }
+    RecordingError::CellCount { place, found: record.len(), expected: width }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn lines_are_counted_through_every_kind_of_line_end() {
+        for end in ["\n", "\r\n", "\r"] {
+            let mut rows: Vec<String> = (0..20).map(|k| format!("{k},{k}")).collect();
+            rows[12] = "12,oops".to_owned();
+            let text = format!("t,y{end}{}", rows.join(end));
+            let error = parse_csv(text.as_bytes(), "f.csv").unwrap_err();
+            assert_eq!(error.place().line, Some(14), "{end:?}: {error}");
+        }
+    }
+
+    #[test]
+    fn cells_read_back_exactly() {
+        for value in [0.0, -0.0, 1.0 / 3.0, 1e-24, -2.5e300, 610.3516, f64::MIN_POSITIVE] {
+            assert_eq!(cell(value).parse::<f64>().unwrap().to_bits(), value.to_bits());
+        }
+    }
+}

@@ -1,0 +1,277 @@
+//! Why a recording could not be read or written: the place, what was found there, the mend.
+
+use std::fmt;
+
+/// Where in a file: `file:line:column name`, the parts that are known.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub struct Place {
+    /// The file as the caller named it.
+    pub file: String,
+    /// Line of the file, counted from 1 (the header is line 1).
+    pub line: Option<u64>,
+    /// Column number, counted from 1, and the column's name.
+    pub column: Option<(usize, String)>,
+}
+
+impl Place {
+    pub(crate) fn file(file: &str) -> Self {
+        Self { file: file.to_owned(), line: None, column: None }
+    }
+
+    pub(crate) fn line(file: &str, line: u64) -> Self {
+        Self { file: file.to_owned(), line: Some(line), column: None }
+    }
+
+    pub(crate) fn column(mut self, index: usize, name: &str) -> Self {
+        self.column = Some((index + 1, name.to_owned()));
+        self
+    }
+}
+
+impl fmt::Display for Place {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        f.write_str(&self.file)?;
+        if let Some(line) = self.line {
+            write!(f, ":{line}")?;
+        }
+        if let Some((number, name)) = &self.column {
+            write!(f, ":{name} (column {number})")?;
+        }
+        Ok(())
+    }
+}
+
+/// Why a recording could not be read or written. Each message is one paragraph: place, what was found, mend.
+#[derive(Debug, thiserror::Error)]
+#[non_exhaustive]
+pub enum RecordingError {
+    /// The file does not exist.
+    #[error("{place}: no such file; check the path and the spelling")]
+    NotFound {
+        /// The file as named by the caller.
+        place: Place,
+    },
+    /// A folder was given where a file is needed.
+    #[error("{place}: this is a folder, not a recording; name one CSV file inside it")]
+    IsDirectory {
+        /// The folder as named by the caller.
+        place: Place,
+    },
+    /// The operating system refused to read or write.
+    #[error("{place}: the file could not be {action}: {source}; check its permissions and the disk")]
+    Io {
+        /// The file as named by the caller.
+        place: Place,
+        /// `read` or `written`.
+        action: &'static str,
+        /// What the operating system said.
+        source: std::io::Error,
+    },
+    /// The bytes are not UTF-8 text.
+    #[error("{place}: the file is not UTF-8 text ({found}); save it again as `CSV UTF-8`")]
+    NotUtf8 {
+        /// The file, and the line of the first offending byte.
+        place: Place,
+        /// What was found instead.
+        found: String,
+    },
+    /// There is nothing in the file.
+    #[error(
+        "{place}: the file is empty; a recording starts with a header row such as `t,u [V],y [m]`, followed \
+         by one row per sample"
+    )]
+    Empty {
+        /// The file.
+        place: Place,
+    },
+    /// The columns are separated by something else than a comma.
+    #[error(
+        "{place}: the columns are separated by {found}; greybox reads comma-separated files with a decimal \
+         point: {mend}"
+    )]
+    Separator {
+        /// The header line.
+        place: Place,
+        /// `semicolons`, `tabs`, ….
+        found: &'static str,
+        /// How to convert this file.
+        mend: &'static str,
+    },
+    /// A number is written with a decimal comma.
+    #[error(
+        "{place}: {found} looks like a decimal comma; write numbers with a decimal point (0.5, not 0,5), for \
+         example by exporting with an English number format"
+    )]
+    DecimalComma {
+        /// The row, and the cell where it is one cell.
+        place: Place,
+        /// The offending text.
+        found: String,
+    },
+    /// The first row holds numbers.
+    #[error(
+        "{place}: the first row holds numbers ({found}), so the header row is missing; add one such as \
+         `t,u [V],y [m]` as the first line"
+    )]
+    NoHeader {
+        /// The first line.
+        place: Place,
+        /// The first cell.
+        found: String,
+    },
+    /// The first column is not the time `t`.
+    #[error(
+        "{place}: the first column must be the time `t` in seconds, found `{found}`; {mend} (accepted: `t`, \
+         `t [s]`, `t [ms]`, `t [us]`)"
+    )]
+    TimeColumn {
+        /// The header line.
+        place: Place,
+        /// The header of the first column.
+        found: String,
+        /// How to mend this header.
+        mend: String,
+    },
+    /// There is a time and nothing else.
+    #[error("{place}: there is no column beside the time; add at least one channel, such as `y [m]`")]
+    NoChannels {
+        /// The header line.
+        place: Place,
+    },
+    /// A header cell is empty or its brackets do not close.
+    #[error("{place}: the header cell `{found}` is not `name` or `name [unit]`; {mend}")]
+    HeaderCell {
+        /// The header line and column.
+        place: Place,
+        /// The cell as written.
+        found: String,
+        /// How to mend it.
+        mend: &'static str,
+    },
+    /// Two columns share a name.
+    #[error(
+        "{place}: the name `{name}` already stands in column {first}; rename or delete one of the two columns"
+    )]
+    DuplicateName {
+        /// The header line and the second column.
+        place: Place,
+        /// The name.
+        name: String,
+        /// Number of the first column of that name, counted from 1.
+        first: usize,
+    },
+    /// A row has more or fewer cells than the header.
+    #[error(
+        "{place}: the row has {found} cells, the header has {expected}; give every column its cell (an empty \
+         cell marks a missing sample) and no more"
+    )]
+    CellCount {
+        /// The row.
+        place: Place,
+        /// Cells in the row.
+        found: usize,
+        /// Cells in the header.
+        expected: usize,
+    },
+    /// A cell holds text where a number is needed.
+    #[error("{place}: `{found}` is not a number; {mend}")]
+    NotANumber {
+        /// The cell.
+        place: Place,
+        /// The cell as written.
+        found: String,
+        /// How to mend it.
+        mend: &'static str,
+    },
+    /// A cell holds `NaN` or an infinity.
+    #[error("{place}: `{found}` is not a measured value; leave the cell empty for a missing sample")]
+    NotFinite {
+        /// The cell.
+        place: Place,
+        /// The cell as written.
+        found: String,
+    },
+    /// A row has no time.
+    #[error("{place}: the time is missing; every row needs its time, delete the row or fill in the cell")]
+    MissingTime {
+        /// The cell.
+        place: Place,
+    },
+    /// The time repeats or runs backwards.
+    #[error(
+        "{place}: the time {found} s does not come after the time {previous} s of the row before; {mend}"
+    )]
+    TimeNotIncreasing {
+        /// The cell.
+        place: Place,
+        /// Time of the row, s.
+        found: f64,
+        /// Time of the row before, s.
+        previous: f64,
+        /// How to mend it.
+        mend: &'static str,
+    },
+    /// Too few rows to identify anything.
+    #[error("{place}: the recording has {rows} rows of samples, at least {needed} are needed; {mend}")]
+    TooFewRows {
+        /// The file.
+        place: Place,
+        /// Rows found.
+        rows: usize,
+        /// Rows needed.
+        needed: usize,
+        /// How to mend it.
+        mend: &'static str,
+    },
+    /// Gaps leave no piece that is long enough.
+    #[error(
+        "{place}: gaps in the time cut the recording into {pieces} pieces, none of them with {needed} samples; \
+         check the time column, or record without dropping samples"
+    )]
+    NoUsablePiece {
+        /// The file.
+        place: Place,
+        /// Pieces found.
+        pieces: usize,
+        /// Samples a piece needs.
+        needed: usize,
+    },
+    /// A column to be built or written has another length than the time.
+    #[error("{place}: the column has {found} values, the time has {expected}; give one value per time")]
+    ColumnLength {
+        /// File and column.
+        place: Place,
+        /// Values in the column.
+        found: usize,
+        /// Values in the time.
+        expected: usize,
+    },
+}
+
+impl RecordingError {
+    /// Where it went wrong.
+    pub fn place(&self) -> &Place {
+        match self {
+            Self::NotFound { place }
+            | Self::IsDirectory { place }
+            | Self::Io { place, .. }
+            | Self::NotUtf8 { place, .. }
+            | Self::Empty { place }
+            | Self::Separator { place, .. }
+            | Self::DecimalComma { place, .. }
+            | Self::NoHeader { place, .. }
+            | Self::TimeColumn { place, .. }
+            | Self::NoChannels { place }
+            | Self::HeaderCell { place, .. }
+            | Self::DuplicateName { place, .. }
+            | Self::CellCount { place, .. }
+            | Self::NotANumber { place, .. }
+            | Self::NotFinite { place, .. }
+            | Self::MissingTime { place }
+            | Self::TimeNotIncreasing { place, .. }
+            | Self::TooFewRows { place, .. }
+            | Self::NoUsablePiece { place, .. }
+            | Self::ColumnLength { place, .. } => place,
+        }
+    }
+}

@@ -1,0 +1,489 @@
+//! Is this recording good enough to find anything in it? Checks with plain answers.
+//!
+//! Each check is a small function over the samples of the longest piece (the counts over all pieces); [`check`]
+//! runs them all. The limits are set so that a sound recording yields only [`Severity::Info`].
+
+use crate::finding::{Finding, Severity, number, quantity};
+use crate::interpolate::fill_missing;
+use crate::noise::{
+    finite_range, fourth_difference, median, noise_sigma, quantisation_step, recording_sigma,
+};
+use crate::recording::{Channel, Recording};
+use crate::spectrum::{Periodogram, correlation, periodogram, whiten};
+
+/// What a channel is to the experiment.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+enum Role {
+    Input,
+    Output,
+    Unknown,
+}
+
+/// Everything that can be said about the health of a recording, whole-recording findings first, then channel by
+/// channel, then the delays between inputs and outputs.
+///
+/// `inputs` and `outputs` name channels; a channel in neither list is checked as far as that goes without
+/// knowing its role. A name that the recording does not have is reported as a [`Severity::Problem`].
+pub fn check(recording: &Recording, inputs: &[&str], outputs: &[&str]) -> Vec<Finding> {
+    let mut findings = vec![sampling(recording)];
+    findings.extend(recording.warnings.iter().cloned());
+    findings.extend(unknown_channels(recording, inputs, outputs));
+    for (c, channel) in recording.channels.iter().enumerate() {
+        let role = match (inputs.contains(&channel.name.as_str()), outputs.contains(&channel.name.as_str())) {
+            (true, false) => Role::Input,
+            (false, true) => Role::Output,
+            _ => Role::Unknown,
+        };
+        findings.extend(check_channel(recording, c, role));
+    }
+    for input in inputs {
+        for output in outputs {
+            findings.extend(delay(recording, input, output));
+        }
+    }
+    findings
+}
+
+fn check_channel(recording: &Recording, c: usize, role: Role) -> Vec<Finding> {
+    let channel = &recording.channels[c];
+    let present: Vec<f64> = channel.values.iter().copied().filter(|v| !v.is_nan()).collect();
+    let mut findings: Vec<Finding> = missing(channel, &recording.time).into_iter().collect();
+    if present.is_empty() {
+        return findings;
+    }
+    if let Some(found) = flat(channel, &present, role) {
+        findings.push(found);
+        return findings;
+    }
+    let sigma = recording_sigma(recording, c);
+    let pieces: Vec<&[f64]> = recording.pieces.iter().map(|piece| piece.columns[c].as_slice()).collect();
+    let longest = pieces.iter().copied().max_by_key(|y| y.len()).unwrap_or(&[]);
+    findings.extend(clipping(channel, longest));
+    findings.extend(quantisation(channel, longest));
+    findings.extend(outliers(recording, c));
+    let full = fill_missing(longest);
+    if full.len() < 16 || finite_range(&full).is_none_or(|(low, high)| low == high) {
+        return findings;
+    }
+    let spectrum = periodogram(&full, recording.dt());
+    if role == Role::Input {
+        findings.push(excitation(channel, &present, &spectrum));
+    } else {
+        findings.extend(noise_level(channel, &present, sigma, &spectrum));
+        findings.extend(bandwidth(channel, &spectrum, recording.dt()));
+        findings.extend(record_length(channel, &full, &spectrum));
+    }
+    findings
+}
+
+fn sampling(recording: &Recording) -> Finding {
+    let dt = recording.dt();
+    let used: usize = recording.pieces.iter().map(|piece| piece.len).sum();
+    let pieces = match recording.pieces.len() {
+        1 => String::new(),
+        count => format!(" in {count} pieces"),
+    };
+    Finding::new(
+        Severity::Info,
+        "sampling",
+        format!(
+            "{used} samples{pieces} every {} s ({} Hz), {} s in all.",
+            number(dt),
+            number(1.0 / dt),
+            number(recording.duration())
+        ),
+    )
+    .value(1.0 / dt, Some("Hz"))
+}
+
+fn unknown_channels(recording: &Recording, inputs: &[&str], outputs: &[&str]) -> Vec<Finding> {
+    let known: Vec<&str> = recording.channels.iter().map(|channel| channel.name.as_str()).collect();
+    let absent = inputs.iter().chain(outputs).filter(|name| recording.channel(name).is_none());
+    absent
+        .map(|name| {
+            Finding::new(
+                Severity::Problem,
+                "unknown_channel",
+                format!("{} has no channel of this name.", recording.name),
+            )
+            .on(name)
+            .mend(format!("Its channels are {}.", known.join(", ")))
+        })
+        .collect()
+}
+
+fn missing(channel: &Channel, time: &[f64]) -> Option<Finding> {
+    let count = channel.values.iter().filter(|v| v.is_nan()).count();
+    let first = channel.values.iter().position(|v| v.is_nan())?;
+    let rows = channel.values.len();
+    let share = 100.0 * count as f64 / rows as f64;
+    let (severity, message) = if count == rows {
+        (Severity::Problem, "No sample at all: every cell is empty.".to_owned())
+    } else {
+        let severity = if share > 20.0 { Severity::Warning } else { Severity::Info };
+        let message = format!(
+            "{count} of {rows} samples are missing ({} %), the first at t = {} s; they are left out of every fit.",
+            number(share),
+            number(time[first])
+        );
+        (severity, message)
+    };
+    Some(Finding::new(severity, "missing", message).on(&channel.name).value(count as f64, None))
+}
+
+fn flat(channel: &Channel, present: &[f64], role: Role) -> Option<Finding> {
+    let (low, high) = finite_range(present)?;
+    if high - low > 1e-12 * low.abs().max(high.abs()) {
+        return None;
+    }
+    let value = quantity(low, channel.unit.as_deref());
+    let finding = match role {
+        Role::Input => Finding::new(
+            Severity::Warning,
+            "excitation",
+            format!(
+                "The input is constant ({value}): nothing that depends on it can be told apart from a constant \
+                 offset."
+            ),
+        )
+        .mend("Move the input: steps of several sizes, a sweep or a multisine over the working range."),
+        Role::Output => {
+            Finding::new(Severity::Problem, "flat", format!("The channel never moves (always {value})."))
+                .mend("Check that the sensor was connected and that the right column was exported.")
+        }
+        Role::Unknown => {
+            Finding::new(Severity::Warning, "flat", format!("The channel never moves (always {value})."))
+        }
+    };
+    Some(finding.on(&channel.name).value(low, channel.unit.as_deref()))
+}
+
+/// Lengths of the runs of equal neighbouring samples, with their value.
+fn runs(y: &[f64], tolerance: f64) -> Vec<(f64, usize)> {
+    let mut runs: Vec<(f64, usize)> = Vec::new();
+    for &v in y.iter().filter(|v| !v.is_nan()) {
+        match runs.last_mut() {
+            Some((value, length)) if (v - *value).abs() <= tolerance => *length += 1,
+            _ => runs.push((v, 1)),
+        }
+    }
+    runs
+}
+
+/// Clipping: the signal stands at its extreme again and again, longer than a turning point would.
+///
+/// Near a smooth turning point the time within w of the extreme grows as √w, so that the extreme level of a
+/// quantised signal holds at most 1/(√5 − 1) ≈ 0.8 times as many samples as the next four levels together; a
+/// clipped one holds many times as many. Asked for are twice as many, in two runs of three samples or more, and
+/// runs three times as long as elsewhere (which spares staircases). Signals of a few levels (switches) and a
+/// rest at zero are not clipping.
+fn clipping(channel: &Channel, y: &[f64]) -> Vec<Finding> {
+    let Some((low, high)) = finite_range(y) else { return Vec::new() };
+    let tolerance = 1e-9 * (high - low);
+    let runs = runs(y, tolerance);
+    let total: usize = runs.iter().map(|run| run.1).sum();
+    let mut levels: Vec<f64> = runs.iter().map(|run| run.0).collect();
+    levels.sort_unstable_by(f64::total_cmp);
+    levels.dedup_by(|a, b| (*a - *b).abs() <= tolerance);
+    if levels.len() < 12 {
+        return Vec::new();
+    }
+    let level_step = quantisation_step(y).unwrap_or(0.0).max(1e-4 * (high - low));
+    let mean_length = |runs: &[&(f64, usize)]| {
+        runs.iter().map(|run| run.1).sum::<usize>() as f64 / runs.len().max(1) as f64
+    };
+    let mut findings = Vec::new();
+    for (extreme, which) in [(low, "smallest"), (high, "largest")] {
+        let (at, elsewhere): (Vec<_>, Vec<_>) =
+            runs.iter().partition(|run| (run.0 - extreme).abs() <= tolerance);
+        let held: usize = at.iter().map(|run| run.1).sum();
+        let beside: usize =
+            elsewhere.iter().filter(|run| (run.0 - extreme).abs() < 4.5 * level_step).map(|run| run.1).sum();
+        let plateaus = at.iter().filter(|run| run.1 >= 3).count();
+        let clipped = plateaus >= 2
+            && held > 2 * beside
+            && mean_length(&at) > 3.0 * mean_length(&elsewhere)
+            && extreme != 0.0;
+        if clipped {
+            let unit = channel.unit.as_deref();
+            findings.push(
+                Finding::new(
+                    Severity::Warning,
+                    "clipping",
+                    format!(
+                        "The signal stands still at its {which} value {} in {plateaus} places ({} % of the \
+                         samples): it looks clipped there.",
+                        quantity(extreme, unit),
+                        number(100.0 * held as f64 / total as f64)
+                    ),
+                )
+                .mend("Widen the sensor or amplifier range, or model the limit (input_saturation, end_stop).")
+                .on(&channel.name)
+                .value(extreme, unit),
+            );
+        }
+    }
+    findings
+}
+
+fn quantisation(channel: &Channel, y: &[f64]) -> Option<Finding> {
+    let q = quantisation_step(y)?;
+    let noise = noise_sigma(y);
+    let (low, high) = finite_range(y)?;
+    let unit = channel.unit.as_deref();
+    let coarse = (high - low) / q;
+    // Below this the rounding drowns in the noise and no reader needs to know.
+    if q < 0.5 * noise {
+        return None;
+    }
+    let (severity, mend) = if coarse < 50.0 {
+        (
+            Severity::Warning,
+            Some("Use a finer sensor or amplifier range: fewer than 50 steps span the motion."),
+        )
+    } else {
+        (Severity::Info, None)
+    };
+    let mut finding = Finding::new(
+        severity,
+        "quantisation",
+        format!(
+            "The values come in steps of {} ({} steps over the range); that rounding is counted as noise of {}.",
+            quantity(q, unit),
+            number(coarse.round()),
+            quantity(q / 12f64.sqrt(), unit)
+        ),
+    )
+    .on(&channel.name)
+    .value(q, unit);
+    finding.mend = mend.map(str::to_owned);
+    Some(finding)
+}
+
+/// Largest robust z-score of a fourth difference that passes as noise.
+const OUTLIER_Z: f64 = 8.0;
+
+/// Single samples that stand out of their neighbours: fourth difference beyond 8 robust standard deviations
+/// (Hampel), the sample away from both neighbours on the same side, the neighbours close to each other (which
+/// tells a spike from a step).
+fn outliers(recording: &Recording, c: usize) -> Option<Finding> {
+    let (mut count, mut first) = (0usize, None);
+    for piece in &recording.pieces {
+        let y = &piece.columns[c];
+        let differences: Vec<f64> = y.windows(5).map(fourth_difference).collect();
+        let centre = median(&differences);
+        let deviations: Vec<f64> = differences.iter().map(|d| (d - centre).abs()).collect();
+        let rounding = quantisation_step(y).map_or(0.0, |q| q * (70.0f64 / 12.0).sqrt());
+        let spread = (1.4826 * median(&deviations)).max(rounding);
+        if spread.is_nan() || spread <= 0.0 {
+            continue;
+        }
+        for (k, &deviation) in deviations.iter().enumerate() {
+            let (before, here, after) = (y[k + 1], y[k + 2], y[k + 3]);
+            let (up, down) = (here - before, here - after);
+            let stands_out = up * down > 0.0 && (before - after).abs() < 0.5 * up.abs().min(down.abs());
+            let strongest = deviations[k.saturating_sub(2)..(k + 3).min(deviations.len())]
+                .iter()
+                .all(|&other| other.is_nan() || other <= deviation);
+            if deviation > OUTLIER_Z * spread && stands_out && strongest {
+                count += 1;
+                first.get_or_insert(recording.time[0] + piece.time(k + 2));
+            }
+        }
+    }
+    let first = first?;
+    Some(
+        Finding::new(
+            Severity::Warning,
+            "outliers",
+            format!(
+                "{} from {} neighbours by far more than the noise, the first at t = {} s.",
+                if count == 1 {
+                    "One sample stands out".to_owned()
+                } else {
+                    format!("{count} samples stand out")
+                },
+                if count == 1 { "its" } else { "their" },
+                number(first)
+            ),
+        )
+        .mend("Look at these samples; empty their cells if they are faults of the measurement.")
+        .on(&recording.channels[c].name)
+        .value(count as f64, None),
+    )
+}
+
+fn rms_about_mean(present: &[f64]) -> f64 {
+    let n = present.len() as f64;
+    let mean = present.iter().sum::<f64>() / n;
+    (present.iter().map(|v| (v - mean) * (v - mean)).sum::<f64>() / n).sqrt()
+}
+
+fn excitation(channel: &Channel, present: &[f64], spectrum: &Periodogram) -> Finding {
+    let unit = channel.unit.as_deref();
+    let rms = rms_about_mean(present);
+    let peak = spectrum.strongest();
+    let size = format!("RMS {} about its mean", quantity(rms, unit));
+    if peak >= 3 && spectrum.share(peak.saturating_sub(2), peak + 2) > 0.99 {
+        return Finding::new(
+            Severity::Warning,
+            "excitation",
+            format!(
+                "The input is a single sine of {} Hz ({size}): one frequency fixes two parameters, and a mechanism \
+                 can hide behind a wrong one.",
+                number(peak as f64 * spectrum.resolution)
+            ),
+        )
+        .mend("Add frequencies and amplitudes: a sweep, a multisine, or steps of several sizes.")
+        .on(&channel.name)
+        .value(1.0, None);
+    }
+    let lines = spectrum.significant_lines();
+    let (severity, mend) = if lines < 3 {
+        (
+            Severity::Warning,
+            Some("Add frequencies: a sweep, a multisine, or steps of several sizes.".to_owned()),
+        )
+    } else {
+        (Severity::Info, None)
+    };
+    let mut finding = Finding::new(
+        severity,
+        "excitation",
+        format!(
+            "The input has {size}, 95 % of its power below {} Hz and {lines} distinct spectral peak{}, enough for \
+             about {} parameters of a linear model.",
+            number(spectrum.frequency_below(0.95)),
+            if lines == 1 { "" } else { "s" },
+            2 * lines
+        ),
+    )
+    .on(&channel.name)
+    .value(lines as f64, None);
+    finding.mend = mend;
+    finding
+}
+
+fn noise_level(channel: &Channel, present: &[f64], sigma: f64, spectrum: &Periodogram) -> Option<Finding> {
+    let rms = rms_about_mean(present);
+    if sigma.is_nan() || rms <= 0.0 {
+        return None;
+    }
+    let ratio = sigma / rms;
+    let unit = channel.unit.as_deref();
+    // Content up to the upper half of the band looks like noise to the fourth difference.
+    let half = spectrum.power.len() / 2;
+    let broadband = spectrum.share(half, spectrum.power.len()) > 0.05;
+    let level = format!("{} ({} % of the signal's RMS)", quantity(sigma, unit), number(100.0 * ratio));
+    let finding = if broadband {
+        Finding::new(
+            Severity::Info,
+            "noise",
+            format!(
+                "The noise is at most {level}; the signal reaches into the upper half of the band, so the two \
+                 cannot be told apart well from this channel alone."
+            ),
+        )
+    } else if ratio > 0.3 {
+        Finding::new(Severity::Warning, "noise", format!("The measurement noise is about {level}: much."))
+            .mend("Excite harder, average the sensor, or record for longer.")
+    } else {
+        Finding::new(Severity::Info, "noise", format!("The measurement noise is about {level}."))
+    };
+    Some(finding.on(&channel.name).value(sigma, unit))
+}
+
+fn bandwidth(channel: &Channel, spectrum: &Periodogram, dt: f64) -> Option<Finding> {
+    let top = spectrum.frequency_below(0.95);
+    let per_period = 1.0 / (top * dt);
+    (per_period < 5.0).then(|| {
+        Finding::new(
+            Severity::Warning,
+            "bandwidth",
+            format!(
+                "The fastest motion has only {} samples per period (95 % of the power lies below {} Hz, the \
+                 sampling allows {} Hz): what the input does between samples matters.",
+                number(per_period),
+                number(top),
+                number(0.5 / dt)
+            ),
+        )
+        .mend("Sample at least ten times per period, or state the input's true `hold` in the model.")
+        .on(&channel.name)
+        .value(per_period, None)
+    })
+}
+
+fn record_length(channel: &Channel, full: &[f64], spectrum: &Periodogram) -> Option<Finding> {
+    let slow = spectrum.share(1, 2);
+    let (start, end) = (full[0], full[full.len() - 1]);
+    let (low, high) = finite_range(full)?;
+    let drifts = (end - start).abs() > 0.7 * (high - low);
+    (slow > 0.5).then(|| {
+        Finding::new(
+            Severity::Warning,
+            "record_length",
+            format!(
+                "{} % of the motion is slower than half the recording ({} s){}: its slowest part is seen about once.",
+                number(100.0 * slow),
+                number(0.5 / spectrum.resolution),
+                if drifts { ", the signal drifts from one end of its range to the other" } else { "" }
+            ),
+        )
+        .mend("Record for longer, or use several recordings, if slow effects (drift, leakage) matter.")
+        .on(&channel.name)
+        .value(100.0 * slow, Some("%"))
+    })
+}
+
+/// Lag of the largest correlation between input and output, both differenced and whitened (autoregression), in
+/// the longest piece. A minimum-phase plant vanishes in the whitening, so that a pure delay is what is left.
+fn delay(recording: &Recording, input: &str, output: &str) -> Option<Finding> {
+    let piece = recording.longest_piece()?;
+    let (i, o) = (recording.channel_index(input)?, recording.channel_index(output)?);
+    if i == o {
+        return None;
+    }
+    let (u, y) = (fill_missing(&piece.columns[i]), fill_missing(&piece.columns[o]));
+    let n = piece.len;
+    if n < 64 {
+        return None;
+    }
+    let order = (n / 20).min(32);
+    let (u, y) = (whiten(&u, order), whiten(&y, order));
+    let reach = (n / 4).min(2000);
+    let c = correlation(&u, &y, reach);
+    let size = |k: usize| c[k].abs();
+    let largest = (0..c.len()).map(size).fold(0.0, f64::max);
+    // A periodic input repeats the peak every period: of nearly equal peaks, the one closest to no lag.
+    let best = (0..c.len()).filter(|&k| size(k) >= 0.95 * largest).min_by_key(|k| k.abs_diff(reach))?;
+    let noise = 1.4826 * median(&c.iter().map(|v| v.abs()).collect::<Vec<_>>());
+    if largest.is_nan() || largest < 0.1 || largest < 6.0 / (n as f64).sqrt() || largest < 6.0 * noise {
+        return None;
+    }
+    let lag = best as isize - reach as isize;
+    let seconds = lag as f64 * piece.dt;
+    let sense = match lag {
+        0 => format!("The output answers `{input}` within one sample"),
+        1.. => format!(
+            "The output follows `{input}` after about {lag} sample{} ({} s)",
+            if lag == 1 { "" } else { "s" },
+            number(seconds)
+        ),
+        _ => format!(
+            "The output runs ahead of `{input}` by about {} samples ({} s), as behind a feedback loop or with \
+             clocks that disagree",
+            -lag,
+            number(-seconds)
+        ),
+    };
+    Some(
+        Finding::new(
+            Severity::Info,
+            "delay",
+            format!("{sense} (correlation {} of the whitened signals).", number(c[best])),
+        )
+        .on(output)
+        .value(seconds, Some("s")),
+    )
+}

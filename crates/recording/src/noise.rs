@@ -1,0 +1,155 @@
+//! Measurement noise and quantisation of a channel, from its differences.
+
+use crate::recording::Recording;
+
+/// Sum of squares of the binomial weights 1, −4, 6, −4, 1 of a fourth difference.
+const FOURTH_DIFFERENCE_POWER: f64 = 70.0;
+
+/// Standard deviation of white noise on a smooth signal, by fourth differences:
+///
+/// ```text
+/// σ² = mean((Δ⁴y)²) / 70 ,   Δ⁴y = y₀ − 4y₁ + 6y₂ − 4y₃ + y₄ .
+/// ```
+///
+/// A cubic vanishes in Δ⁴, so that what is left of a signal sampled well above its bandwidth is the noise; 70
+/// is the sum of the squared weights. Windows that contain a missing sample (NaN) are skipped. Never call it
+/// across the boundary of two recordings or pieces. NaN when no five neighbouring samples are present.
+///
+/// ```
+/// use greybox_recording::noise::noise_sigma;
+/// let cubic: Vec<f64> = (0..50).map(|k| f64::from(k).powi(3)).collect();
+/// assert!(noise_sigma(&cubic) < 1e-9);
+/// ```
+pub fn noise_sigma(y: &[f64]) -> f64 {
+    let (mut sum, mut count) = (0.0, 0usize);
+    for w in y.windows(5) {
+        let difference = fourth_difference(w);
+        if !difference.is_nan() {
+            sum += difference * difference;
+            count += 1;
+        }
+    }
+    if count == 0 { f64::NAN } else { (sum / count as f64 / FOURTH_DIFFERENCE_POWER).sqrt() }
+}
+
+/// Δ⁴ of five neighbouring samples.
+pub(crate) fn fourth_difference(w: &[f64]) -> f64 {
+    w[0] - 4.0 * w[1] + 6.0 * w[2] - 4.0 * w[3] + w[4]
+}
+
+/// Step of a quantised channel: the smallest q such that more than 99 % of the first differences are whole
+/// multiples of it (to a tenth of a step). `None` for a channel that is not quantised, that never moves, or
+/// that knows fewer than five levels (a switch or a binary excitation is not a quantised measurement).
+///
+/// Numbers printed with few digits look quantised at their last digit, and are: the caller decides whether a
+/// step that small matters (compare it with [`noise_sigma`]). Differences across missing samples are skipped.
+pub fn quantisation_step(y: &[f64]) -> Option<f64> {
+    let (low, high) = finite_range(y)?;
+    let floor = 1e-11 * low.abs().max(high.abs());
+    let steps: Vec<f64> = y.windows(2).map(|w| (w[1] - w[0]).abs()).filter(|d| !d.is_nan()).collect();
+    let mut moved: Vec<f64> = steps.iter().copied().filter(|&d| d > floor).collect();
+    if moved.len() < 8 {
+        return None;
+    }
+    moved.sort_unstable_by(f64::total_cmp);
+    // The smallest difference, or, should a few samples sit off the raster, one from just above them.
+    [0, moved.len() / 200].into_iter().find_map(|first| {
+        let q = refine_step(&moved[first..])?;
+        let on_raster = steps.iter().filter(|&&d| (d / q - (d / q).round()).abs() < 0.1).count();
+        let levels = ((high - low) / q).round() + 1.0;
+        (on_raster as f64 > 0.99 * steps.len() as f64 && levels >= 5.0).then_some(q)
+    })
+}
+
+/// Refines the smallest of the sorted differences to the common step: least squares of d = m q over the
+/// differences whose multiple m the step known so far tells beyond doubt.
+fn refine_step(sorted: &[f64]) -> Option<f64> {
+    let mut q = *sorted.first()?;
+    let mut reach = 1.5;
+    while reach < 1e6 {
+        let near = &sorted[..sorted.partition_point(|&d| d < reach * q)];
+        let (mut above, mut below) = (0.0, 0.0);
+        for &d in near {
+            let m = (d / q).round().max(1.0);
+            above += m * d;
+            below += m * m;
+        }
+        q = above / below;
+        if near.len() == sorted.len() || !q.is_finite() {
+            break;
+        }
+        reach *= 3.0;
+    }
+    (q > 0.0 && q.is_finite()).then_some(q)
+}
+
+/// Noise of a channel with its quantisation counted in: max([`noise_sigma`], q/√12), where q is the
+/// [`quantisation_step`] and q/√12 the standard deviation of rounding to it.
+pub fn channel_sigma(y: &[f64]) -> f64 {
+    let rounding = quantisation_step(y).map_or(0.0, |q| q / 12f64.sqrt());
+    // f64::max ignores NaN: an estimate that could not be made must stay one.
+    let noise = noise_sigma(y);
+    if noise.is_nan() { noise } else { noise.max(rounding) }
+}
+
+/// [`channel_sigma`] of channel number `channel` of a recording: the median over its pieces, so that one bad
+/// stretch does not decide. NaN when no piece allows an estimate.
+pub fn recording_sigma(recording: &Recording, channel: usize) -> f64 {
+    let of_piece: Vec<f64> = recording
+        .pieces
+        .iter()
+        .filter_map(|piece| piece.columns.get(channel))
+        .map(|y| channel_sigma(y))
+        .collect();
+    median(&of_piece)
+}
+
+/// Median of the values that are not NaN (the mean of the middle two for an even count); NaN for none.
+pub fn median(values: &[f64]) -> f64 {
+    let mut kept: Vec<f64> = values.iter().copied().filter(|v| !v.is_nan()).collect();
+    if kept.is_empty() {
+        return f64::NAN;
+    }
+    let half = kept.len() / 2;
+    let (below, &mut upper, _) = kept.select_nth_unstable_by(half, f64::total_cmp);
+    if values.len() - values.iter().filter(|v| v.is_nan()).count() == 2 * half {
+        let lower = below.iter().copied().fold(f64::NEG_INFINITY, f64::max);
+        0.5 * (lower + upper)
+    } else {
+        upper
+    }
+}
+
+/// Smallest and largest value that is present.
+pub(crate) fn finite_range(y: &[f64]) -> Option<(f64, f64)> {
+    y.iter().filter(|v| v.is_finite()).fold(None, |range, &v| {
+        Some(range.map_or((v, v), |(low, high): (f64, f64)| (low.min(v), high.max(v))))
+    })
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn medians() {
+        assert_eq!(median(&[3.0, 1.0, 2.0]), 2.0);
+        assert_eq!(median(&[4.0, f64::NAN, 1.0, 2.0, 3.0]), 2.5);
+        assert!(median(&[f64::NAN]).is_nan());
+    }
+
+    #[test]
+    fn a_switch_is_not_quantised_and_a_ramp_with_rounded_cells_is() {
+        let switch: Vec<f64> = (0..400).map(|k| if (k / 10) % 2 == 0 { 0.0 } else { 5.0 }).collect();
+        assert_eq!(quantisation_step(&switch), None);
+        assert_eq!(quantisation_step(&[1.0; 100]), None);
+        assert_eq!(quantisation_step(&[]), None);
+        let encoder = 2.0 * std::f64::consts::PI / 4096.0;
+        // Printed with five decimals: the raster itself is rounded.
+        let y: Vec<f64> = (0..4000)
+            .map(|k| ((0.4 * (f64::from(k) * 0.004).sin() / encoder).round() * encoder * 1e5).round() / 1e5)
+            .collect();
+        let q = quantisation_step(&y).unwrap();
+        assert!((q / encoder - 1.0).abs() < 0.01, "{q} {encoder}");
+    }
+}

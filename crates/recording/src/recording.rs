@@ -1,0 +1,173 @@
+//! The recording itself: channels as in the file, pieces on a uniform grid.
+
+use crate::error::{Place, RecordingError};
+use crate::finding::Finding;
+use crate::grid;
+use std::ops::Range;
+
+/// Fewest samples a recording or a piece of it may have.
+pub const MIN_SAMPLES: usize = 8;
+
+/// One measured signal, as in the file.
+#[derive(Debug, Clone, PartialEq)]
+pub struct Channel {
+    /// Name from the header.
+    pub name: String,
+    /// Unit from the header's brackets, as written; `None` where the header states none.
+    pub unit: Option<String>,
+    /// One value per row of the file, in `unit`; NaN = missing.
+    pub values: Vec<f64>,
+}
+
+impl Channel {
+    /// The header cell: `name` or `name [unit]`.
+    pub fn header(&self) -> String {
+        match &self.unit {
+            Some(unit) => format!("{} [{unit}]", self.name),
+            None => self.name.clone(),
+        }
+    }
+}
+
+/// A stretch without gaps on the uniform grid t = start + k Δt.
+#[derive(Debug, Clone, PartialEq)]
+pub struct Piece {
+    /// Time of the first sample, s after the recording's first sample.
+    pub start: f64,
+    /// Step, s; the same in all pieces of a recording.
+    pub dt: f64,
+    /// Rows of the file it came from (0 = the first row under the header).
+    pub rows: Range<usize>,
+    /// Number of grid points; equals `rows.len()` unless the piece was resampled.
+    pub len: usize,
+    /// Per channel (in the order of [`Recording::channels`]) the `len` samples; NaN = missing.
+    pub columns: Vec<Vec<f64>>,
+    /// Whether the samples were interpolated linearly onto the grid because the times were not uniform.
+    pub resampled: bool,
+}
+
+impl Piece {
+    /// Time of sample `k`, s after the recording's first sample.
+    pub fn time(&self, k: usize) -> f64 {
+        self.start + k as f64 * self.dt
+    }
+
+    /// Time from the first to the last sample, s.
+    pub fn duration(&self) -> f64 {
+        self.len.saturating_sub(1) as f64 * self.dt
+    }
+}
+
+/// One continuous experiment.
+#[derive(Debug, Clone, PartialEq)]
+pub struct Recording {
+    /// File name without its folder.
+    pub name: String,
+    /// The measured signals, in the order of the file.
+    pub channels: Vec<Channel>,
+    /// Time of every row as in the file, s.
+    pub time: Vec<f64>,
+    /// The recording on a uniform grid, split at gaps; at least one.
+    pub pieces: Vec<Piece>,
+    /// What the reader had to mend: gaps, jitter, pieces left out.
+    pub warnings: Vec<Finding>,
+}
+
+impl Recording {
+    /// A recording from columns in memory: a simulation, a test, another file format.
+    ///
+    /// `time` in s, strictly increasing; one value per time in every channel, NaN = missing.
+    ///
+    /// # Errors
+    /// A length that differs from the time's, a time that is not finite or does not increase, an infinite
+    /// value, fewer than 8 rows, or gaps that leave no piece of 8 samples. Lines count rows from 1 here.
+    pub fn from_columns(name: &str, time: Vec<f64>, channels: Vec<Channel>) -> Result<Self, RecordingError> {
+        for (k, &t) in time.iter().enumerate() {
+            let place = || Place::line(name, k as u64 + 1).column(0, "t");
+            if !t.is_finite() {
+                return Err(RecordingError::NotFinite { place: place(), found: t.to_string() });
+            }
+            if k > 0 && t <= time[k - 1] {
+                return Err(RecordingError::TimeNotIncreasing {
+                    place: place(),
+                    found: t,
+                    previous: time[k - 1],
+                    mend: "sort the rows and remove repeated times",
+                });
+            }
+        }
+        for (c, channel) in channels.iter().enumerate() {
+            if channel.values.len() != time.len() {
+                return Err(RecordingError::ColumnLength {
+                    place: Place::file(name).column(c + 1, &channel.name),
+                    found: channel.values.len(),
+                    expected: time.len(),
+                });
+            }
+            if let Some(k) = channel.values.iter().position(|v| v.is_infinite()) {
+                return Err(RecordingError::NotFinite {
+                    place: Place::line(name, k as u64 + 1).column(c + 1, &channel.name),
+                    found: channel.values[k].to_string(),
+                });
+            }
+        }
+        Self::assemble(name, name, time, channels, 0.0)
+    }
+
+    /// Builds the pieces; `label` names the file in errors, `resolution` is the last printed digit of the
+    /// times, s (0 = exact). The caller has checked that the times are finite and increase.
+    pub(crate) fn assemble(
+        label: &str,
+        name: &str,
+        time: Vec<f64>,
+        channels: Vec<Channel>,
+        resolution: f64,
+    ) -> Result<Self, RecordingError> {
+        if time.len() < MIN_SAMPLES {
+            return Err(RecordingError::TooFewRows {
+                place: Place::file(label),
+                rows: time.len(),
+                needed: MIN_SAMPLES,
+                mend: "record for longer or export all samples",
+            });
+        }
+        let grid = grid::find(&time, resolution);
+        let (pieces, warnings) = grid::pieces(&grid, &time, &channels);
+        if pieces.is_empty() {
+            return Err(RecordingError::NoUsablePiece {
+                place: Place::file(label),
+                pieces: grid.stretches.len(),
+                needed: MIN_SAMPLES,
+            });
+        }
+        Ok(Self { name: name.to_owned(), channels, time, pieces, warnings })
+    }
+
+    /// Step Δt that all pieces share, s.
+    pub fn dt(&self) -> f64 {
+        self.pieces.first().map_or(f64::NAN, |piece| piece.dt)
+    }
+
+    /// Time from the first to the last row, s.
+    pub fn duration(&self) -> f64 {
+        match (self.time.first(), self.time.last()) {
+            (Some(first), Some(last)) => last - first,
+            _ => 0.0,
+        }
+    }
+
+    /// Position of the channel called `name`, in [`channels`](Self::channels) and in every piece's columns.
+    pub fn channel_index(&self, name: &str) -> Option<usize> {
+        self.channels.iter().position(|channel| channel.name == name)
+    }
+
+    /// The channel called `name`.
+    pub fn channel(&self, name: &str) -> Option<&Channel> {
+        self.channels.iter().find(|channel| channel.name == name)
+    }
+
+    /// The longest piece.
+    pub fn longest_piece(&self) -> Option<&Piece> {
+        self.pieces.iter().rev().max_by_key(|piece| piece.len)
+    }
+}
