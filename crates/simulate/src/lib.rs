@@ -1,1 +1,7 @@
-//! Simulation of greybox models: events, stick-slip, delays, forward sensitivities.
+//! Simulation of greybox models: events, true stick–slip, delays, forward sensitivities.
+mod integrate;
+mod signal;
+mod small;
+
+pub use integrate::{Environment, Force, Method, Seeds, SignalLanes, Trajectory, integrate};
+pub use signal::{FINE, Signal};

@@ -1,0 +1,397 @@
+//! Recordings laid out for a model: inputs and measurements in SI on uniform grids.
+
+use std::ops::Range;
+use std::sync::OnceLock;
+
+use greybox_model::{Expr, Hold, Model};
+use greybox_recording::{Recording, Smoothed};
+use greybox_simulate::{Environment, FINE, Signal};
+
+/// A recording that does not fit the model.
+#[derive(Debug, Clone, PartialEq, thiserror::Error)]
+#[non_exhaustive]
+pub enum DataError {
+    /// A channel that the model needs is not in the file.
+    #[error(
+        "{file}: there is no channel `{channel}`, which the model's {role} needs; the file has {available}. Rename the column, or state the channel in the model: `{name} = {{ channel = \"…\" }}`"
+    )]
+    MissingChannel {
+        /// File.
+        file: String,
+        /// What was looked for.
+        channel: String,
+        /// Input, state or measurement of the model.
+        role: String,
+        /// Name in the model.
+        name: String,
+        /// What there is instead.
+        available: String,
+    },
+    /// The header's unit and the model's do not measure the same thing.
+    #[error(
+        "{file}: channel `{channel}` is in [{found}], but the model's {role} has the unit `{expected}`; they do not measure the same thing. Correct the header or the model"
+    )]
+    Unit {
+        /// File.
+        file: String,
+        /// Channel.
+        channel: String,
+        /// Header unit.
+        found: String,
+        /// Input, state or measurement of the model.
+        role: String,
+        /// The model's unit.
+        expected: String,
+    },
+    /// The header's unit cannot be read.
+    #[error("{file}: channel `{channel}`: {message}")]
+    UnreadableUnit {
+        /// File.
+        file: String,
+        /// Channel.
+        channel: String,
+        /// Why.
+        message: String,
+    },
+    /// A channel without a single value.
+    #[error("{file}: channel `{channel}` has no value at all; fill the column, or take the channel out of the model")]
+    EmptyChannel {
+        /// File.
+        file: String,
+        /// Channel.
+        channel: String,
+    },
+    /// The model measures nothing.
+    #[error("the model has no measured state: give one a channel, or add [measurements]")]
+    NothingMeasured,
+}
+
+/// A measured channel.
+#[derive(Debug, Clone, PartialEq)]
+pub struct ChannelInfo {
+    /// Name in the recordings.
+    pub name: String,
+    /// Unit as the model writes it.
+    pub unit: String,
+    /// SI value of one of that unit.
+    pub factor: f64,
+}
+
+/// One uniformly sampled stretch.
+#[derive(Debug)]
+pub struct PieceData {
+    /// Which recording it belongs to.
+    pub recording: usize,
+    /// Rows of the file.
+    pub rows: Range<usize>,
+    /// Time of the first sample on the recording's clock, s.
+    pub start: f64,
+    /// Sample interval, s.
+    pub dt: f64,
+    /// Number of samples.
+    pub len: usize,
+    /// Inputs in the model's order, SI, missing samples interpolated.
+    pub inputs: Vec<Vec<f64>>,
+    /// Measurements in the model's order, SI, NaN = missing.
+    pub measured: Vec<Vec<f64>>,
+    /// The measurements smoothed.
+    pub smooth: Vec<Smoothed>,
+    fine: Vec<OnceLock<Vec<f64>>>,
+}
+
+/// All recordings of one role (training or held out), laid out for one model.
+#[derive(Debug)]
+pub struct Data {
+    /// File names.
+    pub recordings: Vec<String>,
+    /// Measured channels in the model's order.
+    pub channels: Vec<ChannelInfo>,
+    /// The pieces, recording by recording.
+    pub pieces: Vec<PieceData>,
+    /// Standard deviation of the measurement noise per channel (SI), median over the recordings.
+    pub sigma: Vec<f64>,
+    /// RMS about the mean per channel over all samples (SI).
+    pub spread: Vec<f64>,
+}
+
+impl Data {
+    /// Lays `recordings` out for `model`.
+    ///
+    /// # Errors
+    /// [`DataError`] when a channel is missing or empty, or a unit in a header does not fit.
+    pub fn new(model: &Model, recordings: &[Recording]) -> Result<Data, DataError> {
+        if model.measurements.is_empty() {
+            return Err(DataError::NothingMeasured);
+        }
+        let mut pieces = Vec::new();
+        let mut sigmas: Vec<Vec<f64>> = vec![Vec::new(); model.measurements.len()];
+        for (index, recording) in recordings.iter().enumerate() {
+            let find = |channel: &str, role: String, name: &str, unit: &greybox_model::Unit| {
+                find_channel(recording, channel, role, name, unit)
+            };
+            let mut inputs = Vec::new();
+            for input in &model.inputs {
+                inputs.push(find(&input.channel, format!("input `{}`", input.name), &input.name, &input.unit)?);
+            }
+            let mut measured = Vec::new();
+            for m in &model.measurements {
+                measured.push(find(&m.channel, format!("measurement `{}`", m.expr), &m.channel, &m.unit)?);
+            }
+            let scaled = |(channel, factor): (usize, f64), piece: &greybox_recording::Piece| -> Vec<f64> {
+                piece.columns[channel].iter().map(|v| v * factor).collect()
+            };
+            let mut of_recording: Vec<Vec<f64>> = vec![Vec::new(); measured.len()];
+            for piece in &recording.pieces {
+                let ys: Vec<Vec<f64>> = measured.iter().map(|&m| scaled(m, piece)).collect();
+                let mut smooth = Vec::new();
+                for (c, y) in ys.iter().enumerate() {
+                    let sigma = greybox_recording::noise::channel_sigma(y);
+                    of_recording[c].push(sigma);
+                    let sigma = if sigma.is_finite() { sigma } else { 0.0 };
+                    smooth.push(greybox_recording::smooth::adaptive(y, piece.dt, sigma));
+                }
+                pieces.push(PieceData {
+                    recording: index,
+                    rows: piece.rows.clone(),
+                    start: piece.start,
+                    dt: piece.dt,
+                    len: piece.len,
+                    inputs: inputs
+                        .iter()
+                        .map(|&i| greybox_recording::interpolate::fill_missing(&scaled(i, piece)))
+                        .collect(),
+                    measured: ys,
+                    smooth,
+                    fine: inputs.iter().map(|_| OnceLock::new()).collect(),
+                });
+            }
+            for (c, values) in of_recording.iter().enumerate() {
+                sigmas[c].push(greybox_recording::noise::median(values));
+            }
+        }
+        let channels: Vec<ChannelInfo> = model
+            .measurements
+            .iter()
+            .map(|m| ChannelInfo {
+                name: m.channel.clone(),
+                unit: m.unit.text.clone(),
+                factor: m.unit.factor,
+            })
+            .collect();
+        let spread: Vec<f64> = (0..channels.len())
+            .map(|c| {
+                let values: Vec<f64> =
+                    pieces.iter().flat_map(|p| p.measured[c].iter().copied()).filter(|v| !v.is_nan()).collect();
+                spread(&values)
+            })
+            .collect();
+        let sigma = sigmas
+            .iter()
+            .zip(&spread)
+            .map(|(s, spread)| {
+                let sigma = greybox_recording::noise::median(s);
+                // A recording without noise (a simulation) still has rounding and integration error.
+                let floor = 1e-6 * spread;
+                if sigma.is_finite() { sigma.max(floor) } else { floor.max(f64::MIN_POSITIVE) }
+            })
+            .collect();
+        Ok(Data {
+            recordings: recordings.iter().map(|r| r.name.clone()).collect(),
+            channels,
+            pieces,
+            sigma,
+            spread,
+        })
+    }
+
+    /// Environments of all pieces under the given holds (one per input).
+    pub fn environments(&self, holds: &[Hold]) -> Vec<Environment> {
+        self.pieces
+            .iter()
+            .map(|piece| Environment {
+                start: piece.start,
+                dt: piece.dt,
+                len: piece.len,
+                inputs: piece
+                    .inputs
+                    .iter()
+                    .zip(&piece.fine)
+                    .zip(holds)
+                    .map(|((u, fine), &hold)| {
+                        Signal::new(hold, piece.dt, u, |u| {
+                            fine.get_or_init(|| {
+                                greybox_recording::interpolate::upsample_band_limited(u, FINE)
+                            })
+                            .clone()
+                        })
+                    })
+                    .collect(),
+                forces: Vec::new(),
+            })
+            .collect()
+    }
+
+    /// Number of samples of each piece.
+    pub fn lengths(&self) -> Vec<usize> {
+        self.pieces.iter().map(|p| p.len).collect()
+    }
+
+    /// The data up to, and from, the sample where the last `share` of each recording begins: used when
+    /// no recording is held out.
+    pub fn split_tail(recordings: &[Recording], share: f64) -> (Vec<Recording>, Vec<Recording>) {
+        let cut = |r: &Recording, head: bool| -> Option<Recording> {
+            let n = r.time.len();
+            let at = ((n as f64) * (1.0 - share)).round() as usize;
+            let range = if head { 0..at } else { at..n };
+            let channels = r
+                .channels
+                .iter()
+                .map(|c| greybox_recording::Channel { values: c.values[range.clone()].to_vec(), ..c.clone() })
+                .collect();
+            let mut part = Recording::from_columns(&r.name, r.time[range].to_vec(), channels).ok()?;
+            part.name = r.name.clone();
+            Some(part)
+        };
+        recordings
+            .iter()
+            .filter_map(|r| match (cut(r, true), cut(r, false)) {
+                (Some(a), Some(b)) => Some((a, b)),
+                _ => None,
+            })
+            .unzip()
+    }
+}
+
+fn find_channel(
+    recording: &Recording,
+    channel: &str,
+    role: String,
+    name: &str,
+    unit: &greybox_model::Unit,
+) -> Result<(usize, f64), DataError> {
+    let file = recording.name.clone();
+    let Some(index) = recording.channels.iter().position(|c| c.name == channel) else {
+        let available: Vec<String> = recording.channels.iter().map(|c| format!("`{}`", c.name)).collect();
+        return Err(DataError::MissingChannel {
+            file,
+            channel: channel.to_string(),
+            role,
+            name: name.to_string(),
+            available: available.join(", "),
+        });
+    };
+    let found = &recording.channels[index];
+    if found.values.iter().all(|v| v.is_nan()) {
+        return Err(DataError::EmptyChannel { file, channel: channel.to_string() });
+    }
+    let factor = match &found.unit {
+        None => unit.factor,
+        Some(text) => {
+            let header = greybox_model::Unit::parse(text).map_err(|e| DataError::UnreadableUnit {
+                file: file.clone(),
+                channel: channel.to_string(),
+                message: e.to_string(),
+            })?;
+            if header.dimension != unit.dimension {
+                return Err(DataError::Unit {
+                    file,
+                    channel: channel.to_string(),
+                    found: text.clone(),
+                    role,
+                    expected: unit.text.clone(),
+                });
+            }
+            header.factor
+        }
+    };
+    Ok((index, factor))
+}
+
+/// RMS about the mean.
+pub fn spread(values: &[f64]) -> f64 {
+    if values.is_empty() {
+        return 0.0;
+    }
+    let mean = values.iter().sum::<f64>() / values.len() as f64;
+    (values.iter().map(|v| (v - mean) * (v - mean)).sum::<f64>() / values.len() as f64).sqrt()
+}
+
+/// What the measurements alone say of the states: value, derivative and their standard errors.
+#[derive(Debug, Clone)]
+pub struct Hats {
+    /// Per piece, per entry of the state vector: the smoothed signal, where a channel measures it.
+    pub states: Vec<Vec<Option<Vec<f64>>>>,
+    /// Per entry of the state vector: standard deviation to allow a start value.
+    pub tolerance: Vec<f64>,
+    /// Per piece, per state of the model: smoothed highest derivative where the state is measured.
+    pub highest: Vec<Vec<Option<Vec<f64>>>>,
+}
+
+impl Hats {
+    /// Smoothed states of every piece: coordinates measured by a channel of their own (q and, from the
+    /// same window, q'), and rates measured by one.
+    pub fn new(model: &Model, data: &Data) -> Hats {
+        let mut sources: Vec<Option<(usize, usize)>> = Vec::new(); // (channel, derivative)
+        let mut highest = Vec::new();
+        for state in &model.states {
+            let channel = |primes: u8| {
+                model.measurements.iter().position(|m| {
+                    matches!(&m.expr, Expr::Var { name, primes: p } if **name == *state.name && *p == primes)
+                })
+            };
+            let (position, rate) = (channel(0), channel(1));
+            for i in 0..state.order {
+                sources.push(match i {
+                    0 => position.map(|c| (c, 0)),
+                    1 => rate.map(|c| (c, 0)).or(position.map(|c| (c, 1))),
+                    2 => rate.map(|c| (c, 1)).or(position.map(|c| (c, 2))),
+                    _ => None,
+                });
+            }
+            highest.push(match state.order {
+                1 => position.map(|c| (c, 1)),
+                2 => rate.map(|c| (c, 1)).or(position.map(|c| (c, 2))),
+                _ => None,
+            });
+        }
+        let pick = |piece: &PieceData, source: &Option<(usize, usize)>| {
+            source.map(|(c, d)| {
+                let s = &piece.smooth[c];
+                match d {
+                    0 => s.value.clone(),
+                    1 => s.d1.clone(),
+                    _ => s.d2.clone(),
+                }
+            })
+        };
+        let states: Vec<Vec<Option<Vec<f64>>>> =
+            data.pieces.iter().map(|p| sources.iter().map(|s| pick(p, s)).collect()).collect();
+        let tolerance = sources
+            .iter()
+            .enumerate()
+            .map(|(i, source)| match source {
+                None => f64::INFINITY,
+                Some((c, d)) => {
+                    let sigma = data.sigma[*c];
+                    let errors: Vec<f64> = data
+                        .pieces
+                        .iter()
+                        .map(|p| match d {
+                            0 => p.smooth[*c].value_std_error(sigma),
+                            1 => p.smooth[*c].d1_std_error(sigma),
+                            _ => f64::INFINITY,
+                        })
+                        .collect();
+                    let all: Vec<f64> =
+                        states.iter().filter_map(|s| s[i].as_ref()).flatten().copied().collect();
+                    // Three standard errors (the ends of a window are worse than its middle), and room
+                    // for what the smoothing bends.
+                    3.0 * errors.iter().copied().fold(0.0, f64::max) + 1e-3 * spread(&all)
+                }
+            })
+            .collect();
+        let highest =
+            data.pieces.iter().map(|p| highest.iter().map(|s| pick(p, s)).collect()).collect();
+        Hats { states, tolerance, highest }
+    }
+}

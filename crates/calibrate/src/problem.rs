@@ -1,0 +1,468 @@
+//! Multiple shooting: output-error least squares over segments with free initial states.
+//!
+//! ```text
+//! minimise  Σ_segments Σ_k Σ_c ((y_c(k) − ŷ_c(k; p, x₀ˢ)) / s_c)²
+//!         + Σ_i ((p_i − p̄_i)/σ_i)²  +  Σ_segments |(x₀ˢ − x̄₀ˢ)/σˢ|²
+//! ```
+//!
+//! over the parameters p and every segment's initial state x₀ˢ (Bock 1981, without the matching
+//! conditions: short segments keep the problem convex, long ones give it power). The initial states
+//! are eliminated segment by segment: Householder QR of \[J_x | J_p | r\] leaves a small triangle per
+//! segment, and the triangles are stacked and factored again.
+
+use std::ops::Range;
+
+use greybox_model::System;
+use greybox_simulate::{Environment, Method, Seeds, SignalLanes, Trajectory, integrate};
+use rayon::prelude::*;
+
+use crate::qr;
+
+/// One stretch of one piece with an initial state of its own.
+#[derive(Debug, Clone, PartialEq)]
+pub struct Segment {
+    /// Index of the piece (environment and measurements).
+    pub piece: usize,
+    /// Samples, the first being where the initial state applies.
+    pub range: Range<usize>,
+}
+
+/// What is believed of an initial state before the segment is fitted: one (mean, σ) per state; an
+/// infinite σ says nothing, σ = 0 pins the state.
+pub type StartPrior = Vec<(f64, f64)>;
+
+/// A parameter the fit may move.
+#[derive(Debug, Clone, PartialEq)]
+pub struct Free {
+    /// Index in the system's parameter vector.
+    pub index: usize,
+    /// Prior mean.
+    pub mean: f64,
+    /// Prior standard deviation (infinite: none).
+    pub std: f64,
+    /// Smallest admissible value.
+    pub lower: f64,
+    /// Largest admissible value.
+    pub upper: f64,
+}
+
+/// The problem; borrowed parts are shared between the many fits of a diagnosis.
+#[derive(Debug, Clone)]
+pub struct Problem<'a> {
+    /// The compiled model.
+    pub system: &'a System,
+    /// One environment per piece.
+    pub environments: &'a [Environment],
+    /// Measurements per piece and channel; NaN = missing.
+    pub measured: &'a [&'a [Vec<f64>]],
+    /// Integration.
+    pub method: Method,
+    /// The segments.
+    pub segments: &'a [Segment],
+    /// One prior per segment.
+    pub start_priors: &'a [StartPrior],
+    /// Parameters to fit.
+    pub free: &'a [Free],
+    /// Residual scale per channel.
+    pub scale: &'a [f64],
+}
+
+/// A point of the search.
+#[derive(Debug, Clone, PartialEq)]
+pub struct Point {
+    /// All parameters of the system.
+    pub parameters: Vec<f64>,
+    /// Initial state of every segment.
+    pub starts: Vec<Vec<f64>>,
+}
+
+/// The linearised problem of one segment. Rows: channel by channel the samples of the segment,
+/// then one row per state for the prior on the start. Missing samples have zero rows.
+#[derive(Debug, Clone)]
+pub struct SegmentRows {
+    /// Number of rows.
+    pub rows: usize,
+    /// Residual (measured − simulated)/scale.
+    pub r: Vec<f64>,
+    /// −∂r/∂x₀, one column per state (zero for pinned ones).
+    pub jx: Vec<f64>,
+    /// −∂r/∂p, one column per free parameter.
+    pub jp: Vec<f64>,
+    /// Response to each signal lane.
+    pub signals: Vec<f64>,
+    /// The trajectory behind it (its sensitivities moved out).
+    pub trajectory: Trajectory,
+}
+
+/// How a fit ended.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum Ending {
+    /// The relative decrease fell below the tolerance.
+    Converged,
+    /// No step decreases the cost any more.
+    Stalled,
+    /// The iteration limit was reached.
+    Limit,
+}
+
+/// Result of [`Problem::fit`].
+#[derive(Debug, Clone)]
+pub struct Fit {
+    /// Where it ended.
+    pub point: Point,
+    /// Cost there, priors included.
+    pub cost: f64,
+    /// Weighted residual sum of squares per channel.
+    pub rss: Vec<f64>,
+    /// Number of measured samples per channel.
+    pub count: Vec<usize>,
+    /// Jacobians evaluated.
+    pub iterations: usize,
+    /// Why it ended.
+    pub ending: Ending,
+}
+
+/// Limits of [`Problem::fit`].
+#[derive(Debug, Clone, Copy)]
+pub struct Limits {
+    /// Most Jacobians.
+    pub iterations: usize,
+    /// Relative decrease of the cost below which a fit has converged.
+    pub tolerance: f64,
+}
+
+impl Default for Limits {
+    fn default() -> Limits {
+        Limits { iterations: 30, tolerance: 1e-6 }
+    }
+}
+
+struct Reduced {
+    /// Triangle of [J_x | J_p | r], stride nx + np + 1.
+    triangle: Vec<f64>,
+}
+
+impl Problem<'_> {
+    /// Simulates every segment and returns its rows; with `jacobian` false only the residuals.
+    pub fn rows(&self, point: &Point, jacobian: bool, signals: Option<&[SignalLanes]>) -> Vec<SegmentRows> {
+        (0..self.segments.len())
+            .into_par_iter()
+            .map(|i| self.segment_rows(i, point, jacobian, signals))
+            .collect()
+    }
+
+    fn segment_rows(
+        &self,
+        i: usize,
+        point: &Point,
+        jacobian: bool,
+        signals: Option<&[SignalLanes]>,
+    ) -> SegmentRows {
+        let segment = &self.segments[i];
+        let (nx, ny, np) = (self.system.nx, self.system.ny, self.free.len());
+        let start = &point.starts[i];
+        let prior = &self.start_priors[i];
+        let seeds = if jacobian {
+            Seeds {
+                parameters: self.free.iter().map(|f| f.index).collect(),
+                initial: (0..nx).collect(),
+                signals: signals.map(|s| s[segment.piece].clone()).unwrap_or_default(),
+            }
+        } else {
+            Seeds::default()
+        };
+        let mut trajectory = integrate(
+            self.system,
+            &self.environments[segment.piece],
+            &point.parameters,
+            start,
+            segment.range.clone(),
+            self.method,
+            &seeds,
+        );
+        let n = segment.range.len();
+        let rows = ny * n + nx;
+        let mut r = vec![0.0; rows];
+        let measured = self.measured[segment.piece];
+        for c in 0..ny {
+            let inverse = 1.0 / self.scale[c];
+            let y = &measured[c][segment.range.clone()];
+            for k in 0..n {
+                let e = (y[k] - trajectory.y[c * n + k]) * inverse;
+                r[c * n + k] = if e.is_finite() { e } else { 0.0 };
+            }
+        }
+        for j in 0..nx {
+            let (mean, std) = prior[j];
+            if std > 0.0 && std.is_finite() {
+                r[ny * n + j] = (mean - start[j]) / std;
+            }
+        }
+        let take = |dy: &[f64], from: usize, lanes: usize| -> Vec<f64> {
+            let mut columns = vec![0.0; lanes * rows];
+            for l in 0..lanes {
+                let column = &mut columns[l * rows..(l + 1) * rows];
+                let d = &dy[(from + l) * ny * n..(from + l + 1) * ny * n];
+                for c in 0..ny {
+                    let inverse = 1.0 / self.scale[c];
+                    let y = &measured[c][segment.range.clone()];
+                    for k in 0..n {
+                        let v = d[c * n + k] * inverse;
+                        column[c * n + k] = if y[k].is_nan() || !v.is_finite() { 0.0 } else { v };
+                    }
+                }
+            }
+            columns
+        };
+        let (mut jx, mut jp, mut columns) = (Vec::new(), Vec::new(), Vec::new());
+        if jacobian {
+            jp = take(&trajectory.dy, 0, np);
+            jx = take(&trajectory.dy, np, nx);
+            columns = take(&trajectory.dy, np + nx, seeds.signals.lanes);
+            for j in 0..nx {
+                let (_, std) = prior[j];
+                if std == 0.0 {
+                    jx[j * rows..(j + 1) * rows].fill(0.0);
+                } else if std.is_finite() {
+                    jx[j * rows + ny * n + j] = 1.0 / std;
+                } else {
+                    // A faint ridge, relative to the column, for a state the segment does not see.
+                    let column = &jx[j * rows..(j + 1) * rows];
+                    let size = qr::dot(column, column).sqrt();
+                    jx[j * rows + ny * n + j] = 1e-5 * size;
+                }
+            }
+            trajectory.dy = Vec::new();
+        }
+        SegmentRows { rows, r, jx, jp, signals: columns, trajectory }
+    }
+
+    fn prior_cost(&self, parameters: &[f64]) -> f64 {
+        self.free
+            .iter()
+            .map(|f| if f.std.is_finite() { ((parameters[f.index] - f.mean) / f.std).powi(2) } else { 0.0 })
+            .sum()
+    }
+
+    /// Cost of a point.
+    pub fn cost(&self, point: &Point) -> f64 {
+        let rows = self.rows(point, false, None);
+        self.cost_of(&rows, point)
+    }
+
+    fn cost_of(&self, rows: &[SegmentRows], point: &Point) -> f64 {
+        rows.iter().map(|s| qr::dot(&s.r, &s.r)).sum::<f64>() + self.prior_cost(&point.parameters)
+    }
+
+    /// Residual sum of squares (in units of the scale) and number of samples per channel.
+    pub fn rss(&self, rows: &[SegmentRows]) -> (Vec<f64>, Vec<usize>) {
+        let ny = self.system.ny;
+        let (mut rss, mut count) = (vec![0.0; ny], vec![0; ny]);
+        for (segment, rows) in self.segments.iter().zip(rows) {
+            let n = segment.range.len();
+            for c in 0..ny {
+                rss[c] += qr::dot(&rows.r[c * n..(c + 1) * n], &rows.r[c * n..(c + 1) * n]);
+                count[c] += self.measured[segment.piece][c][segment.range.clone()]
+                    .iter()
+                    .filter(|v| !v.is_nan())
+                    .count();
+            }
+        }
+        (rss, count)
+    }
+
+    /// Levenberg–Marquardt from `point` (Marquardt scaling, bounds by projection).
+    pub fn fit(&self, point: Point, limits: Limits) -> Fit {
+        let (nx, np) = (self.system.nx, self.free.len());
+        let width = nx + np + 1;
+        let mut point = point;
+        for f in self.free {
+            point.parameters[f.index] = point.parameters[f.index].clamp(f.lower, f.upper);
+        }
+        let mut lambda = 1e-3;
+        let mut ending = Ending::Limit;
+        let mut iterations = 0;
+        let mut rows = self.rows(&point, true, None);
+        let mut cost = self.cost_of(&rows, &point);
+        let mut small = 0;
+        while iterations < limits.iterations {
+            iterations += 1;
+            let reduced: Vec<Reduced> = rows
+                .par_iter()
+                .map(|s| {
+                    let mut a = Vec::with_capacity(width * s.rows);
+                    a.extend_from_slice(&s.jx);
+                    a.extend_from_slice(&s.jp);
+                    a.extend_from_slice(&s.r);
+                    Reduced { triangle: qr::triangle(&mut a, s.rows, width) }
+                })
+                .collect();
+            let global = self.stack(&reduced, &point.parameters, nx, np);
+            let mut accepted = false;
+            for _ in 0..12 {
+                let Some(step) = self.step(&global, np, lambda, &point.parameters) else { break };
+                let mut trial = point.clone();
+                for (f, d) in self.free.iter().zip(&step) {
+                    trial.parameters[f.index] =
+                        (trial.parameters[f.index] + d).clamp(f.lower, f.upper);
+                }
+                let moved: Vec<f64> = self
+                    .free
+                    .iter()
+                    .map(|f| trial.parameters[f.index] - point.parameters[f.index])
+                    .collect();
+                for (i, red) in reduced.iter().enumerate() {
+                    let rhs: Vec<f64> = (0..nx)
+                        .map(|a| {
+                            let row = &red.triangle[a * width..(a + 1) * width];
+                            row[nx + np] - (0..np).map(|b| row[nx + b] * moved[b]).sum::<f64>()
+                        })
+                        .collect();
+                    let dx = qr::back_substitute(&red.triangle, width, nx, &rhs);
+                    let shrink = 1.0 / (1.0 + 0.1 * lambda.min(1e6));
+                    for (j, d) in dx.iter().enumerate() {
+                        if self.start_priors[i][j].1 != 0.0 {
+                            trial.starts[i][j] += d * shrink;
+                        }
+                    }
+                }
+                let value = self.cost(&trial);
+                if value.is_finite() && value < cost {
+                    let decrease = (cost - value) / cost.max(1e-300);
+                    point = trial;
+                    lambda = (lambda * 0.2).max(1e-9);
+                    small = if decrease < limits.tolerance { small + 1 } else { 0 };
+                    cost = value;
+                    accepted = true;
+                    break;
+                }
+                lambda *= if lambda < 1.0 { 10.0 } else { 6.0 };
+                if lambda > 1e12 {
+                    break;
+                }
+            }
+            if !accepted {
+                ending = Ending::Stalled;
+                break;
+            }
+            if small >= 2 || cost < 1e-20 {
+                ending = Ending::Converged;
+                break;
+            }
+            if iterations < limits.iterations {
+                rows = self.rows(&point, true, None);
+            }
+        }
+        let rows = self.rows(&point, false, None);
+        let (rss, count) = self.rss(&rows);
+        Fit { cost: self.cost_of(&rows, &point), point, rss, count, iterations, ending }
+    }
+
+    /// Triangle of [J_p | r] over all segments with the prior's rows, stride np + 1.
+    fn stack(&self, reduced: &[Reduced], parameters: &[f64], nx: usize, np: usize) -> Vec<f64> {
+        let width = nx + np + 1;
+        let m = reduced.len() * (np + 1) + np;
+        let mut a = vec![0.0; m * (np + 1)];
+        for (s, red) in reduced.iter().enumerate() {
+            for i in 0..=np {
+                for j in i..=np {
+                    a[j * m + s * (np + 1) + i] = red.triangle[(nx + i) * width + nx + j];
+                }
+            }
+        }
+        for (i, f) in self.free.iter().enumerate() {
+            if f.std.is_finite() && f.std > 0.0 {
+                let row = reduced.len() * (np + 1) + i;
+                a[i * m + row] = 1.0 / f.std;
+                a[np * m + row] = (f.mean - parameters[f.index]) / f.std;
+            }
+        }
+        qr::triangle(&mut a, m, np + 1)
+    }
+
+    /// Damped step from the global triangle; parameters at a bound that push outward stay.
+    fn step(&self, global: &[f64], np: usize, lambda: f64, parameters: &[f64]) -> Option<Vec<f64>> {
+        if np == 0 {
+            return Some(Vec::new());
+        }
+        let stride = np + 1;
+        let mut held = vec![false; np];
+        for _ in 0..=np {
+            let m = 2 * np;
+            let mut a = vec![0.0; m * stride];
+            for j in 0..np {
+                if held[j] {
+                    // A column of its own row only: the step is zero.
+                    a[j * m + np + j] = 1.0;
+                    continue;
+                }
+                let mut size = 0.0;
+                for i in 0..=j {
+                    a[j * m + i] = global[i * stride + j];
+                    size += global[i * stride + j].powi(2);
+                }
+                a[j * m + np + j] = (lambda * size).sqrt().max(1e-150);
+            }
+            for i in 0..np {
+                a[np * m + i] = global[i * stride + np];
+            }
+            let r = qr::triangle(&mut a, m, stride);
+            let rhs: Vec<f64> = (0..np).map(|i| r[i * stride + np]).collect();
+            let step = qr::back_substitute(&r, stride, np, &rhs);
+            if !step.iter().all(|v| v.is_finite()) {
+                return None;
+            }
+            let mut changed = false;
+            for (j, f) in self.free.iter().enumerate() {
+                let at = parameters[f.index];
+                let outward = (at <= f.lower && step[j] < 0.0) || (at >= f.upper && step[j] > 0.0);
+                if outward && !held[j] {
+                    held[j] = true;
+                    changed = true;
+                }
+            }
+            if !changed {
+                return Some(step);
+            }
+        }
+        None
+    }
+}
+
+/// Cuts `lengths[i]` samples of each piece into about `count` segments in all, none shorter than
+/// `least` samples where the piece allows it, never across a piece's end.
+pub fn segments(lengths: &[usize], count: usize, least: usize) -> Vec<Segment> {
+    let total: usize = lengths.iter().sum();
+    let mut out = Vec::new();
+    for (piece, &n) in lengths.iter().enumerate() {
+        if n < 2 {
+            continue;
+        }
+        let share = (count as f64 * n as f64 / total as f64).round() as usize;
+        let parts = share.clamp(1, (n / least.max(1)).max(1));
+        for i in 0..parts {
+            let (a, b) = (i * n / parts, (i + 1) * n / parts);
+            out.push(Segment { piece, range: a..b });
+        }
+    }
+    out
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn segments_tile_every_piece_and_respect_the_least_length() {
+        let s = segments(&[1000, 500, 30], 15, 40);
+        let mut next = [0; 3];
+        for seg in &s {
+            assert_eq!(seg.range.start, next[seg.piece]);
+            next[seg.piece] = seg.range.end;
+            assert!(seg.range.len() >= 30);
+        }
+        assert_eq!(next, [1000, 500, 30]);
+        assert_eq!(s.len(), 10 + 5 + 1);
+        assert!(segments(&[100], 60, 40).len() == 2);
+    }
+}

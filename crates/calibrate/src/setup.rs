@@ -1,0 +1,336 @@
+//! A model together with the data it is fitted to: everything the fits of a diagnosis share.
+
+use std::sync::Arc;
+
+use greybox_model::{Hold, Model, System};
+use greybox_simulate::{Environment, Method, Seeds, integrate};
+use rayon::prelude::*;
+
+use crate::data::{Data, Hats};
+use crate::problem::{Fit, Free, Limits, Point, Problem, Segment, StartPrior, segments};
+
+/// Shortest segment, samples.
+const LEAST: usize = 40;
+
+/// A compiled model, its data, and how to integrate it.
+#[derive(Debug, Clone)]
+pub struct Setup {
+    /// The model.
+    pub model: Model,
+    /// The model compiled.
+    pub system: Arc<System>,
+    /// The data.
+    pub data: Arc<Data>,
+    /// Smoothed measurements as states.
+    pub hats: Arc<Hats>,
+    /// Hold of each input.
+    pub holds: Vec<Hold>,
+    /// One environment per piece.
+    pub environments: Arc<Vec<Environment>>,
+    /// Integration method.
+    pub method: Method,
+    /// Parameters to fit with priors and bounds.
+    pub free: Vec<Free>,
+}
+
+/// A choice of segments with the priors of their starts.
+#[derive(Debug, Clone)]
+pub struct Level {
+    /// The segments.
+    pub segments: Vec<Segment>,
+    /// Prior of each segment's initial state.
+    pub priors: Vec<StartPrior>,
+}
+
+impl Setup {
+    /// Lays out a model. `nominal_free` are the parameters to fit (see [`free_parameters`]).
+    ///
+    /// # Errors
+    /// When the model does not compile.
+    pub fn new(
+        model: &Model,
+        data: Arc<Data>,
+        free: Vec<Free>,
+    ) -> Result<Setup, greybox_model::system::CompileError> {
+        let system = Arc::new(System::compile(model)?);
+        let hats = Arc::new(Hats::new(model, &data));
+        let holds: Vec<Hold> = model.inputs.iter().map(|i| i.hold).collect();
+        let environments = Arc::new(data.environments(&holds));
+        let mut setup = Setup {
+            model: model.clone(),
+            system,
+            data,
+            hats,
+            holds,
+            environments,
+            method: Method::Rk4 { substeps: 1 },
+            free,
+        };
+        setup.choose_method();
+        Ok(setup)
+    }
+
+    /// The same data with another model of the same measurements (a mechanism added).
+    ///
+    /// # Errors
+    /// When the model does not compile.
+    pub fn with_model(
+        &self,
+        model: Model,
+        free: Vec<Free>,
+    ) -> Result<Setup, greybox_model::system::CompileError> {
+        let system = Arc::new(System::compile(&model)?);
+        let hats = if system.nx == self.system.nx {
+            self.hats.clone()
+        } else {
+            Arc::new(Hats::new(&model, &self.data))
+        };
+        Ok(Setup { model, system, hats, free, ..self.clone() })
+    }
+
+    /// The same with other holds.
+    pub fn with_holds(&self, holds: Vec<Hold>) -> Setup {
+        let environments = Arc::new(self.data.environments(&holds));
+        let mut model = self.model.clone();
+        for (input, hold) in model.inputs.iter_mut().zip(&holds) {
+            input.hold = *hold;
+        }
+        let mut setup = Setup { holds, environments, model, ..self.clone() };
+        setup.choose_method();
+        setup
+    }
+
+    /// The cheapest fixed-step method whose error stays below a twentieth of the noise (or 10⁻⁶ of the
+    /// signal) over a stretch of the data, judged against Dormand–Prince with tight tolerances.
+    pub fn choose_method(&mut self) {
+        let Some((piece, data)) =
+            self.data.pieces.iter().enumerate().max_by_key(|(_, p)| p.len.min(1500))
+        else {
+            return;
+        };
+        let n = data.len.min(1500);
+        let parameters: Vec<f64> = self.model.parameters.iter().map(|p| p.value).collect();
+        let x0 = self.start(piece, 0);
+        let run = |method| {
+            let seeds = Seeds::default();
+            integrate(&self.system, &self.environments[piece], &parameters, &x0, 0..n, method, &seeds)
+        };
+        let reference = run(Method::Adaptive { rtol: 1e-9, atol: 1e-10 });
+        let good = reference.diverged.unwrap_or(n).saturating_sub(1).max(2);
+        let ladder = [
+            Method::Rk4 { substeps: 1 },
+            Method::Dp5 { substeps: 1 },
+            Method::Dp5 { substeps: 2 },
+            Method::Dp5 { substeps: 4 },
+            Method::Dp5 { substeps: 8 },
+            Method::Dp5 { substeps: 16 },
+        ];
+        self.method = Method::Dp5 { substeps: 32 };
+        for method in ladder {
+            let trial = run(method);
+            let accurate = (0..self.system.ny).all(|c| {
+                let limit = (0.05 * self.data.sigma[c]).max(1e-6 * self.data.spread[c]);
+                (0..good).all(|k| {
+                    (trial.y[c * n + k] - reference.y[c * n + k]).abs() <= limit
+                })
+            });
+            if accurate {
+                self.method = method;
+                break;
+            }
+        }
+    }
+
+    /// Parameter values of the model.
+    pub fn values(&self) -> Vec<f64> {
+        self.model.parameters.iter().map(|p| p.value).collect()
+    }
+
+    /// State at a sample as the measurements tell it; unmeasured entries are the given initial value or
+    /// zero.
+    pub fn start(&self, piece: usize, sample: usize) -> Vec<f64> {
+        let mut x = self.given_start();
+        for (v, hat) in x.iter_mut().zip(&self.hats.states[piece]) {
+            if let Some(hat) = hat
+                && hat[sample].is_finite()
+            {
+                *v = hat[sample];
+            }
+        }
+        x
+    }
+
+    fn given_start(&self) -> Vec<f64> {
+        let mut x = vec![0.0; self.system.nx];
+        for (j, state) in self.model.states.iter().enumerate() {
+            for (i, v) in state.initial.iter().enumerate().take(state.order) {
+                x[self.system.offsets[j] + i] = *v;
+            }
+        }
+        x
+    }
+
+    /// Prior of the state at a sample: where it is measured, the smoothed value; at a recording's
+    /// start, the given initial values pin it.
+    pub fn start_prior(&self, piece: usize, sample: usize) -> StartPrior {
+        let mut prior: StartPrior = self.hats.states[piece]
+            .iter()
+            .zip(&self.hats.tolerance)
+            .map(|(hat, tolerance)| match hat {
+                Some(h) if h[sample].is_finite() => (h[sample], *tolerance),
+                _ => (0.0, f64::INFINITY),
+            })
+            .collect();
+        if sample == 0 && self.data.pieces[piece].start == 0.0 {
+            for (j, state) in self.model.states.iter().enumerate() {
+                for (i, v) in state.initial.iter().enumerate().take(state.order) {
+                    prior[self.system.offsets[j] + i] = (*v, 0.0);
+                }
+            }
+        }
+        prior
+    }
+
+    /// About `count` segments over all pieces.
+    pub fn level(&self, count: usize) -> Level {
+        let segments = segments(&self.data.lengths(), count, LEAST);
+        let priors = segments.iter().map(|s| self.start_prior(s.piece, s.range.start)).collect();
+        Level { segments, priors }
+    }
+
+    /// Initial states from the measurements; unmeasured entries from a simulation with `parameters`.
+    pub fn starts(&self, level: &Level, parameters: &[f64]) -> Vec<Vec<f64>> {
+        let unmeasured: Vec<usize> =
+            (0..self.system.nx).filter(|&i| self.hats.tolerance[i].is_infinite()).collect();
+        let runs: Vec<Option<Vec<f64>>> = if unmeasured.is_empty() {
+            Vec::new()
+        } else {
+            self.data
+                .pieces
+                .par_iter()
+                .enumerate()
+                .map(|(i, piece)| {
+                    let x0 = self.start(i, 0);
+                    let run = integrate(
+                        &self.system,
+                        &self.environments[i],
+                        parameters,
+                        &x0,
+                        0..piece.len,
+                        self.method,
+                        &Seeds::default(),
+                    );
+                    run.diverged.is_none().then_some(run.x)
+                })
+                .collect()
+        };
+        level
+            .segments
+            .iter()
+            .map(|s| {
+                let mut x = self.start(s.piece, s.range.start);
+                for &i in &unmeasured {
+                    if let Some(Some(run)) = runs.get(s.piece)
+                        && s.range.start > 0
+                    {
+                        x[i] = run[i * self.data.pieces[s.piece].len + s.range.start];
+                    }
+                }
+                x
+            })
+            .collect()
+    }
+
+    /// Runs `f` on the shooting problem of a level.
+    pub fn with_problem<R>(&self, level: &Level, scale: &[f64], f: impl FnOnce(&Problem<'_>) -> R) -> R {
+        self.with_problem_in(&self.environments, level, scale, f)
+    }
+
+    /// [`with_problem`](Self::with_problem) in other environments (with exogenous forces added).
+    pub fn with_problem_in<R>(
+        &self,
+        environments: &[Environment],
+        level: &Level,
+        scale: &[f64],
+        f: impl FnOnce(&Problem<'_>) -> R,
+    ) -> R {
+        let measured: Vec<&[Vec<f64>]> =
+            self.data.pieces.iter().map(|p| p.measured.as_slice()).collect();
+        f(&Problem {
+            system: &self.system,
+            environments,
+            measured: &measured,
+            method: self.method,
+            segments: &level.segments,
+            start_priors: &level.priors,
+            free: &self.free,
+            scale,
+        })
+    }
+
+    /// Fits from the cheapest of several starting points.
+    pub fn fit(&self, level: &Level, scale: &[f64], points: &[Point], limits: Limits) -> Fit {
+        self.with_problem(level, scale, |problem| {
+            let best = points
+                .iter()
+                .map(|p| (problem.cost(p), p))
+                .min_by(|a, b| a.0.total_cmp(&b.0))
+                .map(|(_, p)| p.clone())
+                .unwrap_or_else(|| Point { parameters: self.values(), starts: Vec::new() });
+            problem.fit(best, limits)
+        })
+    }
+
+    /// Start values for a finer or coarser level read off a fitted trajectory (stitched segments).
+    pub fn stitch(&self, from: &Level, fit: &Point, to: &Level, scale: &[f64]) -> Point {
+        let rows = self.with_problem(from, scale, |p| p.rows(fit, false, None));
+        let starts = to
+            .segments
+            .iter()
+            .enumerate()
+            .map(|(i, s)| {
+                for (j, f) in from.segments.iter().enumerate() {
+                    if f.piece == s.piece && f.range.contains(&s.range.start) {
+                        let t = &rows[j].trajectory;
+                        let k = s.range.start - f.range.start;
+                        let mut x: Vec<f64> = (0..self.system.nx).map(|r| t.x[r * t.n + k]).collect();
+                        for (x, (mean, std)) in x.iter_mut().zip(&to.priors[i]) {
+                            if *std == 0.0 {
+                                *x = *mean;
+                            }
+                        }
+                        return x;
+                    }
+                }
+                self.start(s.piece, s.range.start)
+            })
+            .collect();
+        Point { parameters: fit.parameters.clone(), starts }
+    }
+}
+
+/// The parameters calibration may move: those not fixed. The prior is N(value, std) where `std` is
+/// stated and N(value, |value|/2) where not; a parameter keeps its sign (at least 2 % of its value).
+pub fn free_parameters(model: &Model) -> Vec<Free> {
+    model
+        .parameters
+        .iter()
+        .enumerate()
+        .filter(|(_, p)| !p.fixed)
+        .map(|(index, p)| {
+            let std = match p.std {
+                Some(std) if std > 0.0 => std,
+                _ if p.value != 0.0 => 0.5 * p.value.abs(),
+                _ => f64::INFINITY,
+            };
+            let (lower, upper) = if p.value > 0.0 {
+                (0.02 * p.value, f64::INFINITY)
+            } else if p.value < 0.0 {
+                (f64::NEG_INFINITY, 0.02 * p.value)
+            } else {
+                (f64::NEG_INFINITY, f64::INFINITY)
+            };
+            Free { index, mean: p.value, std, lower, upper }
+        })
+        .collect()
+}

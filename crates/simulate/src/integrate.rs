@@ -1,0 +1,1383 @@
+//! The integrator: explicit Runge–Kutta on the tape, with events, true stick–slip, delays and
+//! forward sensitivities.
+//!
+//! **Within a step** every non-smooth function keeps its branch (its *mode*), so the right-hand side
+//! is smooth and the method keeps its order. After a trial step the arguments tell whether a mode was
+//! left; the instant is then located by the Illinois method on re-integrated partial steps, the mode
+//! changes there, and the rest of the step goes on.
+//!
+//! **Sticking.** When the argument g of a `sign` reaches zero, the value λ that keeps ġ = 0 is
+//! computed from ġ = a + Bλ. If |λ| ≤ 1 (and B < 0) the set-valued sign holds: λ takes that value at
+//! every stage and g stays exactly zero, until |λ| would exceed 1 (Filippov's solution; no
+//! smoothing, no chatter).
+//!
+//! **Sensitivities.** S = ∂x/∂(parameters, initial state, signal amplitudes) obeys the variational
+//! equation Ṡ = f_x S + f_p, integrated by differentiating each Runge–Kutta stage (so S is the exact
+//! derivative of the computed trajectory between events). At an event on g(t, x, p) = 0 it jumps by
+//! the saltation term
+//!
+//! ```text
+//! S⁺ = S⁻ + (f⁻ − f⁺) dtₑ,      dtₑ = −(∇g·S⁻ + g_p) / ġ⁻
+//! ```
+//!
+//! (Hiskens & Pai, "Trajectory sensitivity analysis of hybrid systems", IEEE Trans. Circuits Syst. I
+//! 47(2), 2000).
+
+use greybox_model::Hold;
+use greybox_model::system::System;
+use greybox_model::tape::SwitchKind;
+
+use crate::signal::Signal;
+use crate::small;
+
+/// How to step.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub enum Method {
+    /// Classical fourth-order Runge–Kutta, `substeps` equal steps between two samples.
+    Rk4 {
+        /// Steps per sample interval (≥ 1).
+        substeps: usize,
+    },
+    /// Dormand–Prince 5 with fixed steps.
+    Dp5 {
+        /// Steps per sample interval (≥ 1).
+        substeps: usize,
+    },
+    /// Dormand–Prince 5(4) with error control; steps never straddle a sample.
+    Adaptive {
+        /// Relative tolerance.
+        rtol: f64,
+        /// Absolute tolerance, relative to the magnitude each state has reached so far.
+        atol: f64,
+    },
+}
+
+/// Everything from outside that acts on the system during one uniformly sampled piece.
+#[derive(Debug, Clone)]
+pub struct Environment {
+    /// Time of the first sample on the recording's clock, s.
+    pub start: f64,
+    /// Sample interval, s.
+    pub dt: f64,
+    /// Number of samples.
+    pub len: usize,
+    /// One signal per input of the model.
+    pub inputs: Vec<Signal>,
+    /// Exogenous generalised forces, linear between samples.
+    pub forces: Vec<Force>,
+}
+
+/// An exogenous force F(t) that enters equation e as `weights[e] * F` on its left side.
+#[derive(Debug, Clone)]
+pub struct Force {
+    /// One weight per equation.
+    pub weights: Vec<f64>,
+    /// One value per sample.
+    pub samples: Vec<f64>,
+}
+
+/// Directions of the sensitivities, in the order of the lanes of the result: parameters, then
+/// initial states, then signals.
+#[derive(Debug, Clone, Default)]
+pub struct Seeds {
+    /// Indices of parameters.
+    pub parameters: Vec<usize>,
+    /// Indices into the state vector.
+    pub initial: Vec<usize>,
+    /// Exogenous directions.
+    pub signals: SignalLanes,
+}
+
+/// Directions that are signals: each adds a force, or a change of an input, to the trajectory.
+#[derive(Debug, Clone, Default)]
+pub struct SignalLanes {
+    /// How many.
+    pub lanes: usize,
+    /// Weight of each lane's force in each equation, `equations × lanes`.
+    pub weights: Vec<f64>,
+    /// The forces, `samples × lanes` (empty: none).
+    pub force: Vec<f64>,
+    /// Changes of inputs: (input, `samples × lanes`).
+    pub inputs: Vec<(usize, Vec<f64>)>,
+}
+
+impl Seeds {
+    /// Number of directions.
+    pub fn lanes(&self) -> usize {
+        self.parameters.len() + self.initial.len() + self.signals.lanes
+    }
+}
+
+/// A simulated stretch of `n` samples.
+#[derive(Debug, Clone, Default)]
+pub struct Trajectory {
+    /// Number of samples.
+    pub n: usize,
+    /// Outputs, channel by channel: `y[c * n + k]`.
+    pub y: Vec<f64>,
+    /// States: `x[i * n + k]`.
+    pub x: Vec<f64>,
+    /// Sensitivities of the outputs: `dy[(lane * ny + c) * n + k]`.
+    pub dy: Vec<f64>,
+    /// First sample at which the solution had left every reasonable bound; it is frozen from there.
+    pub diverged: Option<usize>,
+    /// Number of located events.
+    pub events: usize,
+    /// Evaluations of the right-hand side.
+    pub evaluations: usize,
+    /// Accepted steps.
+    pub steps: usize,
+}
+
+struct Tableau {
+    a: &'static [&'static [f64]],
+    b: &'static [f64],
+    c: &'static [f64],
+    /// Error weights, the last for the derivative at the step's end.
+    e: &'static [f64],
+}
+
+static RK4: Tableau = Tableau {
+    a: &[&[], &[0.5], &[0.0, 0.5], &[0.0, 0.0, 1.0]],
+    b: &[1.0 / 6.0, 1.0 / 3.0, 1.0 / 3.0, 1.0 / 6.0],
+    c: &[0.0, 0.5, 0.5, 1.0],
+    e: &[],
+};
+
+// Dormand & Prince, J. Comp. Appl. Math. 6 (1980) 19–26.
+static DP5: Tableau = Tableau {
+    a: &[
+        &[],
+        &[1.0 / 5.0],
+        &[3.0 / 40.0, 9.0 / 40.0],
+        &[44.0 / 45.0, -56.0 / 15.0, 32.0 / 9.0],
+        &[19372.0 / 6561.0, -25360.0 / 2187.0, 64448.0 / 6561.0, -212.0 / 729.0],
+        &[9017.0 / 3168.0, -355.0 / 33.0, 46732.0 / 5247.0, 49.0 / 176.0, -5103.0 / 18656.0],
+    ],
+    b: &[35.0 / 384.0, 0.0, 500.0 / 1113.0, 125.0 / 192.0, -2187.0 / 6784.0, 11.0 / 84.0],
+    c: &[0.0, 0.2, 0.3, 0.8, 8.0 / 9.0, 1.0],
+    e: &[
+        71.0 / 57600.0,
+        0.0,
+        -71.0 / 16695.0,
+        71.0 / 1920.0,
+        -17253.0 / 339200.0,
+        22.0 / 525.0,
+        -1.0 / 40.0,
+    ],
+};
+
+/// One evaluation of the right-hand side, kept for the tangent pass.
+struct Stage {
+    regs: Vec<f64>,
+    f: Vec<f64>,
+    z: Vec<f64>,
+    lu: Vec<f64>,
+    pivots: Vec<usize>,
+    slopes: Vec<f64>,
+    delayed_slopes: Vec<f64>,
+    s: f64,
+    mid: f64,
+    lambda: Vec<f64>,
+    /// For each sticking switch: gradient of its argument (nx), and f(λ=1) − f(λ=0) (nx).
+    gradient: Vec<f64>,
+    pull: Vec<f64>,
+    /// B of the sticking switches, factored.
+    b: Vec<f64>,
+    b_pivots: Vec<usize>,
+    b_diagonal: Vec<f64>,
+    b_ok: bool,
+}
+
+/// Past values of a delayed expression.
+#[derive(Debug, Clone, Default)]
+struct History {
+    s: Vec<f64>,
+    value: Vec<f64>,
+    slope: Vec<f64>,
+    lanes: Vec<f64>,
+}
+
+impl History {
+    fn push(&mut self, s: f64, value: f64, slope: f64, lanes: &[f64]) {
+        if let Some(&last) = self.s.last()
+            && s <= last
+        {
+            // A second visit to the same instant (an event): the newer values count.
+            let n = lanes.len();
+            let at = self.s.len() - 1;
+            self.value[at] = value;
+            self.slope[at] = slope;
+            self.lanes[at * n..].copy_from_slice(lanes);
+            return;
+        }
+        self.s.push(s);
+        self.value.push(value);
+        self.slope.push(slope);
+        self.lanes.extend_from_slice(lanes);
+    }
+
+    /// Cubic Hermite value and slope at `s`, and the index and weight for the lanes.
+    fn at(&self, s: f64) -> (f64, f64, usize, f64) {
+        let n = self.s.len();
+        if n == 0 || s <= self.s[0] {
+            return (self.value.first().copied().unwrap_or(0.0), 0.0, 0, 0.0);
+        }
+        let i = self.s.partition_point(|&t| t <= s).min(n - 1).max(1) - 1;
+        if i + 1 >= n {
+            return (self.value[n - 1], 0.0, n - 1, 0.0);
+        }
+        let h = self.s[i + 1] - self.s[i];
+        let w = (s - self.s[i]) / h;
+        let (y0, y1, d0, d1) =
+            (self.value[i], self.value[i + 1], self.slope[i] * h, self.slope[i + 1] * h);
+        if w > 1.0 {
+            // A delay shorter than the step: straight on from the newest value.
+            return (y1 + (w - 1.0) * d1, d1 / h, i + 1, 0.0);
+        }
+        let (c2, c3) = (3.0 * (y1 - y0) - 2.0 * d0 - d1, 2.0 * (y0 - y1) + d0 + d1);
+        let value = y0 + w * (d0 + w * (c2 + w * c3));
+        let slope = (d0 + w * (2.0 * c2 + 3.0 * w * c3)) / h;
+        (value, slope, i, w)
+    }
+}
+
+/// The trajectory's magnitude, relative to its inputs and start, beyond which it counts as diverged.
+const LIMIT: f64 = 1e9;
+/// Events in one sample interval beyond which events are no longer located (a contact that
+/// bounces infinitely often in finite time).
+const MOST_EVENTS: usize = 200;
+
+/// Simulates samples `from..to` of `env` from state `x0` at sample `from`.
+///
+/// `x0` has `system.nx` entries, `parameters` `system.np`; `env.inputs` one signal per input. The
+/// caller has checked the shapes ([`crate::simulate`] does for user input).
+pub fn integrate(
+    system: &System,
+    env: &Environment,
+    parameters: &[f64],
+    x0: &[f64],
+    range: std::ops::Range<usize>,
+    method: Method,
+    seeds: &Seeds,
+) -> Trajectory {
+    let mut core = Core::new(system, env, parameters, x0, range.start as f64 * env.dt, method, seeds);
+    core.run(range)
+}
+
+struct Core<'a> {
+    system: &'a System,
+    env: &'a Environment,
+    seeds: &'a Seeds,
+    tableau: &'static Tableau,
+    substeps: usize,
+    tolerance: Option<(f64, f64)>,
+    lanes: usize,
+    stages: Vec<Stage>,
+    modes: Vec<i8>,
+    sticking: Vec<usize>,
+    live: Vec<usize>,
+    scale: Vec<f64>,
+    s: f64,
+    x: Vec<f64>,
+    x1: Vec<f64>,
+    xs: Vec<f64>,
+    reach: Vec<f64>,
+    dx: Vec<f64>,
+    dxs: Vec<f64>,
+    dk: Vec<f64>,
+    d: Vec<f64>,
+    active: Vec<bool>,
+    b: Vec<f64>,
+    dlambda: Vec<f64>,
+    gd: Vec<f64>,
+    gactive: Vec<bool>,
+    h_next: f64,
+    fresh: bool,
+    zero_hold: bool,
+    events_here: usize,
+    rhs_history: Vec<History>,
+    out_regs: Vec<f64>,
+    out_modes: Vec<i8>,
+    out_d: Vec<f64>,
+    out_active: Vec<bool>,
+    out_history: Vec<History>,
+    start_s: f64,
+    result: Trajectory,
+}
+
+impl<'a> Core<'a> {
+    fn new(
+        system: &'a System,
+        env: &'a Environment,
+        parameters: &'a [f64],
+        x0: &[f64],
+        s: f64,
+        method: Method,
+        seeds: &'a Seeds,
+    ) -> Core<'a> {
+        let (nx, nz) = (system.nx, system.nz);
+        let lanes = seeds.lanes();
+        let (tableau, substeps, tolerance) = match method {
+            Method::Rk4 { substeps } => (&RK4, substeps.max(1), None),
+            Method::Dp5 { substeps } => (&DP5, substeps.max(1), None),
+            Method::Adaptive { rtol, atol } => (&DP5, 1, Some((rtol, atol))),
+        };
+        let tape = &system.rhs;
+        let mut modes = vec![1i8; tape.switches.len()];
+        let mut regs = vec![0.0; tape.registers()];
+        regs[system.parameters()..][..system.np].copy_from_slice(parameters);
+        tape.prepare(&mut regs, &mut modes);
+        let stage = |regs: &Vec<f64>| Stage {
+            regs: regs.clone(),
+            f: vec![0.0; nx],
+            z: vec![0.0; nz],
+            lu: vec![0.0; nz * nz],
+            pivots: vec![0; nz],
+            slopes: vec![0.0; system.nu],
+            delayed_slopes: vec![0.0; tape.delays.len()],
+            s: 0.0,
+            mid: 0.0,
+            lambda: vec![0.0; tape.switches.len()],
+            gradient: Vec::new(),
+            pull: Vec::new(),
+            b: Vec::new(),
+            b_pivots: Vec::new(),
+            b_diagonal: Vec::new(),
+            b_ok: true,
+        };
+        let mut stages: Vec<Stage> = (0..=tableau.b.len()).map(|_| stage(&regs)).collect();
+        if system.mass_is_fixed {
+            for st in &mut stages {
+                for (m, &r) in st.lu.iter_mut().zip(&tape.outputs[..nz * nz]) {
+                    *m = regs[r as usize];
+                }
+                small::factor(&mut st.lu, &mut st.pivots, nz);
+            }
+        }
+        // Which registers have tangents.
+        let mut leaf_active = vec![false; tape.leaves()];
+        let seeded_states = lanes > 0;
+        leaf_active[System::STATES..System::STATES + nx].fill(seeded_states);
+        for &p in &seeds.parameters {
+            leaf_active[system.parameters() + p] = true;
+        }
+        for (i, _) in &seeds.signals.inputs {
+            leaf_active[system.inputs() + i] = true;
+        }
+        for leaf in &mut leaf_active[system.delayed()..] {
+            *leaf = seeded_states;
+        }
+        let active = tape.activity(&leaf_active, true);
+        let mut d = vec![0.0; tape.registers() * lanes];
+        for (l, &p) in seeds.parameters.iter().enumerate() {
+            d[(system.parameters() + p) * lanes + l] = 1.0;
+        }
+        if lanes > 0 {
+            tape.prepare_tangent(&regs, &modes, lanes, &active, &mut d);
+        }
+        let mut gleaf = vec![true; tape.leaves()];
+        gleaf[system.parameters()..system.parameters() + system.np].fill(false);
+        let gactive = tape.activity(&gleaf, false);
+
+        let out = &system.output;
+        let mut out_regs = vec![0.0; out.registers()];
+        out_regs[system.parameters()..][..system.np].copy_from_slice(parameters);
+        let mut out_modes = vec![1i8; out.switches.len()];
+        out.prepare(&mut out_regs, &mut out_modes);
+        let mut out_leaf_active = vec![seeded_states; out.leaves()];
+        out_leaf_active[System::TIME] = false;
+        let out_active = out.activity(&out_leaf_active, false);
+        let mut out_d = vec![0.0; out.registers() * lanes];
+        for (l, &p) in seeds.parameters.iter().enumerate() {
+            out_d[(system.parameters() + p) * lanes + l] = 1.0;
+        }
+        if lanes > 0 {
+            out.prepare_tangent(&out_regs, &out_modes, lanes, &out_active, &mut out_d);
+        }
+        let mut dx = vec![0.0; nx * lanes];
+        for (l, &i) in seeds.initial.iter().enumerate() {
+            dx[i * lanes + seeds.parameters.len() + l] = 1.0;
+        }
+        // A state delay shorter than the step would read the future: shorten the steps.
+        let mut substeps = substeps;
+        for delay in &tape.delays {
+            if !input_leaf(system, delay.arg_leaf) {
+                let tau = regs[delay.tau as usize];
+                if tau > 0.0 && tau < env.dt / substeps as f64 {
+                    substeps = ((env.dt / tau).ceil() as usize).clamp(substeps, 64);
+                }
+            }
+        }
+        let live = (0..tape.switches.len()).filter(|&k| tape.switches[k].live).collect();
+        Core {
+            system,
+            env,
+            seeds,
+            tableau,
+            substeps,
+            tolerance,
+            lanes,
+            sticking: Vec::new(),
+            live,
+            scale: vec![0.0; modes.len()],
+            modes,
+            s,
+            x: x0.to_vec(),
+            x1: vec![0.0; nx],
+            xs: vec![0.0; nx],
+            reach: x0.iter().map(|v| v.abs()).collect(),
+            dx,
+            dxs: vec![0.0; nx * lanes],
+            dk: vec![0.0; tableau.b.len() * nx * lanes],
+            d,
+            active,
+            b: vec![0.0; nz * lanes.max(1)],
+            dlambda: vec![0.0; tape.switches.len() * lanes],
+            gd: Vec::new(),
+            gactive,
+            h_next: env.dt,
+            fresh: false,
+            zero_hold: env.inputs.iter().any(|u| u.hold() == Hold::Zero),
+            events_here: 0,
+            rhs_history: vec![History::default(); tape.delays.len()],
+            out_regs,
+            out_modes,
+            out_d,
+            out_active,
+            out_history: vec![History::default(); out.delays.len()],
+            start_s: s,
+            result: Trajectory::default(),
+            stages,
+        }
+    }
+
+    fn run(&mut self, range: std::ops::Range<usize>) -> Trajectory {
+        let n = range.len();
+        let (nx, ny, lanes) = (self.system.nx, self.system.ny, self.lanes);
+        self.result = Trajectory {
+            n,
+            y: vec![0.0; ny * n],
+            x: vec![0.0; nx * n],
+            dy: vec![0.0; lanes * ny * n],
+            ..Trajectory::default()
+        };
+        self.start_modes();
+        for (row, k) in range.clone().enumerate() {
+            let s0 = k as f64 * self.env.dt;
+            self.s = s0;
+            self.record(row);
+            if self.result.diverged.is_some() {
+                self.freeze(row, n);
+                break;
+            }
+            if row + 1 == n {
+                break;
+            }
+            self.events_here = 0;
+            if self.zero_hold {
+                self.fresh = false;
+            }
+            let s1 = (k + 1) as f64 * self.env.dt;
+            for (at, delay) in self.breakpoints(s0) {
+                self.advance(at);
+                self.jump_of_delay(delay, at, s1);
+            }
+            let substeps = self.substeps;
+            if self.tolerance.is_none() && substeps > 1 {
+                let h = self.env.dt / substeps as f64;
+                for i in 1..substeps {
+                    let at = s0 + i as f64 * h;
+                    if at > self.s {
+                        self.advance(at);
+                    }
+                }
+            }
+            self.advance(s1);
+        }
+        std::mem::take(&mut self.result)
+    }
+
+    /// Instants inside (s0, s0 + dt) at which a delayed zero-order-hold input jumps.
+    fn breakpoints(&self, s0: f64) -> Vec<(f64, usize)> {
+        let mut found = Vec::new();
+        if !self.zero_hold {
+            return found;
+        }
+        for (i, delay) in self.system.rhs.delays.iter().enumerate() {
+            let Some(u) = self.delayed_input(delay.arg_leaf) else { continue };
+            if self.env.inputs[u].hold() == Hold::Zero {
+                let tau = self.stages[0].regs[delay.tau as usize];
+                let offset = tau.rem_euclid(self.env.dt);
+                found.push((s0 + offset, i));
+            }
+        }
+        found.sort_by(|a, b| a.0.total_cmp(&b.0));
+        found
+    }
+
+    /// Sensitivity to the delay where the delayed zero-order-hold input jumps: dtₑ = dτ.
+    fn jump_of_delay(&mut self, delay: usize, at: f64, next: f64) {
+        if self.lanes == 0 {
+            self.fresh = false;
+            return;
+        }
+        self.eval(0, at, at - 1e-6 * self.env.dt);
+        let before = self.stages[0].f.clone();
+        self.eval(0, at, 0.5 * (at + next.max(at + 1e-9 * self.env.dt)));
+        let tau = self.system.rhs.delays[delay].tau as usize;
+        for i in 0..self.system.nx {
+            let jump = before[i] - self.stages[0].f[i];
+            if jump != 0.0 {
+                for l in 0..self.lanes {
+                    self.dx[i * self.lanes + l] += jump * self.d[tau * self.lanes + l];
+                }
+            }
+        }
+        self.fresh = false;
+    }
+
+    fn delayed_input(&self, arg: Option<u32>) -> Option<usize> {
+        let leaf = arg? as usize;
+        (self.system.inputs()..self.system.inputs() + self.system.nu)
+            .contains(&leaf)
+            .then(|| leaf - self.system.inputs())
+    }
+
+    /// Evaluates the right-hand side at `self.xs`-style state `x` into stage `b`.
+    fn eval(&mut self, b: usize, s: f64, mid: f64) {
+        let x = std::mem::take(&mut self.x);
+        self.eval_at(b, s, mid, &x);
+        self.x = x;
+    }
+
+    fn eval_at(&mut self, b: usize, s: f64, mid: f64, x: &[f64]) {
+        let system = self.system;
+        let tape = &system.rhs;
+        {
+            let st = &mut self.stages[b];
+            st.s = s;
+            st.mid = mid;
+            st.regs[System::TIME] = self.env.start + s;
+            st.regs[System::STATES..System::STATES + system.nx].copy_from_slice(x);
+            for (i, u) in self.env.inputs.iter().enumerate() {
+                let (v, slope) = u.at(s, mid);
+                st.regs[system.inputs() + i] = v;
+                st.slopes[i] = slope;
+            }
+        }
+        for i in 0..tape.delays.len() {
+            let delay = tape.delays[i];
+            let tau = self.stages[b].regs[delay.tau as usize].max(0.0);
+            let (v, slope) = match self.delayed_input(delay.arg_leaf) {
+                Some(u) => self.env.inputs[u].at(s - tau, mid - tau),
+                None => {
+                    let (v, slope, ..) = self.rhs_history[i].at(s - tau);
+                    (v, slope)
+                }
+            };
+            let st = &mut self.stages[b];
+            st.regs[delay.leaf as usize] = v;
+            st.delayed_slopes[i] = slope;
+        }
+        if self.sticking.is_empty() {
+            let st = &mut self.stages[b];
+            tape.eval(&mut st.regs, &mut self.modes, &st.lambda);
+            self.result.evaluations += 1;
+            self.solve(b);
+        } else {
+            self.eval_sticking(b);
+        }
+    }
+
+    /// Highest derivatives and ẋ from the evaluated registers.
+    fn solve(&mut self, b: usize) {
+        let system = self.system;
+        let (nx, nz) = (system.nx, system.nz);
+        let st = &mut self.stages[b];
+        let outputs = &system.rhs.outputs;
+        if !system.mass_is_fixed {
+            for (m, &r) in st.lu.iter_mut().zip(&outputs[..nz * nz]) {
+                *m = st.regs[r as usize];
+            }
+            if !small::factor(&mut st.lu, &mut st.pivots, nz) {
+                st.lu.fill(f64::NAN);
+            }
+        }
+        for i in 0..nz {
+            st.z[i] = -st.regs[outputs[nz * nz + i] as usize];
+        }
+        if !self.env.forces.is_empty() {
+            let (k, w) = locate(st.s, st.mid, self.env.dt, self.env.len);
+            for force in &self.env.forces {
+                let (a, b) = (force.samples[k], force.samples[(k + 1).min(self.env.len - 1)]);
+                let v = a + w * (b - a);
+                for (z, weight) in st.z.iter_mut().zip(&force.weights) {
+                    *z -= weight * v;
+                }
+            }
+        }
+        small::solve(&st.lu, &st.pivots, nz, &mut st.z, 1);
+        st.f[..nx - 1].copy_from_slice(&st.regs[System::STATES + 1..System::STATES + nx]);
+        for j in 0..nz {
+            st.f[system.offsets[j] + system.orders[j] - 1] = st.z[j];
+        }
+    }
+
+    /// The right-hand side while some signs stick: λ solves ġ = a + Bλ = 0.
+    fn eval_sticking(&mut self, b: usize) {
+        let tape = &self.system.rhs;
+        let nx = self.system.nx;
+        let sticking = self.sticking.clone();
+        let m = sticking.len();
+        let evaluate = |core: &mut Self| {
+            let st = &mut core.stages[b];
+            tape.eval(&mut st.regs, &mut core.modes, &st.lambda);
+            core.result.evaluations += 1;
+            core.solve(b);
+        };
+        for &k in &sticking {
+            self.stages[b].lambda[k] = 0.0;
+        }
+        evaluate(self);
+        let f0 = self.stages[b].f.clone();
+        // Gradient of the arguments with respect to the state; the last lane collects explicit time.
+        self.rates(b, true);
+        let lanes = nx + 1;
+        let mut gradient = vec![0.0; m * nx];
+        let mut a = vec![0.0; m];
+        for (i, &k) in sticking.iter().enumerate() {
+            let row = &self.gd[tape.switches[k].a as usize * lanes..][..lanes];
+            gradient[i * nx..(i + 1) * nx].copy_from_slice(&row[..nx]);
+            a[i] = -(row[nx] + row[..nx].iter().zip(&f0).map(|(g, f)| g * f).sum::<f64>());
+        }
+        let mut pull = vec![0.0; m * nx];
+        for (i, &k) in sticking.iter().enumerate() {
+            self.stages[b].lambda[k] = 1.0;
+            evaluate(self);
+            self.stages[b].lambda[k] = 0.0;
+            for ((p, f1), f0) in pull[i * nx..].iter_mut().zip(&self.stages[b].f).zip(&f0) {
+                *p = f1 - f0;
+            }
+        }
+        let mut bm = vec![0.0; m * m];
+        for i in 0..m {
+            for j in 0..m {
+                bm[i * m + j] = (0..nx).map(|r| gradient[i * nx + r] * pull[j * nx + r]).sum();
+            }
+        }
+        let diagonal = (0..m).map(|i| bm[i * m + i]).collect();
+        let mut pivots = vec![0; m];
+        let ok = small::factor(&mut bm, &mut pivots, m);
+        if ok {
+            small::solve(&bm, &pivots, m, &mut a, 1);
+            for (i, &k) in sticking.iter().enumerate() {
+                self.stages[b].lambda[k] = a[i];
+            }
+        }
+        evaluate(self);
+        let st = &mut self.stages[b];
+        st.gradient = gradient;
+        st.pull = pull;
+        st.b = bm;
+        st.b_pivots = pivots;
+        st.b_diagonal = diagonal;
+        st.b_ok = ok;
+    }
+
+    /// Time derivatives of the registers at stage `b` into `self.gd`: with `split` one lane per state
+    /// plus one for explicit time, else one lane along the flow.
+    fn rates(&mut self, b: usize, split: bool) {
+        let system = self.system;
+        let tape = &system.rhs;
+        let nx = system.nx;
+        let lanes = if split { nx + 1 } else { 1 };
+        self.gd.clear();
+        self.gd.resize(tape.registers() * lanes, 0.0);
+        let st = &self.stages[b];
+        let last = lanes - 1;
+        self.gd[System::TIME * lanes + last] = 1.0;
+        for i in 0..nx {
+            if split {
+                self.gd[(System::STATES + i) * lanes + i] = 1.0;
+            } else {
+                self.gd[System::STATES + i] = st.f[i];
+            }
+        }
+        for i in 0..system.nu {
+            self.gd[(system.inputs() + i) * lanes + last] = st.slopes[i];
+        }
+        for (i, delay) in tape.delays.iter().enumerate() {
+            self.gd[delay.leaf as usize * lanes + last] = st.delayed_slopes[i];
+        }
+        tape.tangent(&st.regs, &self.modes, &[], lanes, &self.gactive, &mut self.gd);
+    }
+
+    /// Modes at the very start: natural, with a decision where a sign's argument is exactly zero.
+    fn start_modes(&mut self) {
+        if self.live.is_empty() {
+            return;
+        }
+        self.eval(0, self.s, self.s + 0.25 * self.env.dt);
+        // Natural modes need the arguments, which may depend on other switches: settle by passes.
+        for _ in 0..3 {
+            let tape = &self.system.rhs;
+            let st = &mut self.stages[0];
+            tape.eval_natural(&mut st.regs, &mut self.modes);
+        }
+        self.note_scale(0);
+        for i in 0..self.live.len() {
+            let k = self.live[i];
+            if self.system.rhs.switches[k].kind == SwitchKind::Sign && self.modes[k] == 0 {
+                self.modes[k] = 1;
+                self.decide(k, 0.25 * self.env.dt);
+            }
+        }
+        self.fresh = false;
+    }
+
+    fn note_scale(&mut self, b: usize) {
+        let st = &self.stages[b];
+        for &k in &self.live {
+            let sw = &self.system.rhs.switches[k];
+            let size = st.regs[sw.a as usize].abs().max(st.regs[sw.b as usize].abs());
+            if size > self.scale[k] && size.is_finite() {
+                self.scale[k] = size;
+            }
+        }
+    }
+
+    /// How far inside its mode switch `k` is at stage `b`, with a rounding tolerance added.
+    fn slack(&self, b: usize, k: usize) -> f64 {
+        let st = &self.stages[b];
+        let sw = &self.system.rhs.switches[k];
+        if sw.kind == SwitchKind::Sign && self.modes[k] == 0 {
+            return 1.0 - st.lambda[k].abs() + 1e-9;
+        }
+        sw.margin(self.modes[k], st.regs[sw.a as usize], st.regs[sw.b as usize]) + 1e-12 * self.scale[k]
+    }
+
+    fn least_slack(&self, b: usize) -> f64 {
+        self.live.iter().map(|&k| self.slack(b, k)).fold(f64::INFINITY, f64::min)
+    }
+
+    /// One trial step of length `h` from (s, x), stage 0 evaluated there; the result in `x1`.
+    fn trial(&mut self, h: f64, end: bool) {
+        let nx = self.system.nx;
+        let tableau = self.tableau;
+        let mid = self.s + 0.5 * h;
+        let mut xs = std::mem::take(&mut self.xs);
+        for i in 1..tableau.b.len() {
+            xs.copy_from_slice(&self.x);
+            for (j, &a) in tableau.a[i].iter().enumerate() {
+                if a != 0.0 {
+                    let f = &self.stages[j].f;
+                    for r in 0..nx {
+                        xs[r] += h * a * f[r];
+                    }
+                }
+            }
+            self.eval_at(i, self.s + tableau.c[i] * h, mid, &xs);
+        }
+        self.xs = xs;
+        self.x1.copy_from_slice(&self.x);
+        for (j, &b) in tableau.b.iter().enumerate() {
+            if b != 0.0 {
+                let f = &self.stages[j].f;
+                for r in 0..nx {
+                    self.x1[r] += h * b * f[r];
+                }
+            }
+        }
+        if end {
+            let x1 = std::mem::take(&mut self.x1);
+            self.eval_at(tableau.b.len(), self.s + h, mid, &x1);
+            self.x1 = x1;
+        }
+    }
+
+    /// Integrates to `to`, through whatever events lie before it.
+    fn advance(&mut self, to: f64) {
+        let end = self.tableau.b.len();
+        let tiny = 1e-13 * (self.env.dt + to.abs());
+        let watch = !self.live.is_empty();
+        while to - self.s > tiny {
+            if self.result.diverged.is_some() {
+                self.s = to;
+                return;
+            }
+            if !self.fresh {
+                self.begin(to);
+            }
+            let remaining = to - self.s;
+            let mut h = remaining;
+            if self.tolerance.is_some() && self.h_next < remaining {
+                // Two equal steps rather than a long and a very short one.
+                h = if self.h_next > 0.5 * remaining { 0.5 * remaining } else { self.h_next };
+            }
+            let need_end = watch || self.tolerance.is_some() || !self.rhs_history.is_empty();
+            self.trial(h, need_end);
+            if let Some((rtol, atol)) = self.tolerance {
+                let error = self.error(h, rtol, atol);
+                let grow = (0.9 * error.max(1e-10).powf(-0.2)).clamp(0.2, 5.0);
+                if error > 1.0 && h > 1e-9 * self.env.dt {
+                    self.h_next = h * grow.min(0.9);
+                    continue;
+                }
+                if h >= 0.99 * self.h_next.min(remaining) || grow < 1.0 {
+                    self.h_next = h * grow;
+                }
+            }
+            let mut event = false;
+            if watch && self.events_here < MOST_EVENTS && self.least_slack(end) < 0.0 {
+                h = self.locate_event(h);
+                event = true;
+            }
+            self.accept(h, need_end);
+            if event {
+                self.events_here += 1;
+                self.result.events += 1;
+                self.handle_event(to);
+            } else if watch && self.events_here >= MOST_EVENTS {
+                let st = &mut self.stages[0];
+                self.system.rhs.eval_natural(&mut st.regs, &mut self.modes);
+                self.update_sticking();
+                self.fresh = false;
+            }
+        }
+        self.s = to;
+    }
+
+    /// Evaluates stage 0 anew (a signal may have jumped) and settles the modes there.
+    fn begin(&mut self, to: f64) {
+        let mid = 0.5 * (self.s + to);
+        self.eval(0, self.s, mid);
+        if self.rhs_history.iter().any(|h| h.s.is_empty()) {
+            // The very start: what was before it is the expression's initial value.
+            self.remember(0);
+            self.eval(0, self.s, mid);
+            self.remember(0); // with the slope that follows from it
+        }
+        for _ in 0..8 {
+            let mut changed = false;
+            for i in 0..self.live.len() {
+                let k = self.live[i];
+                let sw = self.system.rhs.switches[k];
+                if self.slack(0, k) < 0.0 {
+                    let sticking = sw.kind == SwitchKind::Sign && self.modes[k] == 0;
+                    let (a, b) =
+                        (self.stages[0].regs[sw.a as usize], self.stages[0].regs[sw.b as usize]);
+                    self.modes[k] = if sticking {
+                        if self.stages[0].lambda[k] > 0.0 { 1 } else { -1 }
+                    } else {
+                        sw.natural_mode(a, b)
+                    };
+                    changed = true;
+                }
+            }
+            if !changed {
+                break;
+            }
+            self.update_sticking();
+            self.eval(0, self.s, mid);
+        }
+        self.note_scale(0);
+        self.fresh = true;
+    }
+
+    fn update_sticking(&mut self) {
+        self.sticking.clear();
+        for &k in &self.live {
+            if self.system.rhs.switches[k].kind == SwitchKind::Sign && self.modes[k] == 0 {
+                self.sticking.push(k);
+            }
+        }
+    }
+
+    fn error(&self, h: f64, rtol: f64, atol: f64) -> f64 {
+        let nx = self.system.nx;
+        let mut sum = 0.0;
+        for r in 0..nx {
+            let e: f64 =
+                self.tableau.e.iter().zip(&self.stages).map(|(w, st)| w * st.f[r]).sum::<f64>() * h;
+            let size = self.x[r].abs().max(self.x1[r].abs());
+            let floor = self.reach[r].max(size).max(f64::MIN_POSITIVE);
+            let e = e / (atol * floor + rtol * size);
+            sum += e * e;
+        }
+        let error = (sum / nx as f64).sqrt();
+        if error.is_finite() { error } else { 1e10 }
+    }
+
+    /// Finds the first h' ≤ h at which a mode is left; leaves the trial of h' in place.
+    fn locate_event(&mut self, h: f64) -> f64 {
+        let end = self.tableau.b.len();
+        let (mut lo, mut hi) = (0.0, h);
+        let mut flo = self.least_slack(0).max(0.0);
+        let mut fhi = self.least_slack(end);
+        let mut side = 0;
+        for i in 0..80 {
+            if hi - lo <= 1e-14 * h || fhi.abs() <= 1e-15 {
+                break;
+            }
+            // Illinois, with a bisection now and then for functions with a corner.
+            let t = if i % 6 == 5 || !fhi.is_finite() {
+                0.5 * (lo + hi)
+            } else {
+                (lo * fhi - hi * flo) / (fhi - flo)
+            };
+            let t = t.clamp(lo + 1e-3 * (hi - lo), hi - 1e-3 * (hi - lo));
+            self.trial(t, true);
+            let f = self.least_slack(end);
+            if f < 0.0 {
+                hi = t;
+                fhi = f;
+                if side == -1 {
+                    flo *= 0.5;
+                }
+                side = -1;
+                // Just past the event by no more than rounding: good enough.
+                let violated = self.live.iter().filter(|&&k| self.slack(end, k) < 0.0);
+                if violated.into_iter().all(|&k| self.slack(end, k) > -self.event_tolerance(k)) {
+                    return t;
+                }
+            } else {
+                lo = t;
+                flo = f;
+                if side == 1 {
+                    fhi *= 0.5;
+                }
+                side = 1;
+            }
+        }
+        self.trial(hi, true);
+        hi
+    }
+
+    fn event_tolerance(&self, k: usize) -> f64 {
+        let sticking = self.system.rhs.switches[k].kind == SwitchKind::Sign && self.modes[k] == 0;
+        if sticking { 1e-9 } else { 1e-11 * self.scale[k] }
+    }
+
+    /// Takes the trial step over: sensitivities, state, time, history.
+    fn accept(&mut self, h: f64, has_end: bool) {
+        if self.lanes > 0 {
+            self.tangent_step(h);
+        }
+        std::mem::swap(&mut self.x, &mut self.x1);
+        self.s += h;
+        self.result.steps += 1;
+        let mut bad = false;
+        for (x, reach) in self.x.iter().zip(&mut self.reach) {
+            *reach = reach.max(x.abs());
+            bad |= !x.is_finite() || x.abs() > LIMIT;
+        }
+        if bad {
+            self.result.diverged = Some(usize::MAX);
+            return;
+        }
+        if has_end {
+            let end = self.tableau.b.len();
+            self.stages.swap(0, end);
+            self.fresh = true;
+            self.remember(0);
+        } else {
+            self.fresh = false;
+        }
+    }
+
+    /// Stores the delayed expressions' values at stage `b`.
+    fn remember(&mut self, b: usize) {
+        if self.rhs_history.is_empty() {
+            return;
+        }
+        let tape = &self.system.rhs;
+        let needed =
+            (0..tape.delays.len()).any(|i| self.delayed_input(tape.delays[i].arg_leaf).is_none());
+        if !needed {
+            return;
+        }
+        self.rates(b, false);
+        if self.lanes > 0 {
+            let dx = std::mem::take(&mut self.dx);
+            self.tangent_at(b, &dx);
+            self.dx = dx;
+        }
+        for i in 0..tape.delays.len() {
+            let arg = tape.delays[i].arg as usize;
+            let st = &self.stages[b];
+            let lanes = &self.d[arg * self.lanes..(arg + 1) * self.lanes];
+            self.rhs_history[i].push(st.s, st.regs[arg], self.gd[arg], lanes);
+        }
+    }
+
+    /// Tangents of all registers at stage `b` for state tangents `dx`, into `self.d`.
+    fn tangent_at(&mut self, b: usize, dx: &[f64]) {
+        let system = self.system;
+        let tape = &system.rhs;
+        let (nx, lanes) = (system.nx, self.lanes);
+        let st = &self.stages[b];
+        self.d[System::STATES * lanes..(System::STATES + nx) * lanes].copy_from_slice(dx);
+        let first = self.seeds.parameters.len() + self.seeds.initial.len();
+        let count = self.seeds.signals.lanes;
+        for (i, change) in &self.seeds.signals.inputs {
+            let (k, w) = locate(st.s, st.mid, self.env.dt, self.env.len);
+            let row = &mut self.d[(system.inputs() + i) * lanes + first..][..count];
+            lerp(change, k, w, self.env.len, count, row);
+        }
+        for (i, delay) in tape.delays.iter().enumerate() {
+            let tau = delay.tau as usize;
+            let slope = st.delayed_slopes[i];
+            let leaf = delay.leaf as usize;
+            for l in 0..lanes {
+                self.d[leaf * lanes + l] = -slope * self.d[tau * lanes + l];
+            }
+            if self.delayed_input(delay.arg_leaf).is_none() {
+                let history = &self.rhs_history[i];
+                let at = st.s - st.regs[tau].max(0.0);
+                let (_, _, j, w) = history.at(at);
+                if !history.s.is_empty() {
+                    let next = (j + 1).min(history.s.len() - 1);
+                    for l in 0..lanes {
+                        let (a, b) = (history.lanes[j * lanes + l], history.lanes[next * lanes + l]);
+                        self.d[leaf * lanes + l] += a + w * (b - a);
+                    }
+                }
+            }
+        }
+        tape.tangent(&st.regs, &self.modes, &[], lanes, &self.active, &mut self.d);
+    }
+
+    /// Derivative of stage `b`'s ẋ along the lanes into `self.dk[b]`, for state tangents `self.dxs`.
+    fn tangent_stage(&mut self, b: usize) {
+        let system = self.system;
+        let (nx, nz, lanes) = (system.nx, system.nz, self.lanes);
+        let dxs = std::mem::take(&mut self.dxs);
+        self.tangent_at(b, &dxs);
+        let outputs = &system.rhs.outputs;
+        let st = &self.stages[b];
+        for i in 0..nz {
+            let row = &mut self.b[i * lanes..(i + 1) * lanes];
+            let h = &self.d[outputs[nz * nz + i] as usize * lanes..][..lanes];
+            for (r, h) in row.iter_mut().zip(h) {
+                *r = -h;
+            }
+            for j in 0..nz {
+                let reg = outputs[i * nz + j] as usize;
+                if self.active[reg] {
+                    let z = st.z[j];
+                    for (r, m) in row.iter_mut().zip(&self.d[reg * lanes..][..lanes]) {
+                        *r -= m * z;
+                    }
+                }
+            }
+        }
+        let signals = &self.seeds.signals;
+        if !signals.force.is_empty() {
+            let first = self.seeds.parameters.len() + self.seeds.initial.len();
+            let count = signals.lanes;
+            let (k, w) = locate(st.s, st.mid, self.env.dt, self.env.len);
+            let a = &signals.force[k * count..][..count];
+            let c = &signals.force[(k + 1).min(self.env.len - 1) * count..][..count];
+            for i in 0..nz {
+                let weights = &signals.weights[i * count..][..count];
+                let row = &mut self.b[i * lanes + first..][..count];
+                for l in 0..count {
+                    row[l] -= weights[l] * (a[l] + w * (c[l] - a[l]));
+                }
+            }
+        }
+        small::solve(&st.lu, &st.pivots, nz, &mut self.b, lanes);
+        let dk = &mut self.dk[b * nx * lanes..(b + 1) * nx * lanes];
+        dk[..(nx - 1) * lanes].copy_from_slice(&dxs[lanes..]);
+        for j in 0..nz {
+            let r = system.offsets[j] + system.orders[j] - 1;
+            dk[r * lanes..(r + 1) * lanes].copy_from_slice(&self.b[j * lanes..(j + 1) * lanes]);
+        }
+        let m = self.sticking.len();
+        if m > 0 && st.b_ok {
+            // dλ keeps the derivative of ġ zero: ∇g·(dẋ + Σ pull dλ) = 0.
+            let mut dl = vec![0.0; m * lanes];
+            for i in 0..m {
+                for r in 0..nx {
+                    let g = st.gradient[i * nx + r];
+                    if g != 0.0 {
+                        for l in 0..lanes {
+                            dl[i * lanes + l] -= g * dk[r * lanes + l];
+                        }
+                    }
+                }
+            }
+            small::solve(&st.b, &st.b_pivots, m, &mut dl, lanes);
+            for i in 0..m {
+                for r in 0..nx {
+                    let p = st.pull[i * nx + r];
+                    if p != 0.0 {
+                        for l in 0..lanes {
+                            dk[r * lanes + l] += p * dl[i * lanes + l];
+                        }
+                    }
+                }
+                let k = self.sticking[i];
+                self.dlambda[k * lanes..(k + 1) * lanes].copy_from_slice(&dl[i * lanes..(i + 1) * lanes]);
+            }
+        }
+        self.dxs = dxs;
+    }
+
+    fn tangent_step(&mut self, h: f64) {
+        let n = self.system.nx * self.lanes;
+        for i in 0..self.tableau.b.len() {
+            self.dxs.copy_from_slice(&self.dx);
+            for (j, &a) in self.tableau.a[i].iter().enumerate() {
+                if a != 0.0 {
+                    for (x, k) in self.dxs.iter_mut().zip(&self.dk[j * n..(j + 1) * n]) {
+                        *x += h * a * k;
+                    }
+                }
+            }
+            self.tangent_stage(i);
+        }
+        for (j, &b) in self.tableau.b.iter().enumerate() {
+            if b != 0.0 {
+                for (x, k) in self.dx.iter_mut().zip(&self.dk[j * n..(j + 1) * n]) {
+                    *x += h * b * k;
+                }
+            }
+        }
+    }
+
+    /// At (s, x), with stage 0 evaluated there in the old modes: changes the modes that were left.
+    fn handle_event(&mut self, to: f64) {
+        let lanes = self.lanes;
+        let left: Vec<usize> = self.live.iter().copied().filter(|&k| self.slack(0, k) < 0.0).collect();
+        let Some(&primary) = left.first() else { return };
+        let before = self.stages[0].f.clone();
+        // dtₑ of the primary event, in the old modes.
+        let mut dte = Vec::new();
+        let released = self.system.rhs.switches[primary].kind == SwitchKind::Sign && self.modes[primary] == 0;
+        if lanes > 0 && !released {
+            self.rates(0, false);
+            let sw = self.system.rhs.switches[primary];
+            let (ra, rb) = (sw.a as usize, sw.b as usize);
+            let two = ra != rb;
+            let side = match sw.kind {
+                SwitchKind::Deadzone | SwitchKind::Saturate => {
+                    // g = |a| − b on the side where it happens.
+                    if self.stages[0].regs[ra] < 0.0 { -1.0 } else { 1.0 }
+                }
+                _ => 1.0,
+            };
+            let rate = side * self.gd[ra] - if two { self.gd[rb] } else { 0.0 };
+            let size = before.iter().fold(0.0f64, |m, v| m.max(v.abs()));
+            if rate.abs() > 1e-12 * size.max(1e-300) {
+                let dx = std::mem::take(&mut self.dx);
+                self.tangent_at(0, &dx);
+                self.dx = dx;
+                dte = (0..lanes)
+                    .map(|l| {
+                        let g = side * self.d[ra * lanes + l]
+                            - if two { self.d[rb * lanes + l] } else { 0.0 };
+                        -g / rate
+                    })
+                    .collect();
+            }
+        }
+        let mid = 0.5 * (self.s + to);
+        for &k in &left {
+            let sw = self.system.rhs.switches[k];
+            match sw.kind {
+                SwitchKind::Sign if self.modes[k] == 0 => {
+                    self.modes[k] = if self.stages[0].lambda[k] > 0.0 { 1 } else { -1 };
+                    self.update_sticking();
+                }
+                SwitchKind::Sign => self.decide(k, mid - self.s),
+                SwitchKind::Deadzone | SwitchKind::Saturate => {
+                    self.modes[k] = match self.modes[k] {
+                        0 => {
+                            if self.stages[0].regs[sw.a as usize] < 0.0 {
+                                -1
+                            } else {
+                                1
+                            }
+                        }
+                        _ => 0,
+                    }
+                }
+                _ => self.modes[k] = -self.modes[k],
+            }
+        }
+        self.eval(0, self.s, mid);
+        self.fresh = true;
+        if !dte.is_empty() {
+            for i in 0..self.system.nx {
+                let jump = before[i] - self.stages[0].f[i];
+                if jump != 0.0 {
+                    for l in 0..lanes {
+                        self.dx[i * lanes + l] += jump * dte[l];
+                    }
+                }
+            }
+        }
+        self.remember(0);
+    }
+
+    /// Sign `k` has reached zero: sticks when its multiplier may hold it, else crosses.
+    fn decide(&mut self, k: usize, ahead: f64) {
+        let old = self.modes[k];
+        self.modes[k] = 0;
+        self.update_sticking();
+        let at = self.sticking.iter().position(|&j| j == k).unwrap_or(0);
+        self.eval(0, self.s, self.s + ahead);
+        let st = &self.stages[0];
+        let (lambda, slope) = (st.lambda[k], st.b_diagonal.get(at).copied().unwrap_or(0.0));
+        if st.b_ok && slope < 0.0 {
+            if lambda.abs() <= 1.0 {
+                let leaf = self.system.rhs.switches[k].a as usize;
+                if (System::STATES..System::STATES + self.system.nx).contains(&leaf) {
+                    self.x[leaf - System::STATES] = 0.0;
+                }
+                return;
+            }
+            self.modes[k] = if lambda > 0.0 { 1 } else { -1 };
+        } else {
+            self.modes[k] = -old;
+        }
+        self.stages[0].lambda[k] = 0.0;
+        self.update_sticking();
+    }
+
+    /// Writes sample `row` of the result.
+    fn record(&mut self, row: usize) {
+        let system = self.system;
+        let (nx, ny, lanes, n) = (system.nx, system.ny, self.lanes, self.result.n);
+        if self.result.diverged.is_some() {
+            self.result.diverged = Some(row);
+            return;
+        }
+        for i in 0..nx {
+            self.result.x[i * n + row] = self.x[i];
+        }
+        // The output belongs to the instant of the sample: inputs with the value they take then.
+        let inside = self.s + 1e-6 * self.env.dt;
+        if system.output_needs_z {
+            self.eval(0, self.s, inside);
+            self.fresh = false;
+            let z = &self.stages[0].z;
+            self.out_regs[system.highest()..][..system.nz].copy_from_slice(z);
+            if lanes > 0 {
+                self.dxs.copy_from_slice(&self.dx);
+                self.tangent_stage(0);
+                for j in 0..system.nz {
+                    let r = system.offsets[j] + system.orders[j] - 1;
+                    let (from, to) = (r * lanes, (system.highest() + j) * lanes);
+                    self.out_d[to..to + lanes].copy_from_slice(&self.dk[from..from + lanes]);
+                }
+            }
+        }
+        let out = &system.output;
+        self.out_regs[System::TIME] = self.env.start + self.s;
+        self.out_regs[System::STATES..System::STATES + nx].copy_from_slice(&self.x);
+        for (i, u) in self.env.inputs.iter().enumerate() {
+            self.out_regs[system.inputs() + i] = u.at(self.s, inside).0;
+        }
+        if lanes > 0 {
+            self.out_d[System::STATES * lanes..(System::STATES + nx) * lanes].copy_from_slice(&self.dx);
+            let first = self.seeds.parameters.len() + self.seeds.initial.len();
+            let count = self.seeds.signals.lanes;
+            for (i, change) in &self.seeds.signals.inputs {
+                let (k, w) = locate(self.s, inside, self.env.dt, self.env.len);
+                let to = &mut self.out_d[(system.inputs() + i) * lanes + first..][..count];
+                lerp(change, k, w, self.env.len, count, to);
+            }
+        }
+        if !out.delays.is_empty() {
+            self.output_delays();
+        }
+        out.eval_natural(&mut self.out_regs, &mut self.out_modes);
+        for (c, &reg) in out.outputs.iter().enumerate() {
+            self.result.y[c * n + row] = self.out_regs[reg as usize];
+        }
+        if lanes > 0 {
+            out.tangent(&self.out_regs, &self.out_modes, &[], lanes, &self.out_active, &mut self.out_d);
+            for (c, &reg) in out.outputs.iter().enumerate() {
+                let d = &self.out_d[reg as usize * lanes..][..lanes];
+                for (l, v) in d.iter().enumerate() {
+                    self.result.dy[(l * ny + c) * n + row] = *v;
+                }
+            }
+        }
+    }
+
+    /// Delayed values of the measurements (sensor delays), sample by sample.
+    fn output_delays(&mut self) {
+        let system = self.system;
+        let (out, lanes) = (&system.output, self.lanes);
+        // The arguments now, for the history; nested delays read the values of earlier samples.
+        out.eval_natural(&mut self.out_regs, &mut self.out_modes);
+        if lanes > 0 {
+            out.tangent(&self.out_regs, &self.out_modes, &[], lanes, &self.out_active, &mut self.out_d);
+        }
+        for (i, delay) in out.delays.iter().enumerate() {
+            let arg = delay.arg as usize;
+            // Slope by the flow where the argument is a state, else by the last difference.
+            let value = self.out_regs[arg];
+            let history = &mut self.out_history[i];
+            let slope = match history.s.last() {
+                Some(&s) if self.s > s => (value - history.value[history.value.len() - 1]) / (self.s - s),
+                _ => 0.0,
+            };
+            let slope = match (delay.arg_leaf.map(|l| l as usize), self.fresh) {
+                (Some(l), true) if (System::STATES..System::STATES + system.nx).contains(&l) => {
+                    self.stages[0].f[l - System::STATES]
+                }
+                _ => slope,
+            };
+            history.push(self.s, value, slope, &self.out_d[arg * lanes..(arg + 1) * lanes]);
+            let tau = delay.tau as usize;
+            let at = (self.s - self.out_regs[tau].max(0.0)).max(self.start_s);
+            let (v, slope, j, w) = history.at(at);
+            self.out_regs[delay.leaf as usize] = v;
+            let next = (j + 1).min(history.s.len() - 1);
+            for l in 0..lanes {
+                let (a, b) = (history.lanes[j * lanes + l], history.lanes[next * lanes + l]);
+                self.out_d[delay.leaf as usize * lanes + l] =
+                    a + w * (b - a) - slope * self.out_d[tau * lanes + l];
+            }
+        }
+    }
+
+    /// After divergence: the last good sample is held to the end, its sensitivities are zero.
+    fn freeze(&mut self, row: usize, n: usize) {
+        self.result.diverged = Some(row);
+        let from = row.saturating_sub(1);
+        for column in self.result.y.chunks_mut(n).chain(self.result.x.chunks_mut(n)) {
+            let held = column[from];
+            column[row..].fill(held);
+        }
+        for column in self.result.dy.chunks_mut(n) {
+            column[row..].fill(0.0);
+        }
+    }
+}
+
+fn input_leaf(system: &System, arg: Option<u32>) -> bool {
+    arg.is_some_and(|l| (system.inputs()..system.inputs() + system.nu).contains(&(l as usize)))
+}
+
+/// Sample before `s` and the weight of the next one; `inside` says which side of a sample.
+#[inline]
+fn locate(s: f64, inside: f64, dt: f64, len: usize) -> (usize, f64) {
+    let k = (inside / dt).floor().clamp(0.0, (len - 1) as f64);
+    let w = (s / dt - k).clamp(0.0, 1.0);
+    (k as usize, w)
+}
+
+#[inline]
+fn lerp(table: &[f64], k: usize, w: f64, len: usize, count: usize, out: &mut [f64]) {
+    let a = &table[k * count..][..count];
+    let b = &table[(k + 1).min(len - 1) * count..][..count];
+    for ((o, a), b) in out.iter_mut().zip(a).zip(b) {
+        *o = a + w * (b - a);
+    }
+}
