@@ -77,6 +77,12 @@ pub enum Func {
 }
 
 impl Func {
+    /// Every function of the language.
+    pub const ALL: [Func; 15] = {
+        use Func::*;
+        [Sin, Cos, Tan, Exp, Ln, Sqrt, Tanh, Abs, Sign, Min, Max, Delay, Deadzone, Saturate, Step]
+    };
+
     /// The function of this name in the model language.
     pub fn from_name(name: &str) -> Option<Func> {
         use Func::*;

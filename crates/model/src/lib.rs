@@ -1,8 +1,16 @@
 //! The greybox model language: textbook equations, parsed, checked for units and compiled.
+pub mod algebra;
+mod display;
 pub mod expr;
 pub mod model;
+mod nearest;
+pub mod parse;
+pub mod system;
+pub mod tape;
 pub mod units;
 
 pub use expr::{BinOp, Expr, Func};
 pub use model::{Equation, Hold, Input, Measurement, Model, Parameter, State};
+pub use parse::{Parsed, ParsedEquation, SyntaxError, parse, parse_equation};
+pub use system::System;
 pub use units::{Dimension, Unit};

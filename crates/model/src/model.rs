@@ -71,8 +71,9 @@ pub struct Parameter {
     pub name: String,
     /// Value in SI.
     pub value: f64,
-    /// Unit as written; a parameter without `unit` gets the one its equation implies.
-    pub unit: Unit,
+    /// Unit as written; `None` when not stated, until [`Model::resolve_units`] infers it from the
+    /// equations.
+    pub unit: Option<Unit>,
     /// Prior 1-sigma in SI, if stated.
     pub std: Option<f64>,
     /// Known exactly: calibration never moves it.

@@ -1,0 +1,918 @@
+//! Expressions compiled to a register tape.
+//!
+//! A [`Tape`] is a straight list of operations on numbered registers, shared subexpressions merged
+//! and operations on parameters alone hoisted into a *prologue* that runs once per simulation.
+//! It is evaluated three ways:
+//!
+//! * [`Tape::eval`]: one point, with the branch of every non-smooth function fixed by a *mode*, so
+//!   that the right-hand side is smooth within a step and events are the integrator's business;
+//! * [`Tape::tangent`]: directional derivatives for many directions (lanes) at once, beside one
+//!   value: forward sensitivities of all parameters share the trajectory they belong to;
+//! * [`Tape::eval_batch`]: many points at once (samples of a recording), every non-smooth function
+//!   evaluated pointwise with sign(0) = 0.
+//!
+//! Registers: the leaves first (in the caller's layout), then constants, then one per operation.
+
+use std::collections::HashMap;
+
+use crate::expr::{BinOp, Expr, Func};
+
+/// A register number.
+pub type Reg = u32;
+
+/// Non-smooth functions, whose branch is a *mode* during a step.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]
+pub enum SwitchKind {
+    /// `sign(a)`: modes −1, +1, and 0 = sticking, where its value λ ∈ [−1, 1] keeps a = 0.
+    Sign,
+    /// `abs(a)`: modes ±1.
+    Abs,
+    /// `min(a, b)`: mode +1 for a > b (value b), −1 for a < b (value a).
+    Min,
+    /// `max(a, b)`: mode +1 for a > b (value a), −1 for a < b (value b).
+    Max,
+    /// `deadzone(a, b)`: modes −1 (a < −b), 0, +1 (a > b).
+    Deadzone,
+    /// `saturate(a, b)`: modes −1 (a < −b), 0, +1 (a > b).
+    Saturate,
+    /// `step(a, b)`: mode −1 for a < b, +1 for a ≥ b.
+    Step,
+}
+
+/// One non-smooth node of the tape.
+#[derive(Debug, Clone, Copy)]
+pub struct Switch {
+    /// Which function.
+    pub kind: SwitchKind,
+    /// First argument.
+    pub a: Reg,
+    /// Second argument (equal to `a` where there is none).
+    pub b: Reg,
+    /// Whether an argument depends on an input (its branch may jump between samples).
+    pub on_input: bool,
+    /// Whether an argument depends on anything but parameters.
+    pub live: bool,
+}
+
+impl Switch {
+    /// The mode that the arguments' values ask for; `sign(0)` asks for 0.
+    #[inline]
+    pub fn natural_mode(&self, a: f64, b: f64) -> i8 {
+        use SwitchKind::*;
+        match self.kind {
+            Sign => (a > 0.0) as i8 - (a < 0.0) as i8,
+            Abs => {
+                if a < 0.0 {
+                    -1
+                } else {
+                    1
+                }
+            }
+            Min | Max | Step => {
+                if a < b {
+                    -1
+                } else {
+                    1
+                }
+            }
+            Deadzone | Saturate => (a > b) as i8 - (a < -b) as i8,
+        }
+    }
+
+    /// How far inside its mode the switch is: positive inside, negative when the mode is violated.
+    /// (Sticking is judged by its multiplier, not here.)
+    #[inline]
+    pub fn margin(&self, mode: i8, a: f64, b: f64) -> f64 {
+        use SwitchKind::*;
+        let m = mode as f64;
+        match self.kind {
+            Sign | Abs => {
+                if mode == 0 {
+                    f64::INFINITY
+                } else {
+                    m * a
+                }
+            }
+            Min | Max | Step => m * (a - b),
+            Deadzone | Saturate => match mode {
+                0 => b - a.abs(),
+                _ => m * a - b,
+            },
+        }
+    }
+
+    #[inline]
+    fn value(&self, mode: i8, lambda: f64, a: f64, b: f64) -> f64 {
+        use SwitchKind::*;
+        let m = mode as f64;
+        match self.kind {
+            Sign => {
+                if mode == 0 {
+                    lambda
+                } else {
+                    m
+                }
+            }
+            Abs => m * a,
+            Max => {
+                if mode > 0 {
+                    a
+                } else {
+                    b
+                }
+            }
+            Min => {
+                if mode > 0 {
+                    b
+                } else {
+                    a
+                }
+            }
+            Deadzone => {
+                if mode == 0 {
+                    0.0
+                } else {
+                    a - m * b
+                }
+            }
+            Saturate => {
+                if mode == 0 {
+                    a
+                } else {
+                    m * b
+                }
+            }
+            Step => {
+                if mode > 0 {
+                    1.0
+                } else {
+                    0.0
+                }
+            }
+        }
+    }
+}
+
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]
+enum Op {
+    Neg(Reg),
+    Add(Reg, Reg),
+    Sub(Reg, Reg),
+    Mul(Reg, Reg),
+    Div(Reg, Reg),
+    Powi(Reg, i32),
+    Pow(Reg, Reg),
+    Sqrt(Reg),
+    Sin(Reg),
+    Cos(Reg),
+    Tan(Reg),
+    Exp(Reg),
+    Ln(Reg),
+    Tanh(Reg),
+    Switch(u32),
+}
+
+/// A delayed value: `leaf` receives `arg` evaluated `tau` ago.
+#[derive(Debug, Clone, Copy)]
+pub struct Delay {
+    /// Register of the undelayed argument.
+    pub arg: Reg,
+    /// Register of the delay (parameters only), s.
+    pub tau: Reg,
+    /// Leaf into which the caller writes the delayed value.
+    pub leaf: Reg,
+    /// The leaf of the argument when it is a bare leaf (such as an input), else `None`.
+    pub arg_leaf: Option<Reg>,
+}
+
+/// What a leaf is, for dependency analysis.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum LeafKind {
+    /// A constant of the simulation.
+    Parameter,
+    /// An exogenous signal.
+    Input,
+    /// Time, a state or anything else that varies.
+    Varying,
+}
+
+/// A compiled list of expressions.
+#[derive(Debug, Clone)]
+pub struct Tape {
+    leaves: usize,
+    kinds: Vec<LeafKind>,
+    constants: Vec<f64>,
+    ops: Vec<Op>,
+    prologue: usize,
+    /// Registers of the compiled expressions, in the order they were given.
+    pub outputs: Vec<Reg>,
+    /// Non-smooth nodes in the order they are evaluated.
+    pub switches: Vec<Switch>,
+    /// Delayed values.
+    pub delays: Vec<Delay>,
+}
+
+/// Builds a [`Tape`] expression by expression.
+pub struct Compiler<'a> {
+    resolve: &'a dyn Fn(&str, u8) -> Option<usize>,
+    kinds: Vec<LeafKind>,
+    constants: Vec<f64>,
+    constant_index: HashMap<u64, usize>,
+    ops: Vec<(Op, bool, bool)>, // operation, depends on parameters only, depends on an input
+    op_index: HashMap<Op, usize>,
+    switches: Vec<Switch>,
+    switch_index: HashMap<(SwitchKind, Reg, Reg), u32>,
+    delays: Vec<Delay>,
+    delay_exprs: Vec<(Expr, Expr)>,
+}
+
+/// A name that the layout does not know.
+#[derive(Debug, Clone, PartialEq)]
+pub struct UnknownName {
+    /// The name.
+    pub name: String,
+    /// Its number of primes.
+    pub primes: u8,
+}
+
+impl std::fmt::Display for UnknownName {
+    fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
+        write!(f, "unknown name `{}{}`", self.name, "'".repeat(self.primes as usize))
+    }
+}
+
+impl std::error::Error for UnknownName {}
+
+// While compiling, registers are tagged: leaves and constants and operations live in separate
+// number ranges until `finish` lays them out.
+const CONSTANT: Reg = 1 << 28;
+const OPERATION: Reg = 1 << 29;
+
+impl<'a> Compiler<'a> {
+    /// `kinds[i]` says what leaf `i` is; `resolve` maps a name with primes to its leaf.
+    pub fn new(kinds: Vec<LeafKind>, resolve: &'a dyn Fn(&str, u8) -> Option<usize>) -> Compiler<'a> {
+        Compiler {
+            resolve,
+            kinds,
+            constants: Vec::new(),
+            constant_index: HashMap::new(),
+            ops: Vec::new(),
+            op_index: HashMap::new(),
+            switches: Vec::new(),
+            switch_index: HashMap::new(),
+            delays: Vec::new(),
+            delay_exprs: Vec::new(),
+        }
+    }
+
+    fn constant(&mut self, v: f64) -> Reg {
+        let next = self.constants.len();
+        let index = *self.constant_index.entry(v.to_bits()).or_insert(next);
+        if index == next {
+            self.constants.push(v);
+        }
+        CONSTANT + index as Reg
+    }
+
+    fn constant_value(&self, r: Reg) -> Option<f64> {
+        (r >= CONSTANT && r < OPERATION).then(|| self.constants[(r - CONSTANT) as usize])
+    }
+
+    fn flags(&self, r: Reg) -> (bool, bool) {
+        if r >= OPERATION {
+            let (_, fixed, on_input) = self.ops[(r - OPERATION) as usize];
+            (fixed, on_input)
+        } else if r >= CONSTANT {
+            (true, false)
+        } else {
+            match self.kinds[r as usize] {
+                LeafKind::Parameter => (true, false),
+                LeafKind::Input => (false, true),
+                LeafKind::Varying => (false, false),
+            }
+        }
+    }
+
+    fn push(&mut self, op: Op, operands: &[Reg]) -> Reg {
+        if let Some(&i) = self.op_index.get(&op) {
+            return OPERATION + i as Reg;
+        }
+        let fixed = operands.iter().all(|&r| self.flags(r).0);
+        let on_input = operands.iter().any(|&r| self.flags(r).1);
+        let i = self.ops.len();
+        self.ops.push((op, fixed, on_input));
+        self.op_index.insert(op, i);
+        OPERATION + i as Reg
+    }
+
+    fn unary(&mut self, op: fn(Reg) -> Op, a: Reg, f: fn(f64) -> f64) -> Reg {
+        match self.constant_value(a) {
+            Some(v) => self.constant(f(v)),
+            None => self.push(op(a), &[a]),
+        }
+    }
+
+    fn switch(&mut self, kind: SwitchKind, a: Reg, b: Reg) -> Reg {
+        let next = self.switches.len() as u32;
+        let index = *self.switch_index.entry((kind, a, b)).or_insert(next);
+        if index == next {
+            let (fixed_a, input_a) = self.flags(a);
+            let (fixed_b, input_b) = self.flags(b);
+            self.switches.push(Switch {
+                kind,
+                a,
+                b,
+                on_input: input_a || input_b,
+                live: !(fixed_a && fixed_b),
+            });
+        }
+        self.push(Op::Switch(index), &[a, b])
+    }
+
+    /// Compiles one expression and returns its (provisional) register for [`finish`](Self::finish).
+    pub fn add(&mut self, e: &Expr) -> Result<Reg, UnknownName> {
+        Ok(match e {
+            Expr::Num(v) => self.constant(*v),
+            Expr::Var { name, primes } => {
+                if &**name == "pi" && *primes == 0 {
+                    return Ok(self.constant(std::f64::consts::PI));
+                }
+                match (self.resolve)(name, *primes) {
+                    Some(leaf) => leaf as Reg,
+                    None => return Err(UnknownName { name: name.to_string(), primes: *primes }),
+                }
+            }
+            Expr::Neg(a) => {
+                let a = self.add(a)?;
+                self.unary(Op::Neg, a, |v| -v)
+            }
+            Expr::Bin(op, a, b) => {
+                let (ra, rb) = (self.add(a)?, self.add(b)?);
+                let (ca, cb) = (self.constant_value(ra), self.constant_value(rb));
+                match (op, ca, cb) {
+                    (BinOp::Add, Some(x), Some(y)) => self.constant(x + y),
+                    (BinOp::Sub, Some(x), Some(y)) => self.constant(x - y),
+                    (BinOp::Mul, Some(x), Some(y)) => self.constant(x * y),
+                    (BinOp::Div, Some(x), Some(y)) => self.constant(x / y),
+                    (BinOp::Pow, Some(x), Some(y)) => self.constant(x.powf(y)),
+                    (BinOp::Add, Some(0.0), _) => rb,
+                    (BinOp::Add | BinOp::Sub, _, Some(0.0)) => ra,
+                    (BinOp::Mul, Some(1.0), _) => rb,
+                    (BinOp::Mul | BinOp::Div | BinOp::Pow, _, Some(1.0)) => ra,
+                    (BinOp::Mul, Some(0.0), _) | (BinOp::Mul, _, Some(0.0)) => self.constant(0.0),
+                    (BinOp::Add, ..) => self.push(Op::Add(ra, rb), &[ra, rb]),
+                    (BinOp::Sub, ..) => self.push(Op::Sub(ra, rb), &[ra, rb]),
+                    (BinOp::Mul, ..) => self.push(Op::Mul(ra, rb), &[ra, rb]),
+                    (BinOp::Div, ..) => self.push(Op::Div(ra, rb), &[ra, rb]),
+                    (BinOp::Pow, _, Some(y)) if y.fract() == 0.0 && y.abs() <= 64.0 => {
+                        self.push(Op::Powi(ra, y as i32), &[ra])
+                    }
+                    (BinOp::Pow, ..) => self.push(Op::Pow(ra, rb), &[ra, rb]),
+                }
+            }
+            Expr::Call(Func::Delay, args) => {
+                let (arg, tau) = (args[0].clone(), args[1].clone());
+                if let Some(i) = self.delay_exprs.iter().position(|d| d.0 == arg && d.1 == tau) {
+                    return Ok(self.delays[i].leaf);
+                }
+                let (ra, rt) = (self.add(&arg)?, self.add(&tau)?);
+                let leaf = self.kinds.len() as Reg;
+                let kind = if self.flags(ra).1 { LeafKind::Input } else { LeafKind::Varying };
+                self.kinds.push(kind);
+                self.delays.push(Delay {
+                    arg: ra,
+                    tau: rt,
+                    leaf,
+                    arg_leaf: (ra < CONSTANT).then_some(ra),
+                });
+                self.delay_exprs.push((arg, tau));
+                leaf
+            }
+            Expr::Call(f, args) => {
+                let a = self.add(&args[0])?;
+                match f {
+                    Func::Sin => self.unary(Op::Sin, a, f64::sin),
+                    Func::Cos => self.unary(Op::Cos, a, f64::cos),
+                    Func::Tan => self.unary(Op::Tan, a, f64::tan),
+                    Func::Exp => self.unary(Op::Exp, a, f64::exp),
+                    Func::Ln => self.unary(Op::Ln, a, f64::ln),
+                    Func::Sqrt => self.unary(Op::Sqrt, a, f64::sqrt),
+                    Func::Tanh => self.unary(Op::Tanh, a, f64::tanh),
+                    Func::Sign => self.switch(SwitchKind::Sign, a, a),
+                    Func::Abs => self.switch(SwitchKind::Abs, a, a),
+                    Func::Min | Func::Max | Func::Deadzone | Func::Saturate | Func::Step => {
+                        let b = self.add(&args[1])?;
+                        let kind = match f {
+                            Func::Min => SwitchKind::Min,
+                            Func::Max => SwitchKind::Max,
+                            Func::Deadzone => SwitchKind::Deadzone,
+                            Func::Saturate => SwitchKind::Saturate,
+                            _ => SwitchKind::Step,
+                        };
+                        self.switch(kind, a, b)
+                    }
+                    Func::Delay => unreachable!("handled above"),
+                }
+            }
+        })
+    }
+
+    /// Lays out the registers: leaves (with the delays' leaves behind the caller's), constants, the
+    /// prologue's operations, the others. `outputs` are registers returned by [`add`](Self::add).
+    pub fn finish(self, outputs: &[Reg]) -> Tape {
+        let leaves = self.kinds.len();
+        let first_op = leaves + self.constants.len();
+        let mut order: Vec<usize> = (0..self.ops.len()).filter(|&i| self.ops[i].1).collect();
+        let prologue = order.len();
+        order.extend((0..self.ops.len()).filter(|&i| !self.ops[i].1));
+        let mut place = vec![0; self.ops.len()];
+        for (to, &from) in order.iter().enumerate() {
+            place[from] = first_op + to;
+        }
+        let at = |r: Reg| -> Reg {
+            if r >= OPERATION {
+                place[(r - OPERATION) as usize] as Reg
+            } else if r >= CONSTANT {
+                leaves as Reg + (r - CONSTANT)
+            } else {
+                r
+            }
+        };
+        let ops = order
+            .iter()
+            .map(|&i| match self.ops[i].0 {
+                Op::Neg(a) => Op::Neg(at(a)),
+                Op::Add(a, b) => Op::Add(at(a), at(b)),
+                Op::Sub(a, b) => Op::Sub(at(a), at(b)),
+                Op::Mul(a, b) => Op::Mul(at(a), at(b)),
+                Op::Div(a, b) => Op::Div(at(a), at(b)),
+                Op::Powi(a, n) => Op::Powi(at(a), n),
+                Op::Pow(a, b) => Op::Pow(at(a), at(b)),
+                Op::Sqrt(a) => Op::Sqrt(at(a)),
+                Op::Sin(a) => Op::Sin(at(a)),
+                Op::Cos(a) => Op::Cos(at(a)),
+                Op::Tan(a) => Op::Tan(at(a)),
+                Op::Exp(a) => Op::Exp(at(a)),
+                Op::Ln(a) => Op::Ln(at(a)),
+                Op::Tanh(a) => Op::Tanh(at(a)),
+                Op::Switch(k) => Op::Switch(k),
+            })
+            .collect();
+        Tape {
+            leaves,
+            kinds: self.kinds,
+            constants: self.constants.clone(),
+            ops,
+            prologue,
+            outputs: outputs.iter().map(|&r| at(r)).collect(),
+            switches: self.switches.iter().map(|s| Switch { a: at(s.a), b: at(s.b), ..*s }).collect(),
+            delays: self
+                .delays
+                .iter()
+                .map(|d| Delay { arg: at(d.arg), tau: at(d.tau), leaf: d.leaf, arg_leaf: d.arg_leaf })
+                .collect(),
+        }
+    }
+}
+
+impl Tape {
+    /// Compiles `exprs` over the leaves that `kinds` and `resolve` describe.
+    pub fn compile(
+        exprs: &[Expr],
+        kinds: Vec<LeafKind>,
+        resolve: &dyn Fn(&str, u8) -> Option<usize>,
+    ) -> Result<Tape, UnknownName> {
+        let mut compiler = Compiler::new(kinds, resolve);
+        let outputs = exprs.iter().map(|e| compiler.add(e)).collect::<Result<Vec<_>, _>>()?;
+        Ok(compiler.finish(&outputs))
+    }
+
+    /// Number of registers that [`eval`](Self::eval) needs.
+    pub fn registers(&self) -> usize {
+        self.leaves + self.constants.len() + self.ops.len()
+    }
+
+    /// Number of leaves, the delays' included (they come last).
+    pub fn leaves(&self) -> usize {
+        self.leaves
+    }
+
+    /// Number of operations evaluated at every point (without the prologue).
+    pub fn body_len(&self) -> usize {
+        self.ops.len() - self.prologue
+    }
+
+    /// Whether a register depends on parameters alone (it is set once per simulation).
+    pub fn is_fixed(&self, r: Reg) -> bool {
+        let r = r as usize;
+        if r < self.leaves {
+            self.kinds[r] == LeafKind::Parameter
+        } else {
+            r < self.first_op() + self.prologue
+        }
+    }
+
+    /// The value of a register that is a constant of the program, whatever the parameters.
+    pub fn constant_value(&self, r: Reg) -> Option<f64> {
+        (r as usize).checked_sub(self.leaves).and_then(|i| self.constants.get(i)).copied()
+    }
+
+    fn first_op(&self) -> usize {
+        self.leaves + self.constants.len()
+    }
+
+    /// Fills the constants and evaluates the operations that depend on parameters alone. The
+    /// parameters' leaves must be set. Modes of switches in the prologue are set from their values.
+    pub fn prepare(&self, regs: &mut [f64], modes: &mut [i8]) {
+        regs[self.leaves..self.first_op()].copy_from_slice(&self.constants);
+        self.run::<true>(0, self.prologue, regs, modes, &[]);
+    }
+
+    /// Evaluates the body with fixed modes; `lambda[k]` is the value of a sticking `sign` `k`.
+    #[inline]
+    pub fn eval(&self, regs: &mut [f64], modes: &mut [i8], lambda: &[f64]) {
+        self.run::<false>(self.prologue, self.ops.len(), regs, modes, lambda);
+    }
+
+    /// Evaluates the body with every mode taken from the arguments' values as they are met, and
+    /// leaves the modes in `modes`.
+    pub fn eval_natural(&self, regs: &mut [f64], modes: &mut [i8]) {
+        self.run::<true>(self.prologue, self.ops.len(), regs, modes, &[]);
+    }
+
+    #[inline(always)]
+    fn run<const NATURAL: bool>(
+        &self,
+        from: usize,
+        to: usize,
+        regs: &mut [f64],
+        modes: &mut [i8],
+        lambda: &[f64],
+    ) {
+        let first = self.first_op();
+        for (i, op) in self.ops[from..to].iter().enumerate() {
+            let g = |r: Reg| regs[r as usize];
+            let v = match *op {
+                Op::Neg(a) => -g(a),
+                Op::Add(a, b) => g(a) + g(b),
+                Op::Sub(a, b) => g(a) - g(b),
+                Op::Mul(a, b) => g(a) * g(b),
+                Op::Div(a, b) => g(a) / g(b),
+                Op::Powi(a, n) => powi(g(a), n),
+                Op::Pow(a, b) => g(a).powf(g(b)),
+                Op::Sqrt(a) => g(a).sqrt(),
+                Op::Sin(a) => g(a).sin(),
+                Op::Cos(a) => g(a).cos(),
+                Op::Tan(a) => g(a).tan(),
+                Op::Exp(a) => g(a).exp(),
+                Op::Ln(a) => g(a).ln(),
+                Op::Tanh(a) => g(a).tanh(),
+                Op::Switch(k) => {
+                    let s = &self.switches[k as usize];
+                    let (a, b) = (g(s.a), g(s.b));
+                    if NATURAL {
+                        modes[k as usize] = s.natural_mode(a, b);
+                        s.value(modes[k as usize], 0.0, a, b)
+                    } else {
+                        s.value(modes[k as usize], lambda[k as usize], a, b)
+                    }
+                }
+            };
+            regs[first + from + i] = v;
+        }
+    }
+
+    /// Directional derivatives of every register for `lanes` directions at the point whose values
+    /// stand in `regs`. `d` is `registers × lanes`, row major; the leaves' rows (and, for the body,
+    /// the prologue's) must be set. `dlambda` is `switches × lanes`: derivatives of the values of
+    /// sticking signs. `active[r]` false promises a zero row and skips the work.
+    pub fn tangent(
+        &self,
+        regs: &[f64],
+        modes: &[i8],
+        dlambda: &[f64],
+        lanes: usize,
+        active: &[bool],
+        d: &mut [f64],
+    ) {
+        self.run_tangent(self.prologue, self.ops.len(), regs, modes, dlambda, lanes, active, d);
+    }
+
+    /// [`tangent`](Self::tangent) of the prologue: once per simulation.
+    pub fn prepare_tangent(&self, regs: &[f64], modes: &[i8], lanes: usize, active: &[bool], d: &mut [f64]) {
+        d[self.leaves * lanes..self.first_op() * lanes].fill(0.0);
+        self.run_tangent(0, self.prologue, regs, modes, &[], lanes, active, d);
+    }
+
+    /// Which registers can have a non-zero derivative when the leaves marked in `leaf_active` have.
+    /// `any_lambda`: whether sticking signs have derivatives.
+    pub fn activity(&self, leaf_active: &[bool], any_lambda: bool) -> Vec<bool> {
+        let mut active = vec![false; self.registers()];
+        active[..self.leaves].copy_from_slice(leaf_active);
+        let first = self.first_op();
+        for (i, op) in self.ops.iter().enumerate() {
+            active[first + i] = match *op {
+                Op::Neg(a)
+                | Op::Powi(a, _)
+                | Op::Sqrt(a)
+                | Op::Sin(a)
+                | Op::Cos(a)
+                | Op::Tan(a)
+                | Op::Exp(a)
+                | Op::Ln(a)
+                | Op::Tanh(a) => active[a as usize],
+                Op::Add(a, b) | Op::Sub(a, b) | Op::Mul(a, b) | Op::Div(a, b) | Op::Pow(a, b) => {
+                    active[a as usize] || active[b as usize]
+                }
+                Op::Switch(k) => {
+                    let s = &self.switches[k as usize];
+                    match s.kind {
+                        SwitchKind::Sign => any_lambda,
+                        SwitchKind::Step => false,
+                        _ => active[s.a as usize] || active[s.b as usize],
+                    }
+                }
+            };
+        }
+        active
+    }
+
+    fn run_tangent(
+        &self,
+        from: usize,
+        to: usize,
+        regs: &[f64],
+        modes: &[i8],
+        dlambda: &[f64],
+        lanes: usize,
+        active: &[bool],
+        d: &mut [f64],
+    ) {
+        let first = self.first_op();
+        for (i, op) in self.ops[from..to].iter().enumerate() {
+            let out = first + from + i;
+            let (lower, upper) = d.split_at_mut(out * lanes);
+            let o = &mut upper[..lanes];
+            if !active[out] {
+                o.fill(0.0);
+                continue;
+            }
+            let v = |r: Reg| regs[r as usize];
+            let row = |r: Reg| &lower[r as usize * lanes..][..lanes];
+            let scaled = |o: &mut [f64], a: Reg, k: f64| {
+                for (o, x) in o.iter_mut().zip(row(a)) {
+                    *o = k * x;
+                }
+            };
+            let blended = |o: &mut [f64], a: Reg, ka: f64, b: Reg, kb: f64| match (
+                active[a as usize],
+                active[b as usize],
+            ) {
+                (true, false) => scaled(o, a, ka),
+                (false, true) => scaled(o, b, kb),
+                _ => {
+                    for ((o, x), y) in o.iter_mut().zip(row(a)).zip(row(b)) {
+                        *o = ka * x + kb * y;
+                    }
+                }
+            };
+            match *op {
+                Op::Neg(a) => scaled(o, a, -1.0),
+                Op::Add(a, b) => blended(o, a, 1.0, b, 1.0),
+                Op::Sub(a, b) => blended(o, a, 1.0, b, -1.0),
+                Op::Mul(a, b) => blended(o, a, v(b), b, v(a)),
+                Op::Div(a, b) => blended(o, a, 1.0 / v(b), b, -v(a) / (v(b) * v(b))),
+                Op::Powi(a, n) => scaled(o, a, n as f64 * powi(v(a), n - 1)),
+                Op::Pow(a, b) => {
+                    let (x, y) = (v(a), v(b));
+                    let log = if active[b as usize] { x.powf(y) * x.ln() } else { 0.0 };
+                    blended(o, a, y * x.powf(y - 1.0), b, log);
+                }
+                // At 0 the slope of the root is infinite; a zero derivative keeps lanes finite
+                // where a state rests at the boundary of its domain (an empty tank).
+                Op::Sqrt(a) => {
+                    let root = regs[out];
+                    scaled(o, a, if root > 0.0 { 0.5 / root } else { 0.0 })
+                }
+                Op::Sin(a) => scaled(o, a, v(a).cos()),
+                Op::Cos(a) => scaled(o, a, -v(a).sin()),
+                Op::Tan(a) => scaled(o, a, 1.0 + regs[out] * regs[out]),
+                Op::Exp(a) => scaled(o, a, regs[out]),
+                Op::Ln(a) => scaled(o, a, 1.0 / v(a)),
+                Op::Tanh(a) => scaled(o, a, 1.0 - regs[out] * regs[out]),
+                Op::Switch(k) => {
+                    let s = &self.switches[k as usize];
+                    let mode = modes[k as usize];
+                    let m = mode as f64;
+                    use SwitchKind::*;
+                    match s.kind {
+                        Sign if mode == 0 && !dlambda.is_empty() => {
+                            o.copy_from_slice(&dlambda[k as usize * lanes..][..lanes]);
+                        }
+                        Sign | Step => o.fill(0.0),
+                        Abs => scaled(o, s.a, m),
+                        Max => scaled(o, if mode > 0 { s.a } else { s.b }, 1.0),
+                        Min => scaled(o, if mode > 0 { s.b } else { s.a }, 1.0),
+                        Deadzone if mode == 0 => o.fill(0.0),
+                        Deadzone => blended(o, s.a, 1.0, s.b, -m),
+                        Saturate if mode == 0 => scaled(o, s.a, 1.0),
+                        Saturate => scaled(o, s.b, m),
+                    }
+                }
+            }
+        }
+    }
+
+    /// Evaluates the outputs at `n` points; every non-smooth function pointwise, sign(0) = 0.
+    /// `leaf(i)` gives leaf `i` as one value or one per point; delays' leaves must be given too.
+    /// The result holds one vector of length `n` per output.
+    pub fn eval_batch<'d>(&self, n: usize, leaf: &dyn Fn(usize) -> Column<'d>) -> Vec<Vec<f64>> {
+        const LANES: usize = 16;
+        let columns: Vec<Column<'d>> = (0..self.leaves).map(leaf).collect();
+        let first = self.first_op();
+        let mut regs = vec![[0.0; LANES]; self.registers()];
+        for (r, c) in regs[self.leaves..first].iter_mut().zip(&self.constants) {
+            *r = [*c; LANES];
+        }
+        let mut out: Vec<Vec<f64>> = vec![Vec::with_capacity(n); self.outputs.len()];
+        let mut start = 0;
+        while start < n {
+            let width = LANES.min(n - start);
+            for (r, c) in regs.iter_mut().zip(&columns) {
+                match c {
+                    Column::Value(v) => *r = [*v; LANES],
+                    // Idle lanes of the last block repeat its last point.
+                    Column::Series(s) => {
+                        for (l, x) in r.iter_mut().enumerate() {
+                            *x = s[start + l.min(width - 1)];
+                        }
+                    }
+                }
+            }
+            for (i, op) in self.ops.iter().enumerate() {
+                let (lower, upper) = regs.split_at_mut(first + i);
+                let o = &mut upper[0];
+                let r = |a: Reg| &lower[a as usize];
+                let map1 = |o: &mut [f64; LANES], a: Reg, f: fn(f64) -> f64| {
+                    for (o, x) in o.iter_mut().zip(r(a)) {
+                        *o = f(*x);
+                    }
+                };
+                macro_rules! map2 {
+                    ($a:expr, $b:expr, $f:expr) => {
+                        for ((o, x), y) in o.iter_mut().zip(r($a)).zip(r($b)) {
+                            *o = $f(*x, *y);
+                        }
+                    };
+                }
+                match *op {
+                    Op::Neg(a) => map1(o, a, |x| -x),
+                    Op::Add(a, b) => map2!(a, b, |x: f64, y: f64| x + y),
+                    Op::Sub(a, b) => map2!(a, b, |x: f64, y: f64| x - y),
+                    Op::Mul(a, b) => map2!(a, b, |x: f64, y: f64| x * y),
+                    Op::Div(a, b) => map2!(a, b, |x: f64, y: f64| x / y),
+                    Op::Pow(a, b) => map2!(a, b, f64::powf),
+                    Op::Powi(a, n) => {
+                        for (o, x) in o.iter_mut().zip(r(a)) {
+                            *o = powi(*x, n);
+                        }
+                    }
+                    Op::Sqrt(a) => map1(o, a, f64::sqrt),
+                    Op::Sin(a) => map1(o, a, f64::sin),
+                    Op::Cos(a) => map1(o, a, f64::cos),
+                    Op::Tan(a) => map1(o, a, f64::tan),
+                    Op::Exp(a) => map1(o, a, f64::exp),
+                    Op::Ln(a) => map1(o, a, f64::ln),
+                    Op::Tanh(a) => map1(o, a, f64::tanh),
+                    Op::Switch(k) => {
+                        let s = &self.switches[k as usize];
+                        map2!(s.a, s.b, |x: f64, y: f64| s.value(s.natural_mode(x, y), 0.0, x, y));
+                    }
+                }
+            }
+            for (o, &reg) in out.iter_mut().zip(&self.outputs) {
+                o.extend_from_slice(&regs[reg as usize][..width]);
+            }
+            start += width;
+        }
+        out
+    }
+}
+
+/// A leaf of [`Tape::eval_batch`].
+#[derive(Debug, Clone, Copy)]
+pub enum Column<'a> {
+    /// The same at every point.
+    Value(f64),
+    /// One value per point.
+    Series(&'a [f64]),
+}
+
+#[inline]
+fn powi(x: f64, n: i32) -> f64 {
+    match n {
+        0 => 1.0,
+        1 => x,
+        2 => x * x,
+        3 => x * x * x,
+        _ => x.powi(n),
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn names(n: &str, primes: u8) -> Option<usize> {
+        match (n, primes) {
+            ("x", 0) => Some(0),
+            ("x", 1) => Some(1),
+            ("k", 0) => Some(2),
+            _ => None,
+        }
+    }
+
+    fn kinds() -> Vec<LeafKind> {
+        vec![LeafKind::Varying, LeafKind::Varying, LeafKind::Parameter]
+    }
+
+    fn sample() -> Expr {
+        let (x, v, k) = (Expr::var("x"), Expr::prime("x", 1), Expr::var("k"));
+        let cube = x.clone().pow(Expr::Num(3.0));
+        k.clone() * cube * Expr::call(Func::Sin, vec![v.clone()])
+            + Expr::call(Func::Deadzone, vec![x.clone(), k.clone() / Expr::Num(8.0)])
+            + Expr::call(Func::Abs, vec![v]) * (k.clone() * k)
+            - Expr::call(Func::Saturate, vec![x, Expr::Num(0.5)])
+    }
+
+    fn by_hand(x: f64, v: f64, k: f64) -> f64 {
+        let gap = k / 8.0;
+        let dz = if x.abs() <= gap { 0.0 } else { x - gap * x.signum() };
+        k * x.powi(3) * v.sin() + dz + v.abs() * k * k - x.clamp(-0.5, 0.5)
+    }
+
+    #[test]
+    fn one_point_batch_and_by_hand_agree() {
+        let tape = Tape::compile(&[sample()], kinds(), &names).unwrap();
+        let xs: Vec<f64> = (0..37).map(|i| -1.2 + 0.065 * i as f64).collect();
+        let vs: Vec<f64> = (0..37).map(|i| 0.9 - 0.05 * i as f64).collect();
+        let batch = tape.eval_batch(37, &|i| match i {
+            0 => Column::Series(&xs),
+            1 => Column::Series(&vs),
+            _ => Column::Value(1.7),
+        });
+        for i in 0..37 {
+            let mut regs = vec![0.0; tape.registers()];
+            let mut modes = vec![0; tape.switches.len()];
+            regs[..3].copy_from_slice(&[xs[i], vs[i], 1.7]);
+            tape.prepare(&mut regs, &mut modes);
+            tape.eval_natural(&mut regs, &mut modes);
+            let value = regs[tape.outputs[0] as usize];
+            assert!((value - by_hand(xs[i], vs[i], 1.7)).abs() < 1e-14);
+            assert_eq!(value, batch[0][i]);
+        }
+    }
+
+    #[test]
+    fn tangents_match_central_differences() {
+        let tape = Tape::compile(&[sample()], kinds(), &names).unwrap();
+        for (x, v, k) in [(0.4, 0.3, 1.7), (-0.9, -0.4, 0.8), (0.1, 0.7, 2.0)] {
+            let mut regs = vec![0.0; tape.registers()];
+            let mut modes = vec![0; tape.switches.len()];
+            regs[..3].copy_from_slice(&[x, v, k]);
+            tape.prepare(&mut regs, &mut modes);
+            tape.eval_natural(&mut regs, &mut modes);
+            let active = tape.activity(&[true, true, true], false);
+            let mut d = vec![0.0; tape.registers() * 3];
+            for i in 0..3 {
+                d[i * 3 + i] = 1.0;
+            }
+            tape.prepare_tangent(&regs, &modes, 3, &active, &mut d);
+            tape.tangent(&regs, &modes, &[], 3, &active, &mut d);
+            let row = &d[tape.outputs[0] as usize * 3..][..3];
+            let h = 1e-6;
+            let numeric = [
+                (by_hand(x + h, v, k) - by_hand(x - h, v, k)) / (2.0 * h),
+                (by_hand(x, v + h, k) - by_hand(x, v - h, k)) / (2.0 * h),
+                (by_hand(x, v, k + h) - by_hand(x, v, k - h)) / (2.0 * h),
+            ];
+            for l in 0..3 {
+                assert!((row[l] - numeric[l]).abs() < 1e-8, "{row:?} {numeric:?}");
+            }
+        }
+    }
+
+    #[test]
+    fn parameters_alone_are_hoisted_and_shared_terms_merged() {
+        let k2 = || Expr::var("k") * Expr::var("k");
+        let tape = Tape::compile(&[k2() * Expr::var("x"), k2() + Expr::var("x")], kinds(), &names).unwrap();
+        assert_eq!(tape.prologue, 1);
+        assert_eq!(tape.body_len(), 2);
+    }
+
+    #[test]
+    fn an_unknown_name_is_told_with_its_primes() {
+        let error = Tape::compile(&[Expr::prime("y", 2)], kinds(), &names).unwrap_err();
+        assert_eq!(error.to_string(), "unknown name `y''`");
+    }
+}
