@@ -12,8 +12,6 @@ use std::fs;
 use std::io::{ErrorKind, Read, Write};
 use std::path::Path;
 
-const MISSING_MEND: &str = "write a number, or leave the cell empty for a missing sample";
-
 /// Reads the recording in the file at `path`.
 ///
 /// # Errors
@@ -396,11 +394,12 @@ fn printed_decimals(cell: &[u8]) -> Option<i32> {
 
 fn bad_cell(cell: &[u8], c: usize, place: Place) -> RecordingError {
     let text = String::from_utf8_lossy(cell);
-    let found: String = if text.chars().count() > 40 {
-        text.chars().take(40).chain(['…']).collect()
-    } else {
-        text.into_owned()
-    };
+    let first_line = text.lines().next().unwrap_or_default();
+    let open_quote = first_line.len() < text.len();
+    let mut found: String = first_line.chars().take(40).collect();
+    if found.len() < text.len() {
+        found.push('…');
+    }
     let number_like = |s: &str| s.parse::<f64>().is_ok();
     if number_like(&found) {
         return RecordingError::NotFinite { place, found };
@@ -408,7 +407,13 @@ fn bad_cell(cell: &[u8], c: usize, place: Place) -> RecordingError {
     if found.matches(',').count() == 1 && number_like(&found.replace(',', ".")) {
         return RecordingError::DecimalComma { place, found: format!("`{found}`") };
     }
-    let mend = if c == 0 { "write the time as a number of seconds" } else { MISSING_MEND };
+    let mend = if open_quote {
+        "a quotation mark opens there and does not close in its line: remove it"
+    } else if c == 0 {
+        "write the time as a number of seconds"
+    } else {
+        "write a number, or leave the cell empty for a missing sample"
+    };
     RecordingError::NotANumber { place, found, mend }
 }
 

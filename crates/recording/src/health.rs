@@ -194,7 +194,7 @@ fn clipping(channel: &Channel, y: &[f64]) -> Vec<Finding> {
     };
     let mut findings = Vec::new();
     for (extreme, which) in [(low, "smallest"), (high, "largest")] {
-        let (at, elsewhere): (Vec<_>, Vec<_>) =
+        let (at, elsewhere): (Vec<&(f64, usize)>, Vec<&(f64, usize)>) =
             runs.iter().partition(|run| (run.0 - extreme).abs() <= tolerance);
         let held: usize = at.iter().map(|run| run.1).sum();
         let beside: usize =
