@@ -4,7 +4,7 @@ use std::ops::Range;
 use std::sync::OnceLock;
 
 use greybox_model::{Expr, Hold, Model};
-use greybox_recording::{Recording, Smoothed};
+use greybox_recording::{Recording, smooth::Smoothed};
 use greybox_simulate::{Environment, FINE, Signal};
 
 /// A recording that does not fit the model.
@@ -292,7 +292,7 @@ fn find_channel(
                 channel: channel.to_string(),
                 message: e.to_string(),
             })?;
-            if header.dimension != unit.dimension {
+            if !header.dimension.same(&unit.dimension) {
                 return Err(DataError::Unit {
                     file,
                     channel: channel.to_string(),

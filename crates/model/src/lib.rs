@@ -1,6 +1,7 @@
 //! The greybox model language: textbook equations, parsed, checked for units and compiled.
 pub mod algebra;
 mod display;
+pub mod error;
 pub mod expr;
 pub mod model;
 mod nearest;
@@ -9,8 +10,9 @@ pub mod system;
 pub mod tape;
 pub mod units;
 
+pub use error::{ModelError, Place, Problem};
 pub use expr::{BinOp, Expr, Func};
 pub use model::{Equation, Hold, Input, Measurement, Model, Parameter, State};
 pub use parse::{Parsed, ParsedEquation, SyntaxError, parse, parse_equation};
 pub use system::System;
-pub use units::{Dimension, Unit};
+pub use units::{Dimension, Unit, UnitError};

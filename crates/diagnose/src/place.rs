@@ -1,0 +1,259 @@
+//! Where a force could act: read off the nominal equations.
+//!
+//! Each equation has a coordinate of its own (matched through the mass matrix). Beyond that, every
+//! parameter p whose derivative of the equations is rank one, ∂(equations)/∂p = w·g with constant w
+//! and g linear in the coordinates (or rates), shows an element of the machine: a spring or a damper
+//! that acts on the motion d = g with the weights w on the equations, so that action equals reaction.
+//! A missing force F(d, d') at that element enters equation e as w_e F.
+
+use greybox_model::{Dimension, Expr, Model};
+
+/// A place of the model.
+#[derive(Debug, Clone, PartialEq)]
+pub enum Place {
+    /// A motion with its weights on the equations.
+    Motion(Motion),
+    /// An equation as a whole.
+    Equation(usize),
+    /// An input.
+    Input(usize),
+    /// A measurement.
+    Measurement(usize),
+}
+
+/// A motion on which forces can act.
+#[derive(Debug, Clone, PartialEq)]
+pub struct Motion {
+    /// Weight of the force in each equation.
+    pub weights: Vec<f64>,
+    /// Coefficients of the motion in the states.
+    pub coefficients: Vec<f64>,
+    /// d, where the model knows it.
+    pub position: Option<Expr>,
+    /// d', where the model knows it.
+    pub rate: Option<Expr>,
+}
+
+impl Place {
+    /// Names of the equations where it enters, the one that the report names first.
+    pub fn equations(&self, model: &Model) -> Vec<String> {
+        match self {
+            Place::Motion(m) => {
+                let mut named: Vec<usize> = (0..m.weights.len()).filter(|&e| m.weights[e] != 0.0).collect();
+                // The equation whose own coordinate is the motion comes first.
+                let own = own_coordinates(model);
+                named.sort_by_key(|&e| {
+                    let alone = own[e].is_some_and(|j| {
+                        m.coefficients.iter().enumerate().all(|(i, c)| (*c != 0.0) == (i == j))
+                    });
+                    (!alone, e)
+                });
+                named.into_iter().map(|e| model.equations[e].name.clone()).collect()
+            }
+            Place::Equation(e) => vec![model.equations[*e].name.clone()],
+            Place::Input(i) => {
+                let name = &model.inputs[*i].name;
+                model.equations.iter().filter(|e| e.residual().mentions(name)).map(|e| e.name.clone()).collect()
+            }
+            Place::Measurement(c) => {
+                let expr = &model.measurements[*c].expr;
+                let mut names = Vec::new();
+                for (e, own) in model.equations.iter().zip(own_coordinates(model)) {
+                    if own.is_some_and(|j| expr.mentions(&model.states[j].name)) {
+                        names.push(e.name.clone());
+                    }
+                }
+                names
+            }
+        }
+    }
+}
+
+/// The state each equation governs: a matching of equations to states through the mass matrix that
+/// prefers, for each equation, a coordinate that also appears in its other terms.
+pub fn own_coordinates(model: &Model) -> Vec<Option<usize>> {
+    let n = model.states.len();
+    let highest: Vec<(&str, u8)> = model.states.iter().map(|s| (s.name.as_str(), s.order as u8)).collect();
+    let mut likes = vec![vec![0u8; n]; n];
+    for (e, equation) in model.equations.iter().enumerate() {
+        if let Some((mass, rest)) = equation.residual().affine_in(&highest) {
+            for j in 0..n {
+                if mass[j].simplify() != Expr::Num(0.0) {
+                    likes[e][j] = 1 + rest.mentions(&model.states[j].name) as u8;
+                }
+            }
+        }
+    }
+    // n is small: the best assignment by depth-first search, the first best one counts.
+    fn search(likes: &[Vec<u8>], e: usize, used: &mut Vec<Option<usize>>, best: &mut (u32, Vec<Option<usize>>), score: u32) {
+        if e == likes.len() {
+            if score > best.0 || best.1.is_empty() {
+                *best = (score, used.clone());
+            }
+            return;
+        }
+        for j in 0..likes.len() {
+            if likes[e][j] > 0 && !used[..e].contains(&Some(j)) {
+                used[e] = Some(j);
+                search(likes, e + 1, used, best, score + 100 + likes[e][j] as u32);
+                used[e] = None;
+            }
+        }
+        if n_too_many(likes.len()) {
+            return;
+        }
+        search(likes, e + 1, used, best, score);
+    }
+    fn n_too_many(n: usize) -> bool {
+        n > 8
+    }
+    let mut best = (0, Vec::new());
+    search(&likes, 0, &mut vec![None; n], &mut best, 0);
+    if best.1.is_empty() { vec![None; n] } else { best.1 }
+}
+
+/// All places of a model: motions (own coordinates first, then rank-one elements), equations, inputs,
+/// measurements.
+pub fn places(model: &Model) -> Vec<Place> {
+    let n = model.states.len();
+    let mut motions: Vec<Motion> = Vec::new();
+    let mut add = |weights: Vec<f64>, coefficients: Vec<f64>| {
+        if let Some(motion) = motion(model, weights, coefficients)
+            && !motions.iter().any(|m| same(m, &motion))
+        {
+            motions.push(motion);
+        }
+    };
+    for (e, own) in own_coordinates(model).into_iter().enumerate() {
+        if let Some(j) = own {
+            let (mut w, mut c) = (vec![0.0; n], vec![0.0; n]);
+            w[e] = 1.0;
+            c[j] = 1.0;
+            add(w, c);
+        }
+    }
+    for parameter in &model.parameters {
+        if let Some((w, c)) = rank_one(model, &parameter.name) {
+            add(w, c);
+        }
+    }
+    let mut out: Vec<Place> = motions.into_iter().map(Place::Motion).collect();
+    out.extend((0..model.equations.len()).map(Place::Equation));
+    out.extend((0..model.inputs.len()).map(Place::Input));
+    out.extend((0..model.measurements.len()).map(Place::Measurement));
+    out
+}
+
+fn same(a: &Motion, b: &Motion) -> bool {
+    let close = |x: &[f64], y: &[f64]| x.iter().zip(y).all(|(x, y)| (x - y).abs() < 1e-9);
+    let flipped: Vec<f64> = b.coefficients.iter().map(|c| -c).collect();
+    let against: Vec<f64> = b.weights.iter().map(|c| -c).collect();
+    (close(&a.coefficients, &b.coefficients) && close(&a.weights, &b.weights))
+        || (close(&a.coefficients, &flipped) && close(&a.weights, &against))
+}
+
+/// Weights and coefficients of the element behind a parameter, if it is one.
+fn rank_one(model: &Model, parameter: &str) -> Option<(Vec<f64>, Vec<f64>)> {
+    let n = model.states.len();
+    let mut rows: Vec<Option<(u8, Vec<f64>)>> = Vec::new();
+    for equation in &model.equations {
+        let g = equation.residual().derivative(parameter, 0).simplify();
+        if g == Expr::Num(0.0) {
+            rows.push(None);
+            continue;
+        }
+        rows.push(Some(linear_form(model, &g)?));
+    }
+    let (level, form) = rows.iter().flatten().next()?.clone();
+    let lead = form.iter().copied().find(|c| *c != 0.0)?;
+    let coefficients: Vec<f64> = form.iter().map(|c| c / lead).collect();
+    let mut weights = vec![0.0; n];
+    for (e, row) in rows.iter().enumerate() {
+        if let Some((l, form)) = row {
+            if *l != level {
+                return None;
+            }
+            let at = coefficients.iter().position(|c| *c != 0.0)?;
+            let w = form[at];
+            if form.iter().zip(&coefficients).any(|(f, c)| (f - w * c).abs() > 1e-9) {
+                return None;
+            }
+            weights[e] = w;
+        }
+    }
+    // A parameter of the inertia is no place for a force.
+    if model.states.iter().zip(&coefficients).any(|(s, c)| *c != 0.0 && level as usize >= s.order) {
+        return None;
+    }
+    // Force per unit weight: make the largest weight one, so that F is the force itself.
+    let size = weights.iter().fold(0.0f64, |m, w| m.max(w.abs()));
+    let sign = 1.0 / size;
+    Some((weights.iter().map(|w| w * sign).collect(), coefficients))
+}
+
+/// `g` as a linear form with constant coefficients in the states' derivatives of one common level.
+fn linear_form(model: &Model, g: &Expr) -> Option<(u8, Vec<f64>)> {
+    for level in 0..2u8 {
+        let symbols: Vec<(&str, u8)> = model.states.iter().map(|s| (s.name.as_str(), level)).collect();
+        if let Some((coefficients, rest)) = g.affine_in(&symbols)
+            && rest.simplify() == Expr::Num(0.0)
+        {
+            let numbers: Option<Vec<f64>> = coefficients.iter().map(|c| c.simplify().constant()).collect();
+            if let Some(numbers) = numbers
+                && numbers.iter().any(|c| *c != 0.0)
+            {
+                return Some((level, numbers));
+            }
+        }
+    }
+    None
+}
+
+/// The expressions of a motion. A first-order state whose unit is a velocity (m/s, 1/s) is the rate of
+/// a motion whose position the model does not know; any other first-order state is a position whose
+/// rate is the highest derivative, on which no force may depend.
+fn motion(model: &Model, weights: Vec<f64>, coefficients: Vec<f64>) -> Option<Motion> {
+    let mut kinds = Vec::new();
+    for (state, c) in model.states.iter().zip(&coefficients) {
+        if *c != 0.0 {
+            kinds.push(match state.order {
+                1 if is_velocity(&state.unit.dimension) => 1,
+                1 => 0,
+                _ => 2,
+            });
+        }
+    }
+    let first = *kinds.first()?;
+    if kinds.iter().any(|k| *k != first) {
+        return None;
+    }
+    let combine = |primes: u8| {
+        let mut sum: Option<Expr> = None;
+        for (state, &c) in model.states.iter().zip(&coefficients) {
+            if c == 0.0 {
+                continue;
+            }
+            let symbol = Expr::prime(&state.name, primes);
+            let term = if c.abs() == 1.0 { symbol } else { Expr::Num(c.abs()) * symbol };
+            sum = Some(match (sum, c > 0.0) {
+                (None, true) => term,
+                (None, false) => -term,
+                (Some(s), true) => s + term,
+                (Some(s), false) => s - term,
+            });
+        }
+        sum
+    };
+    let (position, rate) = match first {
+        1 => (None, combine(0)),
+        0 => (combine(0), None),
+        _ => (combine(0), combine(1)),
+    };
+    Some(Motion { weights, coefficients, position, rate })
+}
+
+fn is_velocity(d: &Dimension) -> bool {
+    // m/s, or 1/s (rad/s)
+    let d = d.0;
+    d[2] == -1.0 && d[1] == 0.0 && d[3..].iter().all(|v| *v == 0.0) && (d[0] == 1.0 || d[0] == 0.0)
+}
