@@ -1,1 +1,6 @@
 //! Finds the physics a simulation leaves out.
+pub mod along;
+pub mod candidate;
+pub mod library;
+pub mod place;
+pub mod screen;

@@ -1,0 +1,164 @@
+//! Expressions of the model evaluated along given states, sample by sample.
+
+use greybox_calibrate::{Level, Point, Setup};
+use greybox_model::{Expr, Func};
+use greybox_model::tape::{Column, LeafKind, Tape};
+
+/// States of every piece at every sample, from the measurements where there are any.
+pub struct Along<'a> {
+    setup: &'a Setup,
+    /// `states[piece][i]` is entry i of the state vector.
+    pub states: Vec<Vec<Vec<f64>>>,
+    parameters: Vec<f64>,
+}
+
+impl<'a> Along<'a> {
+    /// Smoothed measurements; unmeasured entries from the segments' trajectories.
+    pub fn smoothed(setup: &'a Setup, level: &Level, scale: &[f64], point: &Point) -> Along<'a> {
+        let unmeasured = setup.hats.tolerance.iter().any(|t| t.is_infinite());
+        let mut states: Vec<Vec<Vec<f64>>> = setup
+            .data
+            .pieces
+            .iter()
+            .zip(&setup.hats.states)
+            .map(|(piece, hats)| {
+                hats.iter().map(|h| h.clone().unwrap_or_else(|| vec![0.0; piece.len])).collect()
+            })
+            .collect();
+        if unmeasured {
+            let rows = setup.with_problem(level, scale, |p| p.rows(point, false, None));
+            for (segment, rows) in level.segments.iter().zip(&rows) {
+                let t = &rows.trajectory;
+                for i in 0..setup.system.nx {
+                    if setup.hats.tolerance[i].is_infinite() {
+                        states[segment.piece][i][segment.range.clone()]
+                            .copy_from_slice(&t.x[i * t.n..(i + 1) * t.n]);
+                    }
+                }
+            }
+        }
+        Along { setup, states, parameters: point.parameters.clone() }
+    }
+
+    /// Simulated states, `x[piece][i * n + k]`.
+    pub fn simulated(setup: &'a Setup, x: &[Vec<f64>], parameters: &[f64]) -> Along<'a> {
+        let states = x
+            .iter()
+            .zip(&setup.data.pieces)
+            .map(|(x, piece)| x.chunks(piece.len).map(<[f64]>::to_vec).collect())
+            .collect();
+        Along { setup, states, parameters: parameters.to_vec() }
+    }
+
+    /// The same states with other parameters.
+    pub fn with_parameters(mut self, parameters: &[f64]) -> Along<'a> {
+        self.parameters = parameters.to_vec();
+        self
+    }
+
+    /// Values of `exprs` (states, inputs, parameters of the model, `extra` names), as
+    /// `[expr][piece][sample]`; `None` when an expression mentions anything else. Every function is
+    /// evaluated pointwise, with sign(0) = 0.
+    pub fn eval(&self, exprs: &[Expr], extra: &[(&str, f64)]) -> Option<Vec<Vec<Vec<f64>>>> {
+        let model = &self.setup.model;
+        let system = &self.setup.system;
+        let base = system.delayed();
+        // Delayed expressions become leaves of their own: evaluated first, then shifted.
+        let mut delays: Vec<(Expr, Expr)> = Vec::new();
+        let rewritten: Vec<Expr> = exprs
+            .iter()
+            .map(|e| {
+                e.map(&mut |node| match &node {
+                    Expr::Call(Func::Delay, args) => {
+                        let found = delays.iter().position(|d| d.0 == args[0] && d.1 == args[1]);
+                        let i = found.unwrap_or_else(|| {
+                            delays.push((args[0].clone(), args[1].clone()));
+                            delays.len() - 1
+                        });
+                        Expr::var(&format!("delayed#{i}"))
+                    }
+                    _ => node,
+                })
+            })
+            .collect();
+        let resolve = |name: &str, primes: u8| -> Option<usize> {
+            if let Some(i) = name.strip_prefix("delayed#") {
+                return i.parse::<usize>().ok().map(|i| base + extra.len() + i);
+            }
+            if let Some(i) = extra.iter().position(|e| e.0 == name) {
+                return (primes == 0).then_some(base + i);
+            }
+            if let Some(j) = model.state(name) {
+                return ((primes as usize) < system.orders[j]).then(|| 1 + system.offsets[j] + primes as usize);
+            }
+            if primes > 0 {
+                return None;
+            }
+            if let Some(i) = model.input(name) {
+                return Some(system.inputs() + i);
+            }
+            if let Some(i) = model.parameter(name) {
+                return Some(system.parameters() + i);
+            }
+            (name == "t").then_some(0)
+        };
+        let shifted: Vec<Vec<Vec<f64>>> = delays
+            .iter()
+            .map(|(arg, tau)| {
+                let mut values = self.eval(&[arg.clone(), tau.clone()], extra)?;
+                let taus = values.pop()?;
+                let args = values.pop()?;
+                Some(
+                    args.iter()
+                        .zip(&taus)
+                        .zip(&self.setup.data.pieces)
+                        .map(|((a, tau), piece)| shift(a, tau.first().copied().unwrap_or(0.0) / piece.dt))
+                        .collect(),
+                )
+            })
+            .collect::<Option<_>>()?;
+        let mut kinds = vec![LeafKind::Varying; base];
+        kinds.extend(std::iter::repeat_n(LeafKind::Parameter, extra.len()));
+        kinds.extend(std::iter::repeat_n(LeafKind::Varying, delays.len()));
+        let tape = Tape::compile(&rewritten, kinds, &resolve).ok()?;
+        let mut out = vec![Vec::with_capacity(self.states.len()); exprs.len()];
+        for (i, piece) in self.setup.data.pieces.iter().enumerate() {
+            let time: Vec<f64> = (0..piece.len).map(|k| piece.start + k as f64 * piece.dt).collect();
+            let columns = tape.eval_batch(piece.len, &|leaf| {
+                if leaf == 0 {
+                    Column::Series(&time)
+                } else if leaf < 1 + system.nx {
+                    Column::Series(&self.states[i][leaf - 1])
+                } else if leaf < system.inputs() {
+                    Column::Value(0.0)
+                } else if leaf < system.parameters() {
+                    Column::Series(&piece.inputs[leaf - system.inputs()])
+                } else if leaf < base {
+                    Column::Value(
+                        self.parameters.get(leaf - system.parameters()).copied().unwrap_or(0.0),
+                    )
+                } else if leaf < base + extra.len() {
+                    Column::Value(extra[leaf - base].1)
+                } else {
+                    Column::Series(&shifted[leaf - base - extra.len()][i])
+                }
+            });
+            for (o, c) in out.iter_mut().zip(columns) {
+                o.push(c);
+            }
+        }
+        Some(out)
+    }
+}
+
+/// A signal delayed by `lag` samples (linear interpolation, first value held before the start).
+fn shift(u: &[f64], lag: f64) -> Vec<f64> {
+    (0..u.len())
+        .map(|k| {
+            let at = (k as f64 - lag).clamp(0.0, (u.len() - 1) as f64);
+            let i = (at.floor() as usize).min(u.len().saturating_sub(2));
+            let w = at - i as f64;
+            u[i] + w * (u.get(i + 1).unwrap_or(&u[i]) - u[i])
+        })
+        .collect()
+}
