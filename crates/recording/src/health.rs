@@ -264,8 +264,8 @@ fn quantisation(channel: &Channel, y: &[f64]) -> Option<Finding> {
 const OUTLIER_Z: f64 = 8.0;
 
 /// Single samples that stand out of their neighbours: fourth difference beyond 8 robust standard deviations
-/// (Hampel), the sample away from both neighbours on the same side, the neighbours close to each other (which
-/// tells a spike from a step).
+/// (Hampel), with the pattern 1, −4, 6, −4, 1 of a spike around it: the differences beside the largest are −2/3 of
+/// it. A step leaves 1, −3, 3, −1.
 fn outliers(recording: &Recording, c: usize) -> Option<Finding> {
     let (mut count, mut first) = (0usize, None);
     for piece in &recording.pieces {
@@ -278,14 +278,10 @@ fn outliers(recording: &Recording, c: usize) -> Option<Finding> {
         if spread.is_nan() || spread <= 0.0 {
             continue;
         }
-        for (k, &deviation) in deviations.iter().enumerate() {
-            let (before, here, after) = (y[k + 1], y[k + 2], y[k + 3]);
-            let (up, down) = (here - before, here - after);
-            let stands_out = up * down > 0.0 && (before - after).abs() < 0.5 * up.abs().min(down.abs());
-            let strongest = deviations[k.saturating_sub(2)..(k + 3).min(deviations.len())]
-                .iter()
-                .all(|&other| other.is_nan() || other <= deviation);
-            if deviation > OUTLIER_Z * spread && stands_out && strongest {
+        for k in 1..differences.len().saturating_sub(1) {
+            let beside = [differences[k - 1], differences[k + 1]];
+            let spike = beside.iter().all(|d| (d / differences[k] + 2.0 / 3.0).abs() < 0.25);
+            if deviations[k] > OUTLIER_Z * spread && spike {
                 count += 1;
                 first.get_or_insert(recording.time[0] + piece.time(k + 2));
             }

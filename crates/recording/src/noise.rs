@@ -37,7 +37,7 @@ pub(crate) fn fourth_difference(w: &[f64]) -> f64 {
     w[0] - 4.0 * w[1] + 6.0 * w[2] - 4.0 * w[3] + w[4]
 }
 
-/// Step of a quantised channel: the smallest q such that more than 99 % of the first differences are whole
+/// Step of a quantised channel: the largest q such that more than 99 % of the first differences are whole
 /// multiples of it (to a tenth of a step). `None` for a channel that is not quantised, that never moves, or
 /// that knows fewer than five levels (a switch or a binary excitation is not a quantised measurement).
 ///
@@ -52,8 +52,9 @@ pub fn quantisation_step(y: &[f64]) -> Option<f64> {
         return None;
     }
     moved.sort_unstable_by(f64::total_cmp);
-    // The smallest difference, or, should a few samples sit off the raster, one from just above them.
-    [0, moved.len() / 200].into_iter().find_map(|first| {
+    // A hundredth of the differences may sit off the raster and be smaller than its step; a signal that moves by
+    // many steps at a time shows the single step more rarely than that.
+    [moved.len() / 100, 0].into_iter().find_map(|first| {
         let q = refine_step(&moved[first..])?;
         let on_raster = steps.iter().filter(|&&d| (d / q - (d / q).round()).abs() < 0.1).count();
         let levels = ((high - low) / q).round() + 1.0;
@@ -71,6 +72,9 @@ fn refine_step(sorted: &[f64]) -> Option<f64> {
         let (mut above, mut below) = (0.0, 0.0);
         for &d in near {
             let m = (d / q).round().max(1.0);
+            if (d / q - m).abs() > 0.25 {
+                continue; // off the raster
+            }
             above += m * d;
             below += m * m;
         }
