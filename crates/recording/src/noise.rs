@@ -1,6 +1,8 @@
 //! Measurement noise and quantisation of a channel, from its differences.
 
+use crate::interpolate::fill_missing;
 use crate::recording::Recording;
+use crate::spectrum::periodogram;
 
 /// Sum of squares of the binomial weights 1, −4, 6, −4, 1 of a fourth difference.
 const FOURTH_DIFFERENCE_POWER: f64 = 70.0;
@@ -35,6 +37,27 @@ pub fn noise_sigma(y: &[f64]) -> f64 {
 /// Δ⁴ of five neighbouring samples.
 pub(crate) fn fourth_difference(w: &[f64]) -> f64 {
     w[0] - 4.0 * w[1] + 6.0 * w[2] - 4.0 * w[3] + w[4]
+}
+
+/// Standard deviation of white noise from the floor of the spectrum: the median of the Hann-windowed periodogram
+/// over the top quarter of the band, where the signal is weakest,
+///
+/// ```text
+/// σ² = median(|Y_k|²) / (ln 2 · Σw²) ,   3/8 f_s ≤ f_k ≤ 1/2 f_s .
+/// ```
+///
+/// (The lines of white noise are distributed exponentially: their median is ln 2 times their mean.) Where the
+/// signal is fast, as at ten samples per period, [`noise_sigma`] takes it for noise and this does not; where the
+/// sensor filters, this sees too little. Much above it means: σ from fourth differences is only an upper bound.
+/// Missing samples are interpolated. NaN below 64 samples.
+pub fn spectral_floor_sigma(y: &[f64]) -> f64 {
+    let full = fill_missing(y);
+    if full.len() < 64 || full[0].is_nan() {
+        return f64::NAN;
+    }
+    let lines = periodogram(&full, 1.0).power;
+    let window_power = 0.375 * full.len() as f64;
+    (median(&lines[3 * lines.len() / 4..lines.len() - 1]) / (std::f64::consts::LN_2 * window_power)).sqrt()
 }
 
 /// Step of a quantised channel: the largest q such that more than 99 % of the first differences are whole
