@@ -159,9 +159,12 @@ fn flat(channel: &Channel, present: &[f64], role: Role) -> Option<Finding> {
     Some(finding.on(&channel.name).value(low, channel.unit.as_deref()))
 }
 
-/// Lengths of the runs of equal neighbouring samples, with their value.
-fn runs(y: &[f64], tolerance: f64) -> Vec<(f64, usize)> {
-    let mut runs: Vec<(f64, usize)> = Vec::new();
+/// Value and length of a run of equal neighbouring samples.
+type Run = (f64, usize);
+
+/// The runs of equal neighbouring samples.
+fn runs(y: &[f64], tolerance: f64) -> Vec<Run> {
+    let mut runs: Vec<Run> = Vec::new();
     for &v in y.iter().filter(|v| !v.is_nan()) {
         match runs.last_mut() {
             Some((value, length)) if (v - *value).abs() <= tolerance => *length += 1,
@@ -190,12 +193,11 @@ fn clipping(channel: &Channel, y: &[f64]) -> Vec<Finding> {
         return Vec::new();
     }
     let level_step = quantisation_step(y).unwrap_or(0.0).max(1e-4 * (high - low));
-    let mean_length = |runs: &[&(f64, usize)]| {
-        runs.iter().map(|run| run.1).sum::<usize>() as f64 / runs.len().max(1) as f64
-    };
+    let mean_length =
+        |runs: &[&Run]| runs.iter().map(|run| run.1).sum::<usize>() as f64 / runs.len().max(1) as f64;
     let mut findings = Vec::new();
     for (extreme, which) in [(low, "smallest"), (high, "largest")] {
-        let (at, elsewhere): (Vec<&(f64, usize)>, Vec<&(f64, usize)>) =
+        let (at, elsewhere): (Vec<&Run>, Vec<&Run>) =
             runs.iter().partition(|run| (run.0 - extreme).abs() <= tolerance);
         let held: usize = at.iter().map(|run| run.1).sum();
         let beside: usize =

@@ -1,6 +1,9 @@
 //! The public benchmark recordings, where they are at hand: `$GREYBOX_RECORDINGS`, or `shared/recordings` beside
 //! the workspace.
 
+// Helpers of a test file are tests too; the lint configuration knows only the annotated functions.
+#![allow(clippy::unwrap_used, clippy::print_stdout)]
+
 use greybox_recording::noise::{noise_sigma, quantisation_step};
 use greybox_recording::smooth::adaptive;
 use greybox_recording::{Recording, Severity, health, read_csv};
