@@ -217,6 +217,9 @@ fn parse(bytes: &[u8], label: &str, name: &str) -> Result<Recording, RecordingEr
             };
             columns[c].push(value);
         }
+        if columns[0].last().is_none_or(|t| t.is_nan()) {
+            return Err(RecordingError::MissingTime { place: source.place(&record).column(0, "t") });
+        }
         decimals = match (decimals, printed_decimals(record[0].trim_ascii())) {
             (Some(most), Some(here)) => Some(most.max(here)),
             _ => None,

@@ -34,11 +34,12 @@ pub(crate) fn find(time: &[f64], resolution: f64) -> Grid {
     let rounding = 0.51 * resolution;
     let coarse_clock = resolution > 0.01 * middle && uneven as f64 > 0.02 * steps.len() as f64;
 
+    let all = 0..time.len();
     let longest = if coarse_clock {
-        let whole = [0..time.len()];
-        let dt = pooled_slope(time, &whole);
-        if departure(time, &whole[0], dt) <= rounding + JITTER_LIMIT * dt {
-            return Grid { dt: tidy(dt, time.len()), stretches: whole.to_vec(), rounding };
+        let whole = std::slice::from_ref(&all);
+        let dt = pooled_slope(time, whole);
+        if departure(time, &all, dt) <= rounding + JITTER_LIMIT * dt {
+            return Grid { dt: tidy(dt, time.len()), stretches: vec![all], rounding };
         }
         let near: Vec<f64> =
             steps.iter().copied().filter(|d| (d - middle).abs() < 1.5 * resolution).collect();
@@ -65,23 +66,26 @@ pub(crate) fn find(time: &[f64], resolution: f64) -> Grid {
 /// Least-squares slope of time against row, each stretch with its own offset, over the stretches that will be
 /// kept (over all of them if none will).
 fn pooled_slope(time: &[f64], stretches: &[Range<usize>]) -> f64 {
+    // Sums of departures from a first guess keep the digits that sums of times would lose.
+    let steps = || time.windows(2).map(|w| w[1] - w[0]);
+    let guess = stretches.iter().max_by_key(|rows| rows.len()).filter(|rows| rows.len() > 1).map_or_else(
+        || steps().fold(f64::INFINITY, f64::min),
+        |rows| (time[rows.end - 1] - time[rows.start]) / (rows.len() - 1) as f64,
+    );
     let slope = |shortest: usize| {
         let (mut above, mut below) = (0.0, 0.0);
         for rows in stretches.iter().filter(|rows| rows.len() >= shortest) {
-            let n = rows.len() as f64;
-            let origin = time[rows.start];
-            let mean = time[rows.clone()].iter().map(|t| t - origin).sum::<f64>() / n;
+            let middle = 0.5 * (rows.len() as f64 - 1.0);
             for (k, &t) in time[rows.clone()].iter().enumerate() {
-                let x = k as f64 - 0.5 * (n - 1.0);
-                above += x * (t - origin - mean);
+                // Σx = 0 over the stretch: its own offset drops out.
+                let x = k as f64 - middle;
+                above += x * (t - time[rows.start] - k as f64 * guess);
                 below += x * x;
             }
         }
-        (below > 0.0).then(|| above / below)
+        (below > 0.0).then(|| guess + above / below)
     };
-    slope(MIN_SAMPLES)
-        .or_else(|| slope(2))
-        .unwrap_or_else(|| (time[time.len() - 1] - time[0]) / (time.len() - 1) as f64)
+    slope(MIN_SAMPLES).or_else(|| slope(2)).unwrap_or(guess)
 }
 
 /// Largest distance of the times from the line of slope `dt` that halves the extremes, s.
@@ -95,11 +99,11 @@ fn departure(time: &[f64], rows: &Range<usize>, dt: f64) -> f64 {
     0.5 * (high - low)
 }
 
-/// The shortest decimal number that stays within a millionth of a step of `dt` over `n` samples.
+/// The shortest decimal number that stays within 10⁻⁵ steps of `dt` over `n` samples.
 fn tidy(dt: f64, n: usize) -> f64 {
     (0..17)
         .filter_map(|digits| format!("{dt:.digits$e}").parse::<f64>().ok())
-        .find(|short| (short - dt).abs() * n as f64 <= 1e-6 * dt)
+        .find(|short| (short - dt).abs() * n as f64 <= 1e-5 * dt)
         .unwrap_or(dt)
 }
 
@@ -242,6 +246,7 @@ mod tests {
             assert_eq!(grid.stretches.len(), 1);
             assert!((grid.dt - dt).abs() * (n as f64) < 0.01 * dt, "{dt}: {}", grid.dt);
         }
+        assert_eq!(find(&(0..600_000).map(|k| f64::from(k) / 1000.0).collect::<Vec<_>>(), 0.001).dt, 0.001);
         assert_eq!(find(&(0..100).map(|k| f64::from(k) / 1000.0).collect::<Vec<_>>(), 0.001).dt, 0.001);
     }
 

@@ -7,6 +7,7 @@ use crate::finding::{Finding, Severity, number, quantity};
 use crate::interpolate::fill_missing;
 use crate::noise::{
     finite_range, fourth_difference, median, noise_sigma, quantisation_step, recording_sigma,
+    spectral_floor_sigma,
 };
 use crate::recording::{Channel, Recording};
 use crate::spectrum::{Periodogram, correlation, periodogram, whiten};
@@ -69,7 +70,7 @@ fn check_channel(recording: &Recording, c: usize, role: Role) -> Vec<Finding> {
     if role == Role::Input {
         findings.push(excitation(channel, &present, &spectrum));
     } else {
-        findings.extend(noise_level(channel, &present, sigma, &spectrum));
+        findings.extend(noise_level(channel, &present, &full, sigma));
         findings.extend(bandwidth(channel, &spectrum, recording.dt()));
         findings.extend(record_length(channel, &full, &spectrum));
     }
@@ -158,9 +159,12 @@ fn flat(channel: &Channel, present: &[f64], role: Role) -> Option<Finding> {
     Some(finding.on(&channel.name).value(low, channel.unit.as_deref()))
 }
 
-/// Lengths of the runs of equal neighbouring samples, with their value.
-fn runs(y: &[f64], tolerance: f64) -> Vec<(f64, usize)> {
-    let mut runs: Vec<(f64, usize)> = Vec::new();
+/// Value and length of a run of equal neighbouring samples.
+type Run = (f64, usize);
+
+/// The runs of equal neighbouring samples.
+fn runs(y: &[f64], tolerance: f64) -> Vec<Run> {
+    let mut runs: Vec<Run> = Vec::new();
     for &v in y.iter().filter(|v| !v.is_nan()) {
         match runs.last_mut() {
             Some((value, length)) if (v - *value).abs() <= tolerance => *length += 1,
@@ -189,12 +193,11 @@ fn clipping(channel: &Channel, y: &[f64]) -> Vec<Finding> {
         return Vec::new();
     }
     let level_step = quantisation_step(y).unwrap_or(0.0).max(1e-4 * (high - low));
-    let mean_length = |runs: &[&(f64, usize)]| {
-        runs.iter().map(|run| run.1).sum::<usize>() as f64 / runs.len().max(1) as f64
-    };
+    let mean_length =
+        |runs: &[&Run]| runs.iter().map(|run| run.1).sum::<usize>() as f64 / runs.len().max(1) as f64;
     let mut findings = Vec::new();
     for (extreme, which) in [(low, "smallest"), (high, "largest")] {
-        let (at, elsewhere): (Vec<&(f64, usize)>, Vec<&(f64, usize)>) =
+        let (at, elsewhere): (Vec<&Run>, Vec<&Run>) =
             runs.iter().partition(|run| (run.0 - extreme).abs() <= tolerance);
         let held: usize = at.iter().map(|run| run.1).sum();
         let beside: usize =
@@ -264,8 +267,8 @@ fn quantisation(channel: &Channel, y: &[f64]) -> Option<Finding> {
 const OUTLIER_Z: f64 = 8.0;
 
 /// Single samples that stand out of their neighbours: fourth difference beyond 8 robust standard deviations
-/// (Hampel), the sample away from both neighbours on the same side, the neighbours close to each other (which
-/// tells a spike from a step).
+/// (Hampel), with the pattern 1, −4, 6, −4, 1 of a spike around it: the differences beside the largest are −2/3 of
+/// it. A step leaves 1, −3, 3, −1.
 fn outliers(recording: &Recording, c: usize) -> Option<Finding> {
     let (mut count, mut first) = (0usize, None);
     for piece in &recording.pieces {
@@ -278,14 +281,10 @@ fn outliers(recording: &Recording, c: usize) -> Option<Finding> {
         if spread.is_nan() || spread <= 0.0 {
             continue;
         }
-        for (k, &deviation) in deviations.iter().enumerate() {
-            let (before, here, after) = (y[k + 1], y[k + 2], y[k + 3]);
-            let (up, down) = (here - before, here - after);
-            let stands_out = up * down > 0.0 && (before - after).abs() < 0.5 * up.abs().min(down.abs());
-            let strongest = deviations[k.saturating_sub(2)..(k + 3).min(deviations.len())]
-                .iter()
-                .all(|&other| other.is_nan() || other <= deviation);
-            if deviation > OUTLIER_Z * spread && stands_out && strongest {
+        for k in 1..differences.len().saturating_sub(1) {
+            let beside = [differences[k - 1], differences[k + 1]];
+            let spike = beside.iter().all(|d| (d / differences[k] + 2.0 / 3.0).abs() < 0.25);
+            if deviations[k] > OUTLIER_Z * spread && spike {
                 count += 1;
                 first.get_or_insert(recording.time[0] + piece.time(k + 2));
             }
@@ -329,7 +328,7 @@ fn excitation(channel: &Channel, present: &[f64], spectrum: &Periodogram) -> Fin
             Severity::Warning,
             "excitation",
             format!(
-                "The input is a single sine of {} Hz ({size}): one frequency fixes two parameters, and a mechanism \
+                "The input is practically a single sine of {} Hz ({size}): one frequency fixes two parameters, and a mechanism \
                  can hide behind a wrong one.",
                 number(peak as f64 * spectrum.resolution)
             ),
@@ -347,15 +346,19 @@ fn excitation(channel: &Channel, present: &[f64], spectrum: &Periodogram) -> Fin
     } else {
         (Severity::Info, None)
     };
+    let richness = match lines {
+        50.. => "power in more than 50 spectral lines: it excites richly".to_owned(),
+        _ => format!(
+            "the power of about {lines} sines, enough for about {} parameters of a linear model",
+            2 * lines
+        ),
+    };
     let mut finding = Finding::new(
         severity,
         "excitation",
         format!(
-            "The input has {size}, 95 % of its power below {} Hz and {lines} distinct spectral peak{}, enough for \
-             about {} parameters of a linear model.",
-            number(spectrum.frequency_below(0.95)),
-            if lines == 1 { "" } else { "s" },
-            2 * lines
+            "The input has {size}, 95 % of its power below {} Hz and {richness}.",
+            number(spectrum.frequency_below(0.95))
         ),
     )
     .on(&channel.name)
@@ -364,24 +367,23 @@ fn excitation(channel: &Channel, present: &[f64], spectrum: &Periodogram) -> Fin
     finding
 }
 
-fn noise_level(channel: &Channel, present: &[f64], sigma: f64, spectrum: &Periodogram) -> Option<Finding> {
+fn noise_level(channel: &Channel, present: &[f64], full: &[f64], sigma: f64) -> Option<Finding> {
     let rms = rms_about_mean(present);
     if sigma.is_nan() || rms <= 0.0 {
         return None;
     }
     let ratio = sigma / rms;
     let unit = channel.unit.as_deref();
-    // Content up to the upper half of the band looks like noise to the fourth difference.
-    let half = spectrum.power.len() / 2;
-    let broadband = spectrum.share(half, spectrum.power.len()) > 0.05;
     let level = format!("{} ({} % of the signal's RMS)", quantity(sigma, unit), number(100.0 * ratio));
-    let finding = if broadband {
+    let floor = spectral_floor_sigma(full);
+    let finding = if sigma > 1.5 * floor {
         Finding::new(
             Severity::Info,
             "noise",
             format!(
-                "The noise is at most {level}; the signal reaches into the upper half of the band, so the two \
-                 cannot be told apart well from this channel alone."
+                "The measurement noise is at most {level}; part of that is fast motion or coloured noise, since the \
+                 floor of the spectrum is {}.",
+                quantity(floor, unit)
             ),
         )
     } else if ratio > 0.3 {
@@ -418,22 +420,25 @@ fn record_length(channel: &Channel, full: &[f64], spectrum: &Periodogram) -> Opt
     let slow = spectrum.share(1, 2);
     let (start, end) = (full[0], full[full.len() - 1]);
     let (low, high) = finite_range(full)?;
-    let drifts = (end - start).abs() > 0.7 * (high - low);
-    (slow > 0.5).then(|| {
-        Finding::new(
-            Severity::Warning,
-            "record_length",
-            format!(
-                "{} % of the motion is slower than half the recording ({} s){}: its slowest part is seen about once.",
-                number(100.0 * slow),
-                number(0.5 / spectrum.resolution),
-                if drifts { ", the signal drifts from one end of its range to the other" } else { "" }
-            ),
-        )
-        .mend("Record for longer, or use several recordings, if slow effects (drift, leakage) matter.")
-        .on(&channel.name)
-        .value(100.0 * slow, Some("%"))
-    })
+    if slow < 0.5 {
+        return None;
+    }
+    let share = number(100.0 * slow);
+    let finding = if (end - start).abs() > 0.7 * (high - low) {
+        let message = format!(
+            "The signal travels once through its range in the whole recording ({share} % of its power): slow \
+             effects cannot be told from that travel."
+        );
+        Finding::new(Severity::Info, "record_length", message)
+    } else {
+        let message = format!(
+            "{share} % of the motion is slower than half the recording ({} s): its slowest part is seen about once.",
+            number(0.5 / spectrum.resolution)
+        );
+        Finding::new(Severity::Warning, "record_length", message)
+            .mend("Record for longer, or use several recordings, if slow effects (drift, leakage) matter.")
+    };
+    Some(finding.on(&channel.name).value(100.0 * slow, Some("%")))
 }
 
 /// Lag of the largest correlation between input and output, both differenced and whitened (autoregression), in
@@ -450,7 +455,8 @@ fn delay(recording: &Recording, input: &str, output: &str) -> Option<Finding> {
         return None;
     }
     let order = (n / 20).min(32);
-    let (u, y) = (whiten(&u, order), whiten(&y, order));
+    let u = whiten(&u, order)?;
+    let y = whiten(&y, order)?;
     let reach = (n / 4).min(2000);
     let c = correlation(&u, &y, reach);
     let size = |k: usize| c[k].abs();
@@ -458,7 +464,7 @@ fn delay(recording: &Recording, input: &str, output: &str) -> Option<Finding> {
     // A periodic input repeats the peak every period: of nearly equal peaks, the one closest to no lag.
     let best = (0..c.len()).filter(|&k| size(k) >= 0.95 * largest).min_by_key(|k| k.abs_diff(reach))?;
     let noise = 1.4826 * median(&c.iter().map(|v| v.abs()).collect::<Vec<_>>());
-    if largest.is_nan() || largest < 0.1 || largest < 6.0 / (n as f64).sqrt() || largest < 6.0 * noise {
+    if largest.is_nan() || largest < 0.3 || largest < 8.0 / (n as f64).sqrt() || largest < 6.0 * noise {
         return None;
     }
     let lag = best as isize - reach as isize;
@@ -471,9 +477,10 @@ fn delay(recording: &Recording, input: &str, output: &str) -> Option<Finding> {
             number(seconds)
         ),
         _ => format!(
-            "The output runs ahead of `{input}` by about {} samples ({} s), as behind a feedback loop or with \
+            "The output runs ahead of `{input}` by about {} sample{} ({} s), as behind a feedback loop or with \
              clocks that disagree",
             -lag,
+            if lag == -1 { "" } else { "s" },
             number(-seconds)
         ),
     };

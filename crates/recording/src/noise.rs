@@ -1,6 +1,8 @@
 //! Measurement noise and quantisation of a channel, from its differences.
 
+use crate::interpolate::fill_missing;
 use crate::recording::Recording;
+use crate::spectrum::periodogram;
 
 /// Sum of squares of the binomial weights 1, −4, 6, −4, 1 of a fourth difference.
 const FOURTH_DIFFERENCE_POWER: f64 = 70.0;
@@ -37,7 +39,28 @@ pub(crate) fn fourth_difference(w: &[f64]) -> f64 {
     w[0] - 4.0 * w[1] + 6.0 * w[2] - 4.0 * w[3] + w[4]
 }
 
-/// Step of a quantised channel: the smallest q such that more than 99 % of the first differences are whole
+/// Standard deviation of white noise from the floor of the spectrum: the median of the Hann-windowed periodogram
+/// over the top quarter of the band, where the signal is weakest,
+///
+/// ```text
+/// σ² = median(|Y_k|²) / (ln 2 · Σw²) ,   3/8 f_s ≤ f_k ≤ 1/2 f_s .
+/// ```
+///
+/// (The lines of white noise are distributed exponentially: their median is ln 2 times their mean.) Where the
+/// signal is fast, as at ten samples per period, [`noise_sigma`] takes it for noise and this does not; where the
+/// sensor filters, this sees too little. Much above it means: σ from fourth differences is only an upper bound.
+/// Missing samples are interpolated. NaN below 64 samples.
+pub fn spectral_floor_sigma(y: &[f64]) -> f64 {
+    let full = fill_missing(y);
+    if full.len() < 64 || full[0].is_nan() {
+        return f64::NAN;
+    }
+    let lines = periodogram(&full, 1.0).power;
+    let window_power = 0.375 * full.len() as f64;
+    (median(&lines[3 * lines.len() / 4..lines.len() - 1]) / (std::f64::consts::LN_2 * window_power)).sqrt()
+}
+
+/// Step of a quantised channel: the largest q such that more than 99 % of the first differences are whole
 /// multiples of it (to a tenth of a step). `None` for a channel that is not quantised, that never moves, or
 /// that knows fewer than five levels (a switch or a binary excitation is not a quantised measurement).
 ///
@@ -52,8 +75,9 @@ pub fn quantisation_step(y: &[f64]) -> Option<f64> {
         return None;
     }
     moved.sort_unstable_by(f64::total_cmp);
-    // The smallest difference, or, should a few samples sit off the raster, one from just above them.
-    [0, moved.len() / 200].into_iter().find_map(|first| {
+    // A hundredth of the differences may sit off the raster and be smaller than its step; a signal that moves by
+    // many steps at a time shows the single step more rarely than that.
+    [moved.len() / 100, 0].into_iter().find_map(|first| {
         let q = refine_step(&moved[first..])?;
         let on_raster = steps.iter().filter(|&&d| (d / q - (d / q).round()).abs() < 0.1).count();
         let levels = ((high - low) / q).round() + 1.0;
@@ -71,6 +95,9 @@ fn refine_step(sorted: &[f64]) -> Option<f64> {
         let (mut above, mut below) = (0.0, 0.0);
         for &d in near {
             let m = (d / q).round().max(1.0);
+            if (d / q - m).abs() > 0.25 {
+                continue; // off the raster
+            }
             above += m * d;
             below += m * m;
         }

@@ -59,13 +59,17 @@ impl Periodogram {
         self.power[first..=last].iter().sum::<f64>() / self.total()
     }
 
-    /// Local maxima that carry at least a thousandth of the strongest line's power.
+    /// Number of sines it would take to spread the power so: the local maxima that carry at least a thousandth of
+    /// the strongest line's power, or half of (Σp)²/Σp² where that is more (a sweep has no maxima; a sine under a
+    /// Hann window counts two).
     pub(crate) fn significant_lines(&self) -> usize {
         let limit = 1e-3 * self.power[self.strongest()];
         let at = |k: usize| self.power.get(k).copied().unwrap_or(0.0);
-        (1..self.power.len())
+        let peaks = (1..self.power.len())
             .filter(|&k| at(k) >= limit && at(k) > 0.0 && at(k) > at(k - 1) && at(k) >= at(k + 1))
-            .count()
+            .count();
+        let spread = self.total().powi(2) / self.power.iter().map(|p| p * p).sum::<f64>();
+        peaks.max((0.5 * spread) as usize)
     }
 }
 
@@ -90,15 +94,20 @@ pub(crate) fn correlation(a: &[f64], b: &[f64], reach: usize) -> Vec<f64> {
 }
 
 /// Differences of `y`, then the residual of an autoregression of `order`: a sequence as white as that allows.
-pub(crate) fn whiten(y: &[f64], order: usize) -> Vec<f64> {
+///
+/// `None` when the autoregression predicts all but a 10⁻⁷th of the power: what is left of such a signal (a sine, a
+/// sweep, a few sines) is rounding and noise, and a correlation with that means nothing.
+pub(crate) fn whiten(y: &[f64], order: usize) -> Option<Vec<f64>> {
     let mut steps: Vec<f64> = y.windows(2).map(|w| w[1] - w[0]).collect();
     let mean = steps.iter().sum::<f64>() / steps.len() as f64;
     steps.iter_mut().for_each(|d| *d -= mean);
     let r = &correlation(&steps, &steps, order)[order..];
     let filter = levinson(r);
-    (0..steps.len())
+    let residual: Vec<f64> = (0..steps.len())
         .map(|k| filter.iter().take(k + 1).enumerate().map(|(j, c)| c * steps[k - j]).sum())
-        .collect()
+        .collect();
+    let power = |x: &[f64]| x.iter().skip(order).map(|v| v * v).sum::<f64>();
+    (power(&residual) > 1e-7 * power(&steps)).then_some(residual)
 }
 
 /// Prediction-error filter 1, a₁, … of the autocorrelation r₀, r₁, … (Levinson–Durbin recursion), with a trace

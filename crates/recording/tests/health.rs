@@ -1,0 +1,236 @@
+//! Each health check fires on its fault and stays silent on a sound recording.
+
+// Helpers of a test file are tests too; the lint configuration knows only the annotated functions.
+#![allow(clippy::unwrap_used)]
+
+use greybox_recording::health::check;
+use greybox_recording::{Channel, Finding, Recording, Severity};
+use rand::SeedableRng;
+use rand_distr::{Distribution, Normal};
+use rand_pcg::Pcg64Mcg;
+use std::f64::consts::PI;
+
+const DT: f64 = 0.01;
+const N: usize = 4000;
+
+fn white(seed: u64, sigma: f64) -> Vec<f64> {
+    let mut rng = Pcg64Mcg::seed_from_u64(seed);
+    let normal = Normal::new(0.0, sigma).unwrap();
+    (0..N).map(|_| normal.sample(&mut rng)).collect()
+}
+
+/// Eight sines between 0.3 and 5 Hz.
+fn multisine() -> Vec<f64> {
+    (0..N)
+        .map(|k| {
+            let t = DT * k as f64;
+            (1..=8).map(|h| (2.0 * PI * 0.61 * f64::from(h) * t + f64::from(h * h)).sin()).sum()
+        })
+        .collect()
+}
+
+fn recording(columns: &[(&str, Vec<f64>)]) -> Recording {
+    let time = (0..N).map(|k| DT * k as f64).collect();
+    let channels = columns
+        .iter()
+        .map(|(name, values)| Channel {
+            name: (*name).to_owned(),
+            unit: Some("V".to_owned()),
+            values: values.clone(),
+        })
+        .collect();
+    Recording::from_columns("r.csv", time, channels).unwrap()
+}
+
+fn find<'a>(findings: &'a [Finding], code: &str) -> Option<&'a Finding> {
+    findings.iter().find(|f| f.code == code)
+}
+
+/// The finding of one output channel under one check.
+fn of_output(values: Vec<f64>, code: &str) -> Option<Finding> {
+    let findings = check(&recording(&[("y", values)]), &[], &["y"]);
+    find(&findings, code).cloned()
+}
+
+fn noisy_multisine() -> Vec<f64> {
+    multisine().iter().zip(white(1, 0.01)).map(|(a, b)| a + b).collect()
+}
+
+#[test]
+fn a_sound_recording_has_nothing_worse_than_information() {
+    let findings = check(&recording(&[("u", multisine()), ("y", noisy_multisine())]), &["u"], &["y"]);
+    for finding in &findings {
+        assert_eq!(finding.severity, Severity::Info, "{finding}");
+    }
+    let rate = find(&findings, "sampling").unwrap();
+    assert!((rate.value.unwrap() - 100.0).abs() < 1e-6 && rate.unit.as_deref() == Some("Hz"));
+    let noise = find(&findings, "noise").unwrap();
+    assert!((noise.value.unwrap() / 0.01 - 1.0).abs() < 0.08, "{noise}");
+    let excitation = find(&findings, "excitation").unwrap();
+    assert_eq!(excitation.value, Some(8.0), "{excitation}");
+    assert!(excitation.message.contains("about 8 sines"));
+}
+
+#[test]
+fn channels_without_a_role_are_checked_too() {
+    let findings = check(&recording(&[("a", multisine()), ("b", vec![2.0; N])]), &[], &[]);
+    let flat = find(&findings, "flat").unwrap();
+    assert_eq!((flat.severity, flat.channel.as_deref()), (Severity::Warning, Some("b")));
+    assert!(findings.iter().any(|f| f.channel.as_deref() == Some("a")));
+}
+
+#[test]
+fn a_name_that_is_not_there_is_a_problem() {
+    let findings = check(&recording(&[("y", multisine())]), &["torque"], &["y"]);
+    let unknown = find(&findings, "unknown_channel").unwrap();
+    assert_eq!((unknown.severity, unknown.channel.as_deref()), (Severity::Problem, Some("torque")));
+    assert!(unknown.mend.as_deref().unwrap().contains('y'));
+}
+
+#[test]
+fn clipping_is_told_from_turning_points_switches_staircases_and_encoders() {
+    let clipped: Vec<f64> = multisine().iter().map(|v| v.min(2.5)).collect();
+    let finding = of_output(clipped.clone(), "clipping").expect("clipped");
+    assert!(
+        finding.severity == Severity::Warning
+            && finding.value == Some(2.5)
+            && finding.message.contains("largest")
+    );
+    let coarse = |y: Vec<f64>, q: f64| y.iter().map(|v| (v / q).round() * q).collect::<Vec<_>>();
+    assert!(of_output(coarse(clipped, 0.1), "clipping").is_some(), "clipped and quantised");
+
+    let slow_sine: Vec<f64> = (0..N).map(|k| (2.0 * PI * 0.2 * DT * k as f64).sin()).collect();
+    let mut staircase = white(7, 1.0);
+    for k in 0..N {
+        staircase[k] = staircase[k - k % 40];
+    }
+    let switch: Vec<f64> = (0..N).map(|k| if k % 200 < 100 { 1.0 } else { 5.0 }).collect();
+    let printed = coarse(slow_sine.clone(), 1e-4);
+    let sound = [
+        multisine(),
+        coarse(multisine(), 0.1),
+        coarse(slow_sine.clone(), 0.02),
+        slow_sine,
+        printed,
+        white(3, 1.0),
+        coarse(white(3, 1.0), 0.2),
+        staircase,
+        switch,
+    ];
+    for (case, y) in sound.into_iter().enumerate() {
+        let finding = of_output(y, "clipping");
+        assert!(finding.is_none(), "case {case}: {}", finding.unwrap());
+    }
+}
+
+#[test]
+fn coarse_quantisation_is_a_warning_and_fine_one_is_not_mentioned() {
+    let coarse: Vec<f64> = multisine().iter().map(|v| (v / 0.5).round() * 0.5).collect();
+    let finding = of_output(coarse, "quantisation").expect("quantised");
+    assert!(
+        finding.severity == Severity::Warning && (finding.value.unwrap() - 0.5).abs() < 1e-9,
+        "{finding}"
+    );
+    let drowned: Vec<f64> = noisy_multisine().iter().map(|v| (v / 1e-3).round() * 1e-3).collect();
+    assert_eq!(of_output(drowned, "quantisation"), None);
+}
+
+#[test]
+fn spikes_are_counted_and_steps_are_not() {
+    let mut y = noisy_multisine();
+    y[1234] += 0.5;
+    y[3000] -= 0.7;
+    let finding = of_output(y, "outliers").expect("two spikes");
+    assert_eq!(finding.value, Some(2.0));
+    assert!(finding.message.contains("t = 12.34 s"), "{finding}");
+    let mut step = noisy_multisine();
+    step[2000..].iter_mut().for_each(|v| *v += 3.0);
+    assert_eq!(of_output(step, "outliers"), None);
+}
+
+#[test]
+fn missing_and_flat_channels_are_reported() {
+    let mut y = noisy_multisine();
+    y[100..200].fill(f64::NAN);
+    let some = of_output(y, "missing").unwrap();
+    assert_eq!((some.severity, some.value), (Severity::Info, Some(100.0)));
+    assert!(some.message.contains("t = 1 s"), "{some}");
+    let none = of_output(vec![f64::NAN; N], "missing").unwrap();
+    assert_eq!(none.severity, Severity::Problem);
+    assert_eq!(of_output(vec![0.0; N], "flat").unwrap().severity, Severity::Problem);
+}
+
+#[test]
+fn poor_excitation_is_named() {
+    let input = |u: Vec<f64>| {
+        let findings = check(&recording(&[("u", u), ("y", noisy_multisine())]), &["u"], &["y"]);
+        find(&findings, "excitation").unwrap().clone()
+    };
+    let constant = input(vec![1.5; N]);
+    assert!(
+        constant.severity == Severity::Warning && constant.message.contains("constant (1.5 V)"),
+        "{constant}"
+    );
+    let sine = input((0..N).map(|k| (2.0 * PI * 1.7 * DT * k as f64).sin()).collect());
+    assert!(sine.severity == Severity::Warning && sine.message.contains("single sine of 1.7 Hz"), "{sine}");
+    let sweep = input((0..N).map(|k| (2.0 * PI * 0.05 * (DT * k as f64).powi(2)).sin()).collect());
+    assert!(sweep.severity == Severity::Info, "{sweep}");
+    let random = input(white(4, 2.0));
+    assert!(random.severity == Severity::Info && random.value.unwrap() > 100.0, "{random}");
+}
+
+#[test]
+fn slow_and_fast_content_is_named() {
+    let drift: Vec<f64> = (0..N).map(|k| k as f64).collect();
+    let finding = of_output(drift, "record_length").expect("a drift");
+    assert!(finding.message.contains("travels once"), "{finding}");
+    let fast: Vec<f64> = (0..N).map(|k| (2.0 * PI * 31.0 * DT * k as f64).sin()).collect();
+    let finding = of_output(fast, "bandwidth").expect("three samples per period");
+    assert!((finding.value.unwrap() - 100.0 / 31.0).abs() < 0.05, "{finding}");
+}
+
+#[test]
+fn heavy_noise_is_a_warning_and_fast_motion_is_not_called_noise() {
+    let heavy: Vec<f64> = multisine().iter().zip(white(8, 1.0)).map(|(a, b)| a + b).collect();
+    let finding = of_output(heavy, "noise").unwrap();
+    assert!(
+        finding.severity == Severity::Warning && (finding.value.unwrap() - 1.0).abs() < 0.08,
+        "{finding}"
+    );
+    let fast: Vec<f64> = (0..N).map(|k| (2.0 * PI * 0.11 * k as f64).sin()).collect();
+    let fast = fast.iter().zip(white(8, 1e-3)).map(|(a, b)| a + b).collect();
+    let finding = of_output(fast, "noise").unwrap();
+    assert!(finding.message.contains("at most") && finding.message.contains("floor"), "{finding}");
+}
+
+/// A damped oscillator driven by white noise, its position delayed by `delay` samples, with noise on top.
+fn driven(u: &[f64], delay: usize, sigma: f64) -> Vec<f64> {
+    let (omega, zeta, sub) = (2.0 * PI * 2.0, 0.1, 20);
+    let (mut q, mut v) = (0.0, 0.0);
+    let mut y = vec![0.0; N];
+    for k in 0..N {
+        y[k] = q;
+        for _ in 0..sub {
+            v += DT / f64::from(sub) * (u[k] - 2.0 * zeta * omega * v - omega * omega * q);
+            q += DT / f64::from(sub) * v;
+        }
+    }
+    let noise = white(99, sigma);
+    (0..N).map(|k| if k >= delay { y[k - delay] } else { 0.0 } + noise[k]).collect()
+}
+
+#[test]
+fn the_delay_is_found_through_the_dynamics() {
+    let u = white(12, 1.0);
+    for delay in [0usize, 7, 40] {
+        let y = driven(&u, delay, 1e-6);
+        let findings = check(&recording(&[("u", u.clone()), ("y", y)]), &["u"], &["y"]);
+        let finding = find(&findings, "delay").expect("a clear correlation");
+        // The position answers a held force one sample later, with half of it two samples later.
+        let expected = DT * (delay as f64 + 1.0);
+        assert!((finding.value.unwrap() - expected).abs() < 1.1 * DT, "{finding}");
+        assert_eq!(finding.unit.as_deref(), Some("s"));
+    }
+    let unrelated = check(&recording(&[("u", u), ("y", white(13, 1.0))]), &["u"], &["y"]);
+    assert!(find(&unrelated, "delay").is_none());
+}
