@@ -145,7 +145,7 @@ impl Data {
                 let ys: Vec<Vec<f64>> = measured.iter().map(|&m| scaled(m, piece)).collect();
                 let mut smooth = Vec::new();
                 for (c, y) in ys.iter().enumerate() {
-                    let sigma = greybox_recording::noise::channel_sigma(y);
+                    let sigma = noise_level(y);
                     of_recording[c].push(sigma);
                     let sigma = if sigma.is_finite() { sigma } else { 0.0 };
                     smooth.push(greybox_recording::smooth::adaptive(y, piece.dt, sigma));
@@ -305,6 +305,18 @@ fn find_channel(
         }
     };
     Ok((index, factor))
+}
+
+/// Noise of a channel. Fourth differences are blind where the signal itself is fast (nine samples per
+/// period look like noise to them), the floor of the spectrum where the noise is coloured; both are
+/// upper bounds of what white noise there is, so the smaller counts, but never less than the
+/// quantisation allows.
+fn noise_level(y: &[f64]) -> f64 {
+    use greybox_recording::noise::{noise_sigma, quantisation_step, spectral_floor_sigma};
+    let (differences, floor) = (noise_sigma(y), spectral_floor_sigma(y));
+    let rounding = quantisation_step(y).map_or(0.0, |q| q / 12f64.sqrt());
+    let least = if floor.is_finite() && floor > 0.0 { differences.min(floor) } else { differences };
+    if least.is_nan() { least } else { least.max(rounding) }
 }
 
 /// RMS about the mean.

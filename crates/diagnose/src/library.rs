@@ -106,6 +106,8 @@ pub struct Mechanism {
     pub inner: Vec<Inner>,
     /// Whether the mirror image (d → −d) is another candidate.
     pub mirror: bool,
+    /// Kinds of which this one is a refinement: at the same place it replaces them.
+    pub refines: Vec<String>,
     /// Extra complexity beyond the number of parameters.
     pub surcharge: f64,
     /// Where it acts, for laws with a threshold.
@@ -138,6 +140,8 @@ struct File {
     positive: Vec<String>,
     #[serde(default)]
     mirror: bool,
+    #[serde(default)]
+    refines: Vec<String>,
     #[serde(default)]
     surcharge: f64,
     #[serde(default)]
@@ -266,6 +270,7 @@ impl Mechanism {
             positive: raw.positive,
             inner,
             mirror: raw.mirror,
+            refines: raw.refines,
             surcharge: raw.surcharge,
             region,
             about: raw.about,

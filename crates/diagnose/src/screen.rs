@@ -30,6 +30,8 @@ pub struct Variant {
     pub candidate: usize,
     /// Values of the inner parameters.
     pub inner: Vec<f64>,
+    /// Sizes of the inner parameters.
+    pub scales: Vec<f64>,
     /// Lanes.
     pub columns: Range<usize>,
     /// The single column is the whole change (an input transformed), its coefficient 1 when the inner
@@ -48,6 +50,8 @@ pub struct Scored {
     pub values: Vec<f64>,
     /// First-order shift of the free parameters that goes with them.
     pub shift: Vec<f64>,
+    /// Sizes of the inner parameters.
+    pub scales: Vec<f64>,
 }
 
 /// Exogenous signals of a set of candidates.
@@ -182,7 +186,13 @@ pub fn lanes(setup: &Setup, library: &[Mechanism], candidates: &[Candidate], alo
                 }
                 _ => continue,
             }
-            variants.push(Variant { candidate: index, inner, columns: first..columns.len(), secant });
+            variants.push(Variant {
+                candidate: index,
+                inner,
+                scales: scales.clone(),
+                columns: first..columns.len(),
+                secant,
+            });
         }
     }
     let count = columns.len();
@@ -513,7 +523,13 @@ pub fn screen(
         }
         let slot = &mut best[variant.candidate];
         if slot.as_ref().is_none_or(|s| gain > s.gain) {
-            *slot = Some(Scored { candidate: variant.candidate, gain, values, shift: regressed.shift });
+            *slot = Some(Scored {
+                candidate: variant.candidate,
+                gain,
+                values,
+                shift: regressed.shift,
+                scales: variant.scales.clone(),
+            });
         }
     }
     let mut scored: Vec<Scored> = best.into_iter().flatten().collect();

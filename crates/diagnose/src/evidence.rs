@@ -1,0 +1,188 @@
+//! How much better one fitted model is than another, and whether that is believable.
+//!
+//! Residuals of real machines are correlated; the number of samples then overstates the information.
+//! With the autocorrelation ρ of the better model's residual, channel c counts as
+//!
+//! ```text
+//! N_eff = Σ n_c κ_c,   κ_c = 1 / (1 + 2 Σ_k ρ_c(k))      (until ρ < 0.05)
+//! score = Σ n_c κ_c ln(RSS_old/RSS_new) − k ln N_eff − 2·surcharge
+//! ```
+//!
+//! Consistency is judged on ten folds of contiguous blocks: leaving fold k out moves the parameters, to
+//! first order, by δ = −(H − H_k)⁻¹ s_k; what that does to fold k's own residual is its held-out error.
+
+use greybox_calibrate::{Level, Point, Setup, qr};
+
+use crate::screen::project;
+
+/// Number of folds.
+pub const FOLDS: usize = 10;
+
+/// Held-out error per fold, and what it takes to compute it.
+#[derive(Debug, Clone)]
+pub struct Folds {
+    /// Held-out sum of squares per fold.
+    pub sse: Vec<f64>,
+}
+
+/// Comparison of a richer model with a simpler one.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct Evidence {
+    /// Log-likelihood gain less the price of complexity.
+    pub score: f64,
+    /// Relative drop of the residual sum of squares.
+    pub drop: f64,
+    /// Relative drop of the held-out sum of squares.
+    pub held_out: f64,
+    /// Mean over standard error of the folds' drops.
+    pub t: f64,
+    /// Share of the folds that improve.
+    pub improving: f64,
+    /// Smallest κ over the channels.
+    pub kappa: f64,
+}
+
+/// κ per channel: information per sample of an autocorrelated residual.
+pub fn kappa(setup: &Setup, level: &Level, scale: &[f64], point: &Point) -> Vec<f64> {
+    let rows = setup.with_problem(level, scale, |p| p.rows(point, false, None));
+    (0..setup.system.ny)
+        .map(|c| {
+            let series: Vec<&[f64]> = rows
+                .iter()
+                .zip(&level.segments)
+                .map(|(r, s)| &r.r[c * s.range.len()..(c + 1) * s.range.len()])
+                .collect();
+            let power: f64 = series.iter().map(|s| qr::dot(s, s)).sum();
+            let longest = series.iter().map(|s| s.len()).max().unwrap_or(0);
+            if power <= 0.0 {
+                return 1.0;
+            }
+            let mut sum = 0.0;
+            for lag in 1..longest / 2 {
+                let rho: f64 = series
+                    .iter()
+                    .filter(|s| s.len() > lag)
+                    .map(|s| qr::dot(&s[lag..], &s[..s.len() - lag]))
+                    .sum::<f64>()
+                    / power;
+                if rho < 0.05 {
+                    break;
+                }
+                sum += rho;
+            }
+            1.0 / (1.0 + 2.0 * sum)
+        })
+        .collect()
+}
+
+/// Held-out errors by fold at the optimum of a fit.
+pub fn folds(setup: &Setup, level: &Level, scale: &[f64], point: &Point) -> Folds {
+    let (nx, ny, np) = (setup.system.nx, setup.system.ny, setup.free.len());
+    let rows = setup.with_problem(level, scale, |p| p.rows(point, true, None));
+    let total: usize = level.segments.iter().map(|s| s.range.len()).sum();
+    // At least 20 blocks in all, whatever the number of segments.
+    let length = (total / 40).max(1);
+    let mut blocks: Vec<(f64, Vec<f64>, Vec<f64>)> = Vec::new(); // r'r, J'r, J'J
+    for (segment, rows) in level.segments.iter().zip(rows) {
+        let p = project(rows, nx);
+        let (n, m) = (segment.range.len(), p.rows);
+        let parts = (n as f64 / length as f64).round().max(1.0) as usize;
+        for b in 0..parts {
+            let (from, to) = (b * n / parts, (b + 1) * n / parts);
+            let (mut rr, mut jr, mut jj) = (0.0, vec![0.0; np], vec![0.0; np * np]);
+            for c in 0..ny {
+                let part = |v: &[f64], column: usize| -> std::ops::Range<usize> {
+                    debug_assert!(v.len() >= (column + 1) * m);
+                    column * m + c * n + from..column * m + c * n + to
+                };
+                let r = &p.r[part(&p.r, 0)];
+                rr += qr::dot(r, r);
+                for i in 0..np {
+                    let ji = &p.jp[part(&p.jp, i)];
+                    jr[i] += qr::dot(ji, r);
+                    for k in 0..=i {
+                        let v = qr::dot(ji, &p.jp[part(&p.jp, k)]);
+                        jj[i * np + k] += v;
+                        if k != i {
+                            jj[k * np + i] += v;
+                        }
+                    }
+                }
+            }
+            blocks.push((rr, jr, jj));
+        }
+    }
+    let mut h = vec![0.0; np * np];
+    for (_, _, jj) in &blocks {
+        h.iter_mut().zip(jj).for_each(|(a, b)| *a += b);
+    }
+    for (i, f) in setup.free.iter().enumerate() {
+        if f.std.is_finite() && f.std > 0.0 {
+            h[i * np + i] += 1.0 / (f.std * f.std);
+        }
+    }
+    let d: Vec<f64> = (0..np).map(|i| if h[i * np + i] > 0.0 { h[i * np + i].sqrt() } else { 1.0 }).collect();
+    let count = FOLDS.min(blocks.len().max(1));
+    let sse = (0..count)
+        .map(|k| {
+            let (a, b) = (k * blocks.len() / count, (k + 1) * blocks.len() / count);
+            let (mut rr, mut jr, mut jj) = (0.0, vec![0.0; np], vec![0.0; np * np]);
+            for (r, s, hh) in &blocks[a..b] {
+                rr += r;
+                jr.iter_mut().zip(s).for_each(|(a, b)| *a += b);
+                jj.iter_mut().zip(hh).for_each(|(a, b)| *a += b);
+            }
+            if np == 0 {
+                return rr;
+            }
+            // Damped: a fold may hold the only activity of a parameter.
+            let mut left: Vec<f64> =
+                (0..np * np).map(|i| (h[i] - jj[i]) / (d[i / np] * d[i % np])).collect();
+            for i in 0..np {
+                left[i * np + i] += 0.01;
+            }
+            let rhs: Vec<f64> = jr.iter().zip(&d).map(|(s, d)| -s / d).collect();
+            let delta: Vec<f64> =
+                qr::solve_spd(&left, np, &rhs).iter().zip(&d).map(|(x, d)| x / d).collect();
+            let mut sse = rr - 2.0 * qr::dot(&delta, &jr);
+            for i in 0..np {
+                sse += delta[i] * qr::dot(&jj[i * np..(i + 1) * np], &delta);
+            }
+            sse
+        })
+        .collect();
+    Folds { sse }
+}
+
+/// Weighs the richer model (`new`) against the simpler (`old`), both fitted with the same scale.
+pub fn weigh(
+    old_rss: &[f64],
+    new_rss: &[f64],
+    count: &[usize],
+    kappa: &[f64],
+    extra_parameters: f64,
+    surcharge: f64,
+    old_folds: &Folds,
+    new_folds: &Folds,
+) -> Evidence {
+    let effective: f64 = count.iter().zip(kappa).map(|(n, k)| *n as f64 * k).sum();
+    let mut score = -extra_parameters * effective.max(2.0).ln() - 2.0 * surcharge;
+    for c in 0..count.len() {
+        if new_rss[c] > 0.0 && old_rss[c] > 0.0 {
+            score += count[c] as f64 * kappa[c] * (old_rss[c] / new_rss[c]).ln();
+        }
+    }
+    let (old, new): (f64, f64) = (old_rss.iter().sum(), new_rss.iter().sum());
+    let differences: Vec<f64> = old_folds.sse.iter().zip(&new_folds.sse).map(|(a, b)| a - b).collect();
+    let k = differences.len().max(1) as f64;
+    let mean = differences.iter().sum::<f64>() / k;
+    let variance = differences.iter().map(|d| (d - mean).powi(2)).sum::<f64>() / (k - 1.0).max(1.0);
+    Evidence {
+        score,
+        drop: 1.0 - new / old.max(1e-300),
+        held_out: differences.iter().sum::<f64>() / old_folds.sse.iter().sum::<f64>().max(1e-300),
+        t: mean / (variance / k).sqrt().max(1e-300),
+        improving: differences.iter().filter(|d| **d > 0.0).count() as f64 / k,
+        kappa: kappa.iter().copied().fold(1.0, f64::min),
+    }
+}

@@ -1,0 +1,561 @@
+//! The search: short-list by the score test, fit, decide, and again; on short segments first, on longer
+//! ones later.
+
+use greybox_calibrate::{Fit, Free, Level, Limits, Point, Setup, free_parameters};
+use greybox_model::{Hold, Model};
+use greybox_model::system::CompileError;
+use rayon::prelude::*;
+
+use crate::candidate::{Candidate, Instance, candidates};
+use crate::evidence::{Evidence, folds, kappa, weigh};
+use crate::library::{Mechanism, On};
+use crate::place::{Place, places};
+use crate::screen::{Scored, screen};
+use crate::{Observer, Stage};
+
+/// Number of segments of the levels.
+pub const LEVELS: [usize; 3] = [60, 15, 4];
+/// Most mechanisms that are looked for.
+const MOST_MECHANISMS: usize = 5;
+/// Most candidates that are fitted per round.
+const SHORT_LIST: usize = 9;
+/// Least share of the calibrated model's misfit that a second or later mechanism must explain.
+const LEAST_SHARE: f64 = 7e-4;
+
+/// A mechanism in a model, with the sizes its inner parameters are searched at.
+#[derive(Debug, Clone, PartialEq)]
+pub struct Part {
+    /// What and where.
+    pub candidate: Candidate,
+    /// As it stands in the model.
+    pub instance: Instance,
+    /// Sizes of the inner parameters.
+    pub scales: Vec<f64>,
+}
+
+/// A model fitted at a level.
+#[derive(Debug, Clone)]
+pub struct Fitted {
+    /// Model, data, free parameters.
+    pub setup: Setup,
+    /// Mechanisms beyond the nominal equations.
+    pub parts: Vec<Part>,
+    /// The segments.
+    pub level: Level,
+    /// The fit; its `rss` is in units of the scale it was fitted with.
+    pub fit: Fit,
+}
+
+/// What was tried beside an accepted mechanism.
+#[derive(Debug, Clone)]
+pub struct Rival {
+    /// What and where.
+    pub candidate: Candidate,
+    /// As it would stand in the model.
+    pub instance: Instance,
+    /// Its evidence.
+    pub evidence: Evidence,
+    /// The data cannot separate it from the accepted one.
+    pub equivalent: bool,
+}
+
+/// An accepted mechanism with the evidence for it.
+#[derive(Debug, Clone)]
+pub struct Accepted {
+    /// What and where.
+    pub candidate: Candidate,
+    /// Evidence when it was accepted.
+    pub evidence: Evidence,
+    /// The others of that round.
+    pub rivals: Vec<Rival>,
+}
+
+/// Result of the search.
+pub struct Found {
+    /// The nominal equations with fitted parameters, at the last level.
+    pub calibrated: Fitted,
+    /// With the mechanisms.
+    pub improved: Fitted,
+    /// Evidence for each part of `improved`, in the same order.
+    pub accepted: Vec<Accepted>,
+    /// Holds that explain the recording better than the stated ones: (input, stated, better).
+    pub better_holds: Vec<(usize, Hold, Hold)>,
+    /// Residual scale of the improved model per channel, SI.
+    pub scale: Vec<f64>,
+}
+
+/// The search with everything it needs.
+pub struct Search<'a> {
+    /// The mechanisms.
+    pub library: &'a [Mechanism],
+    /// Watches.
+    pub observer: &'a dyn Observer,
+    nominal: Setup,
+    all: Vec<Candidate>,
+}
+
+fn limits(iterations: usize) -> Limits {
+    Limits { iterations, tolerance: 1e-5 }
+}
+
+/// Residual RMS per channel in SI.
+pub fn rms(fit: &Fit, scale: &[f64]) -> Vec<f64> {
+    fit.rss
+        .iter()
+        .zip(&fit.count)
+        .zip(scale)
+        .map(|((r, n), s)| s * (r / (*n).max(1) as f64).sqrt())
+        .collect()
+}
+
+/// The scale for the next comparison: the model's own residual, never below 0.7 of the noise.
+pub fn next_scale(fit: &Fit, scale: &[f64], sigma: &[f64]) -> Vec<f64> {
+    rms(fit, scale).iter().zip(sigma).map(|(r, s)| r.max(0.7 * s)).collect()
+}
+
+impl<'a> Search<'a> {
+    /// Prepares the search for a laid-out nominal model.
+    pub fn new(nominal: Setup, library: &'a [Mechanism], observer: &'a dyn Observer) -> Search<'a> {
+        let places = places(&nominal.model);
+        let all = candidates(&nominal.model, library, &places);
+        Search { library, observer, nominal, all }
+    }
+
+    /// The candidates it considers.
+    pub fn candidates(&self) -> &[Candidate] {
+        &self.all
+    }
+
+    /// The nominal equations plus `parts` (candidate, values, sizes), parameters at `parameters`.
+    fn assemble(
+        &self,
+        holds: &[Hold],
+        parameters: &[f64],
+        parts: &[(Candidate, Vec<f64>, Vec<f64>)],
+        from: &Setup,
+    ) -> Result<(Setup, Vec<Part>), CompileError> {
+        let mut model: Model = self.nominal.model.clone();
+        for (input, hold) in model.inputs.iter_mut().zip(holds) {
+            input.hold = *hold;
+        }
+        let mut free: Vec<Free> = free_parameters(&self.nominal.model);
+        for (p, v) in model.parameters.iter_mut().zip(parameters) {
+            p.value = *v;
+        }
+        let mut out = Vec::new();
+        for (candidate, values, scales) in parts {
+            let mechanism = &self.library[candidate.mechanism];
+            let first = model.parameters.len();
+            let instance = candidate.insert(&mut model, mechanism, values);
+            free.extend(candidate.free(mechanism, first, scales));
+            out.push(Part { candidate: candidate.clone(), instance, scales: scales.clone() });
+        }
+        Ok((from.with_model(model, free)?, out))
+    }
+
+    /// Parts of a fitted model with their present values.
+    fn parts(&self, fitted: &Fitted) -> Vec<(Candidate, Vec<f64>, Vec<f64>)> {
+        fitted
+            .parts
+            .iter()
+            .map(|part| {
+                let values = part
+                    .instance
+                    .names
+                    .iter()
+                    .filter_map(|n| fitted.setup.model.parameter(n))
+                    .map(|i| fitted.fit.point.parameters[i])
+                    .collect();
+                (part.candidate.clone(), values, part.scales.clone())
+            })
+            .collect()
+    }
+
+    /// The model fitted at another level, from the stitched trajectory or the measurements.
+    fn relevel(&self, fitted: &Fitted, count: usize, scale: &[f64], iterations: usize) -> Fitted {
+        let level = fitted.setup.level(count);
+        let stitched = fitted.setup.stitch(&fitted.level, &fitted.fit.point, &level, scale);
+        let hats = Point {
+            parameters: fitted.fit.point.parameters.clone(),
+            starts: fitted.setup.starts(&level, &fitted.fit.point.parameters),
+        };
+        let fit = fitted.setup.fit(&level, scale, &[stitched, hats], limits(iterations));
+        Fitted { level, fit, ..fitted.clone() }
+    }
+
+    fn refit(&self, fitted: &Fitted, scale: &[f64], iterations: usize) -> Fitted {
+        let point = fitted.fit.point.clone();
+        let fit = fitted.setup.fit(&fitted.level, scale, &[point], limits(iterations));
+        Fitted { fit, ..fitted.clone() }
+    }
+
+    /// Fits `base` plus one candidate.
+    fn extend(
+        &self,
+        base: &Fitted,
+        candidate: &Candidate,
+        scored: &Scored,
+        scale: &[f64],
+        iterations: usize,
+    ) -> Option<Fitted> {
+        let n0 = self.nominal.model.parameters.len();
+        let mut parts = self.parts(base);
+        parts.push((candidate.clone(), scored.values.clone(), scored.scales.clone()));
+        let old = &base.fit.point;
+        let (mut setup, parts) =
+            self.assemble(&base.setup.holds, &old.parameters[..n0], &parts, &base.setup).ok()?;
+        let plain: Vec<f64> = old.parameters.iter().chain(&scored.values).copied().collect();
+        let mut shifted = plain.clone();
+        for (f, d) in base.setup.free.iter().zip(&scored.shift) {
+            shifted[f.index] = (shifted[f.index] + d).clamp(f.lower, f.upper);
+        }
+        for (p, v) in setup.model.parameters.iter_mut().zip(&shifted) {
+            p.value = *v;
+        }
+        let hats = setup.starts(&base.level, &shifted);
+        let points = [
+            Point { parameters: shifted.clone(), starts: old.starts.clone() },
+            Point { parameters: plain, starts: old.starts.clone() },
+            Point { parameters: shifted, starts: hats },
+        ];
+        let fit = setup.fit(&base.level, scale, &points, limits(iterations));
+        fit.cost.is_finite().then(|| Fitted { setup, parts, level: base.level.clone(), fit })
+    }
+
+    /// `fitted` without part `index`, refitted.
+    fn without(&self, fitted: &Fitted, index: usize, scale: &[f64], iterations: usize) -> Option<Fitted> {
+        let n0 = self.nominal.model.parameters.len();
+        let mut parts = self.parts(fitted);
+        parts.remove(index);
+        let head = &fitted.fit.point.parameters[..n0];
+        let (setup, kept) = self.assemble(&fitted.setup.holds, head, &parts, &fitted.setup).ok()?;
+        let mut parameters = head.to_vec();
+        parameters.extend(parts.iter().flat_map(|p| p.1.iter().copied()));
+        let point = Point { parameters, starts: fitted.fit.point.starts.clone() };
+        let fit = setup.fit(&fitted.level, scale, &[point], limits(iterations));
+        Some(Fitted { setup, parts: kept, level: fitted.level.clone(), fit })
+    }
+
+    /// Tries the other holds of every input; switches where the cost falls by more than `margin`.
+    fn redecide_holds(&self, fitted: &Fitted, scale: &[f64], margin: f64) -> Fitted {
+        let mut best = fitted.clone();
+        for i in 0..fitted.setup.holds.len() {
+            for hold in [Hold::Zero, Hold::Linear, Hold::BandLimited] {
+                if hold == best.setup.holds[i] {
+                    continue;
+                }
+                let mut holds = best.setup.holds.clone();
+                holds[i] = hold;
+                let trial = Fitted { setup: best.setup.with_holds(holds), ..best.clone() };
+                let trial = self.refit(&trial, scale, 6);
+                if trial.fit.cost < best.fit.cost * (1.0 - margin) {
+                    best = trial;
+                }
+            }
+        }
+        best
+    }
+
+    fn weigh(&self, old: &Fitted, new: &Fitted, scale: &[f64]) -> Evidence {
+        let kappa = kappa(&new.setup, &new.level, scale, &new.fit.point);
+        let complexity = |f: &Fitted| -> (f64, f64) {
+            f.parts.iter().fold((0.0, 0.0), |(p, s), part| {
+                let m = &self.library[part.candidate.mechanism];
+                (p + (m.linear.len() + m.inner.len()) as f64, s + m.surcharge)
+            })
+        };
+        let ((p0, s0), (p1, s1)) = (complexity(old), complexity(new));
+        let old_folds = folds(&old.setup, &old.level, scale, &old.fit.point);
+        let new_folds = folds(&new.setup, &new.level, scale, &new.fit.point);
+        weigh(
+            &old.fit.rss,
+            &new.fit.rss,
+            &new.fit.count,
+            &kappa,
+            p1 - p0,
+            s1 - s0,
+            &old_folds,
+            &new_folds,
+        )
+    }
+
+    /// Whether the improvement is to be believed.
+    fn believable(&self, e: &Evidence, tried: usize, share: f64, first: bool) -> bool {
+        let threshold = 2.0 * (tried.max(1) as f64).ln() + 6.0;
+        let enough = (e.drop > 0.02 && e.held_out > 0.01)
+            || (e.kappa > 0.8 && e.drop > 0.005 && e.held_out > 0.004 && e.t > 2.5);
+        let steady = (e.t > 2.0 && e.improving >= 0.6) || (e.t > 1.5 && e.improving >= 0.8);
+        e.score > threshold && (first || share > LEAST_SHARE) && enough && steady
+    }
+
+    /// Runs all levels.
+    pub fn run(&self) -> Found {
+        let sigma = self.nominal.data.sigma.clone();
+        let mut scale: Vec<f64> = self.nominal.data.spread.iter().map(|s| s.max(1e-300)).collect();
+        self.observer.stage(Stage::Calibrating);
+        let level = self.nominal.level(LEVELS[0]);
+        let start = Point {
+            parameters: self.nominal.values(),
+            starts: self.nominal.starts(&level, &self.nominal.values()),
+        };
+        let fit = self.nominal.fit(&level, &scale, &[start], limits(30));
+        let mut calibrated = Fitted { setup: self.nominal.clone(), parts: Vec::new(), level, fit };
+        scale = next_scale(&calibrated.fit, &scale, &sigma);
+        calibrated = self.refit(&calibrated, &scale, 15);
+        calibrated = self.redecide_holds(&calibrated, &scale, 0.02);
+        let mut current = calibrated.clone();
+        let mut accepted: Vec<Accepted> = Vec::new();
+        for (step, &count) in LEVELS.iter().enumerate() {
+            if step > 0 {
+                let same = calibrated.setup.level(count).segments == calibrated.level.segments;
+                if same {
+                    continue;
+                }
+                self.observer.stage(Stage::Lengthening { segments: count });
+                calibrated = self.relevel(&calibrated, count, &scale, 20);
+                current = if current.parts.is_empty() {
+                    calibrated.clone()
+                } else {
+                    self.relevel(&current, count, &scale, 20)
+                };
+                scale = next_scale(&current.fit, &scale, &sigma);
+                current = self.refit(&current, &scale, 10);
+                current = self.redecide_holds(&current, &scale, 0.002);
+                if !current.parts.is_empty() {
+                    self.prune(&mut current, &mut accepted, &scale);
+                }
+            }
+            self.level(&mut calibrated, &mut current, &mut accepted, &mut scale, &sigma);
+        }
+        let better_holds = (0..current.setup.holds.len())
+            .filter(|&i| current.setup.holds[i] != self.nominal.holds[i])
+            .map(|i| (i, self.nominal.holds[i], current.setup.holds[i]))
+            .collect();
+        Found { calibrated, improved: current, accepted, better_holds, scale }
+    }
+
+    /// One level: rounds until nothing more is believable.
+    fn level(
+        &self,
+        calibrated: &mut Fitted,
+        current: &mut Fitted,
+        accepted: &mut Vec<Accepted>,
+        scale: &mut Vec<f64>,
+        sigma: &[f64],
+    ) {
+        while current.parts.len() < MOST_MECHANISMS {
+            let misfit = rms(&current.fit, scale)
+                .iter()
+                .zip(sigma)
+                .map(|(r, s)| r / s)
+                .fold(0.0, f64::max);
+            let coloured = kappa(&current.setup, &current.level, scale, &current.fit.point)
+                .iter()
+                .any(|k| *k < 0.8);
+            if misfit < 1.03 && !coloured {
+                break;
+            }
+            let taken = |c: &Candidate| {
+                current.parts.iter().any(|p| {
+                    p.candidate == *c
+                        || (p.candidate.place == c.place
+                            && self.library[p.candidate.mechanism]
+                                .refines
+                                .contains(&self.library[c.mechanism].kind))
+                })
+            };
+            let open: Vec<Candidate> = self.all.iter().filter(|c| !taken(c)).cloned().collect();
+            self.observer.stage(Stage::Screening { candidates: open.len(), found: current.parts.len() });
+            let scored = screen(
+                &current.setup,
+                self.library,
+                &open,
+                &current.level,
+                scale,
+                &current.fit.point,
+            );
+            let mut short: Vec<&Scored> = Vec::new();
+            for s in &scored {
+                let kind = open[s.candidate].mechanism;
+                let of_kind = short.iter().filter(|o| open[o.candidate].mechanism == kind).count();
+                if s.gain > 0.003 && of_kind < 2 && short.len() < SHORT_LIST {
+                    short.push(s);
+                }
+            }
+            if short.is_empty() {
+                break;
+            }
+            self.observer.stage(Stage::Fitting { candidates: short.len() });
+            let trials: Vec<(usize, Fitted)> = short
+                .par_iter()
+                .filter_map(|s| {
+                    let candidate = &open[s.candidate];
+                    self.trial(current, candidate, s, scale).map(|f| (s.candidate, f))
+                })
+                .collect();
+            let Some((winner, chosen, rivals, evidence)) =
+                self.decide(calibrated, current, &open, trials, scale)
+            else {
+                break;
+            };
+            // Control: the smaller model from the winner's parameters. If that is better than it was,
+            // the baseline had been stuck.
+            let control = self.control(current, &chosen, scale);
+            let evidence = if control.fit.cost < current.fit.cost * 0.999 {
+                if current.parts.is_empty() {
+                    *calibrated = control.clone();
+                }
+                *current = control;
+                self.weigh(current, &chosen, scale)
+            } else {
+                evidence
+            };
+            let total: f64 = calibrated_rss(calibrated, scale);
+            let share =
+                (current.fit.rss.iter().sum::<f64>() - chosen.fit.rss.iter().sum::<f64>()) / total.max(1e-300);
+            self.observer.weighed(&self.library[winner.mechanism].kind, &evidence, share);
+            if !self.believable(&evidence, self.all.len(), share, current.parts.is_empty()) {
+                break;
+            }
+            // A refinement has replaced its simpler relative.
+            accepted.retain(|a| chosen.parts.iter().any(|p| p.candidate == a.candidate));
+            *current = chosen;
+            accepted.push(Accepted { candidate: winner, evidence, rivals });
+            *scale = next_scale(&current.fit, scale, sigma);
+            *current = self.refit(current, scale, 10);
+            *current = self.redecide_holds(current, scale, 0.002);
+            *scale = next_scale(&current.fit, scale, sigma);
+            *current = self.refit(current, scale, 5);
+            self.prune(current, accepted, scale);
+        }
+    }
+
+    /// Fits a candidate: added, or in place of the relative that it refines.
+    fn trial(&self, current: &Fitted, candidate: &Candidate, scored: &Scored, scale: &[f64]) -> Option<Fitted> {
+        let refined = current.parts.iter().position(|p| {
+            p.candidate.place == candidate.place
+                && self.library[candidate.mechanism]
+                    .refines
+                    .contains(&self.library[p.candidate.mechanism].kind)
+        });
+        match refined {
+            None => self.extend(current, candidate, scored, scale, 15),
+            Some(index) => {
+                let base = self.without(current, index, scale, 6)?;
+                let again = screen(
+                    &base.setup,
+                    self.library,
+                    std::slice::from_ref(candidate),
+                    &base.level,
+                    scale,
+                    &base.fit.point,
+                );
+                self.extend(&base, candidate, again.first()?, scale, 20)
+            }
+        }
+    }
+
+    /// The model without the winner, from the winner's parameters.
+    fn control(&self, current: &Fitted, chosen: &Fitted, scale: &[f64]) -> Fitted {
+        let mut parameters = current.fit.point.parameters.clone();
+        for (p, name) in parameters.iter_mut().zip(current.setup.model.parameters.iter().map(|p| &p.name)) {
+            if let Some(i) = chosen.setup.model.parameter(name) {
+                *p = chosen.fit.point.parameters[i];
+            }
+        }
+        let points = [Point { parameters, starts: chosen.fit.point.starts.clone() }];
+        let fit = current.setup.fit(&current.level, scale, &points, limits(15));
+        if fit.cost < current.fit.cost { Fitted { fit, ..current.clone() } } else { current.clone() }
+    }
+
+    /// The best trial by score, unless a simpler one is as good; with the evidence of all.
+    fn decide(
+        &self,
+        calibrated: &Fitted,
+        current: &Fitted,
+        open: &[Candidate],
+        trials: Vec<(usize, Fitted)>,
+        scale: &[f64],
+    ) -> Option<(Candidate, Fitted, Vec<Rival>, Evidence)> {
+        let mut weighed: Vec<(usize, Fitted, Evidence)> = trials
+            .into_iter()
+            .map(|(c, f)| {
+                let e = self.weigh(current, &f, scale);
+                (c, f, e)
+            })
+            .collect();
+        weighed.sort_by(|a, b| b.2.score.total_cmp(&a.2.score).then(a.0.cmp(&b.0)));
+        let total = calibrated_rss(calibrated, scale);
+        let complexity = |f: &Fitted| -> f64 {
+            f.parts.iter().map(|p| self.library[p.candidate.mechanism].complexity()).sum()
+        };
+        let priority = |c: usize| match self.library[open[c].mechanism].on {
+            On::Motion | On::Equation => 0,
+            On::Input => 1,
+            On::Measurement => 2,
+        };
+        let mut best = 0;
+        for i in 1..weighed.len() {
+            let (a, b) = (&weighed[best], &weighed[i]);
+            let near = |slack: f64| {
+                a.1.fit.rss.iter().zip(&b.1.fit.rss).all(|(x, y)| {
+                    *y < (1.0 + slack) * x || (slack > 0.01 && (y - x) < LEAST_SHARE * total)
+                })
+            };
+            let simpler = complexity(&b.1) < complexity(&a.1) && near(0.02);
+            let tie = complexity(&b.1) == complexity(&a.1)
+                && near(0.005)
+                && priority(b.0) < priority(a.0);
+            if simpler || tie {
+                best = i;
+            }
+        }
+        if weighed.is_empty() {
+            return None;
+        }
+        let (chosen, fitted, evidence) = weighed.remove(best);
+        let rivals = weighed
+            .into_iter()
+            .filter_map(|(c, f, e)| {
+                let equivalent = complexity(&f) <= complexity(&fitted)
+                    && f.fit.rss.iter().zip(&fitted.fit.rss).all(|(x, y)| *x < 1.005 * y);
+                let instance = f.parts.last()?.instance.clone();
+                Some(Rival { candidate: open[c].clone(), instance, evidence: e, equivalent })
+            })
+            .collect();
+        Some((open[chosen].clone(), fitted, rivals, evidence))
+    }
+
+    /// Drops what no longer pays.
+    fn prune(&self, current: &mut Fitted, accepted: &mut Vec<Accepted>, scale: &[f64]) {
+        let mut index = 0;
+        while current.parts.len() > 1 && index < current.parts.len() {
+            let Some(smaller) = self.without(current, index, scale, 12) else {
+                index += 1;
+                continue;
+            };
+            let e = self.weigh(&smaller, current, scale);
+            if e.score < 10.0 || e.drop < 0.01 {
+                let gone = current.parts[index].candidate.clone();
+                self.observer.dropped(&self.library[gone.mechanism].kind);
+                accepted.retain(|a| a.candidate != gone);
+                *current = smaller;
+                index = 0;
+            } else {
+                index += 1;
+            }
+        }
+    }
+}
+
+fn calibrated_rss(calibrated: &Fitted, scale: &[f64]) -> f64 {
+    let rows = calibrated
+        .setup
+        .with_problem(&calibrated.level, scale, |p| p.rows(&calibrated.fit.point, false, None));
+    calibrated.setup.with_problem(&calibrated.level, scale, |p| p.rss(&rows)).0.iter().sum()
+}
+
+/// The equations' names a candidate touches in a model.
+pub fn touched(model: &Model, place: &Place) -> Vec<String> {
+    place.equations(model)
+}
