@@ -1,6 +1,7 @@
 //! Printing expressions in the model language, with the fewest parentheses that keep the tree.
 
 use crate::expr::{BinOp, Expr};
+use crate::model::Equation;
 use std::fmt;
 
 /// Prints in the model language; parsing the text gives the same tree again, as long as its numbers
@@ -16,6 +17,13 @@ use std::fmt;
 impl fmt::Display for Expr {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         write(self, Tightness::Loose, f)
+    }
+}
+
+/// `lhs = rhs`, as it stands in a file.
+impl fmt::Display for Equation {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        write!(f, "{} = {}", self.lhs, self.rhs)
     }
 }
 

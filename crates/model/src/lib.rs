@@ -1,8 +1,11 @@
 //! The greybox model language: textbook equations, parsed, checked for units and compiled.
 pub mod algebra;
+mod dimension;
 mod display;
+mod edit;
 pub mod error;
 pub mod expr;
+mod load;
 pub mod model;
 mod nearest;
 pub mod parse;

@@ -439,7 +439,7 @@ fn si_text(dimension: Dimension) -> String {
         candidates.extend(powers[i + 1..].iter().filter(|p| p.0 != first.0).map(|p| vec![*first, *p]));
     }
     let mut best: Option<(f64, Vec<(&str, f64)>)> = None;
-    for derived in candidates {
+    for derived in &candidates {
         let rest = derived.iter().fold(dimension, |rest, (_, _, d)| rest / *d);
         let mut factors: Vec<(&str, f64)> = derived.iter().map(|(symbol, e, _)| (*symbol, *e)).collect();
         for (i, symbol) in BASE.iter().enumerate() {
@@ -451,6 +451,8 @@ fn si_text(dimension: Dimension) -> String {
         // A factor costs one, each further power half, and a text without numerator a little.
         let mut cost: f64 = factors.iter().map(|(_, e)| 1.0 + 0.5 * f64::from(u8::from(e.abs() != 1.0)) * e.abs().max(1.0)).sum();
         cost += if factors.iter().all(|(_, e)| *e < 0.0) { 0.1 } else { 0.0 };
+        // Kinematics stay kinematics: `m/s^2`, not `N/kg`.
+        cost -= if derived.is_empty() && dimension.0[1] == 0.0 && dimension.0[3] == 0.0 { 1.0 } else { 0.0 };
         if best.as_ref().is_none_or(|(c, _)| cost < c - 1e-9) {
             best = Some((cost, factors));
         }
