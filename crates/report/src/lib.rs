@@ -7,7 +7,13 @@
 //! It depends on no other greybox crate, reads no file and prints nothing.
 
 pub mod contract;
+pub mod decimate;
+pub mod diff;
+pub mod expression;
+pub mod format;
 pub mod page;
+pub mod sentence;
+pub mod svg;
 
 pub use contract::Report;
 pub use page::Page;
