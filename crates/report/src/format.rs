@@ -20,6 +20,19 @@ pub fn number(value: f64) -> String {
     significant(value, 3)
 }
 
+/// As [`number`], without trailing zeros: `0.2`. For bounds in running text, where digits claim nothing.
+pub fn plain(value: f64) -> String {
+    let text = number(value);
+    match text.split_once(" × ") {
+        Some((mantissa, power)) => format!("{} × {power}", trim_zeros(mantissa)),
+        None => trim_zeros(&text).to_owned(),
+    }
+}
+
+fn trim_zeros(text: &str) -> &str {
+    if text.contains('.') { text.trim_end_matches('0').trim_end_matches('.') } else { text }
+}
+
 /// A number to `digits` significant digits.
 pub fn significant(value: f64, digits: usize) -> String {
     if !value.is_finite() {
@@ -261,6 +274,9 @@ mod tests {
     #[test]
     fn percentages_and_probabilities() {
         assert_eq!(percent(0.2834), "28.3 %");
+        assert_eq!(plain(0.2), "0.2");
+        assert_eq!(plain(100.0), "100");
+        assert_eq!(plain(2e-7), "2 × 10⁻⁷");
         assert_eq!(percent(1.3), "130 %");
         assert_eq!(percent(1e-9), "< 0.001 %");
         assert_eq!(percent(f64::NAN), "–");

@@ -11,6 +11,7 @@ pub mod decimate;
 pub mod diff;
 pub mod expression;
 pub mod format;
+mod html;
 pub mod page;
 pub mod sentence;
 pub mod svg;

@@ -144,18 +144,16 @@ pub fn region(ranges: &Ordered<[Option<f64>; 2]>) -> Vec<String> {
         let (low, high) = (low.filter(|v| v.is_finite()), high.filter(|v| v.is_finite()));
         match (low, high) {
             (Some(low), Some(high)) if low < 0.0 && (low + high).abs() <= 0.02 * (high - low) => {
-                let simple = source.chars().all(|c| c.is_alphanumeric() || c == '_' || c == '\'');
-                let size = if simple { format!("|{shown}|") } else { format!("|({shown})|") };
-                out.push(format!("{size} < {}", format::number(0.5 * (high - low))));
+                out.push(format!("|{shown}| < {}", format::plain(0.5 * (high - low))));
             }
             (Some(0.0), Some(high)) if source.starts_with("abs(") => {
-                out.push(format!("{shown} < {}", format::number(high)));
+                out.push(format!("{shown} < {}", format::plain(high)));
             }
             (Some(low), Some(high)) => {
-                out.push(format!("{} < {shown} < {}", format::number(low), format::number(high)));
+                out.push(format!("{} < {shown} < {}", format::plain(low), format::plain(high)));
             }
-            (Some(low), None) => out.push(format!("{shown} > {}", format::number(low))),
-            (None, Some(high)) => out.push(format!("{shown} < {}", format::number(high))),
+            (Some(low), None) => out.push(format!("{shown} > {}", format::plain(low))),
+            (None, Some(high)) => out.push(format!("{shown} < {}", format::plain(high))),
             (None, None) => {}
         }
     }
@@ -166,9 +164,9 @@ pub fn region(ranges: &Ordered<[Option<f64>; 2]>) -> Vec<String> {
 pub fn band(band_hz: Option<Interval>) -> Option<String> {
     let band = band_hz?;
     match (band.low.is_finite(), band.high.is_finite()) {
-        (true, true) => Some(format!("{} … {} Hz", format::number(band.low), format::number(band.high))),
-        (false, true) => Some(format!("below {} Hz", format::number(band.high))),
-        (true, false) => Some(format!("above {} Hz", format::number(band.low))),
+        (true, true) => Some(format!("{} … {} Hz", format::plain(band.low), format::plain(band.high))),
+        (false, true) => Some(format!("below {} Hz", format::plain(band.high))),
+        (true, false) => Some(format!("above {} Hz", format::plain(band.low))),
         (false, false) => None,
     }
 }
@@ -236,11 +234,11 @@ mod tests {
     #[test]
     fn regions_read_as_conditions() {
         let one = |name: &str, range| region(&Ordered::from_iter([(name.to_owned(), range)])).join(";");
-        assert_eq!(one("theta'", [Some(-0.2), Some(0.2)]), "|θ′| < 0.200");
-        assert_eq!(one("x1 - x2", [Some(-1.0), Some(1.0)]), "|(x₁ − x₂)| < 1.00");
-        assert_eq!(one("x", [Some(-0.1), Some(0.4)]), "−0.100 < x < 0.400");
-        assert_eq!(one("v", [Some(2.0), None]), "v > 2.00");
-        assert_eq!(one("abs(v)", [Some(0.0), Some(1.0)]), "|v| < 1.00");
+        assert_eq!(one("theta'", [Some(-0.2), Some(0.2)]), "|θ′| < 0.2");
+        assert_eq!(one("x1 - x2", [Some(-1.0), Some(1.0)]), "|x₁ − x₂| < 1");
+        assert_eq!(one("x", [Some(-0.1), Some(0.4)]), "−0.1 < x < 0.4");
+        assert_eq!(one("v", [Some(2.0), None]), "v > 2");
+        assert_eq!(one("abs(v)", [Some(0.0), Some(1.0)]), "|v| < 1");
         assert_eq!(one("v", [None, Some(f64::INFINITY)]), "");
     }
 
