@@ -10,10 +10,10 @@
   const css = getComputedStyle(root);
   const colour = name => css.getPropertyValue(name).trim();
   const look = {
-    measured: { stroke: colour("--measured"), width: 2.4 },
+    measured: { stroke: colour("--measured"), width: 3 },
     nominal: { stroke: colour("--nominal"), width: 1.6 },
     calibrated: { stroke: colour("--calibrated"), width: 1.5 },
-    improved: { stroke: colour("--improved"), width: 1.5 },
+    improved: { stroke: colour("--improved-line"), width: 1.4 },
     input: { stroke: "#5f6b7a", width: 1.3 },
     noise: { stroke: "#a4acb7", width: 1.3, dash: [5, 4] },
   };
@@ -22,7 +22,7 @@
   const minus = s => s.replace("-", "−");
   // Three significant digits, as in the tables.
   const number = v => {
-    if (v == null) return "–";
+    if (v == null) return "";
     if (v === 0) return "0";
     const [m, e] = v.toExponential(2).split("e");
     const n = Number(e);
@@ -33,7 +33,9 @@
     const largest = Math.max(...splits.map(v => Math.abs(v)));
     const small = largest > 0 && (largest < 1e-3 || largest >= 1e6);
     const e = small ? Math.floor(Math.log10(largest)) : 0;
-    const decimals = Math.min(8, Math.max(0, -Math.floor(Math.log10(step / 10 ** e) + 1e-9)));
+    const unit = step / 10 ** e;
+    let decimals = 0;
+    while (decimals < 8 && Math.abs(unit * 10 ** decimals - Math.round(unit * 10 ** decimals)) > 1e-6 * unit * 10 ** decimals) decimals += 1;
     return splits.map(v => v === 0 ? "0" : minus((v / 10 ** e).toFixed(decimals)) + (e ? "·" + power(e) : ""));
   };
   const decades = (u, splits) => splits.map(v => {
@@ -85,7 +87,7 @@
       scales: { x: log ? { time: false, distr: 3 } : { time: false }, y: log ? { distr: 3 } : {} },
       axes: [
         Object.assign({}, axisStyle, { label: plot.x, labelSize: 22, size: 30, values, space: log ? 40 : (narrow() ? 50 : 70) }),
-        Object.assign({}, axisStyle, { size: 56, values, space: log ? 26 : 34 }),
+        Object.assign({}, axisStyle, { size: 56, values, space: log ? 26 : plot.height < 200 ? 24 : 34 }),
       ],
       series: [
         { label: log ? "f in Hz" : "t in s", value: (u, v) => number(v) },

@@ -107,8 +107,18 @@ enum Style {
 }
 
 fn render(expression: &str, style: Style) -> String {
-    let all = tokens(expression);
-    let pieces: Vec<&str> = all.into_iter().filter(|token| !token.trim().is_empty()).collect();
+    // Blanks are set anew around the operators; only between two words do they mean something.
+    let mut pieces: Vec<&str> = Vec::new();
+    let mut word_gap: Vec<bool> = Vec::new();
+    let mut blank = false;
+    for token in tokens(expression) {
+        if token.trim().is_empty() {
+            blank = true;
+            continue;
+        }
+        pieces.push(token);
+        word_gap.push(std::mem::take(&mut blank));
+    }
     let mut out = String::new();
     // One entry per open parenthesis: true where it is the bar of an absolute value.
     let mut open: Vec<bool> = Vec::new();
@@ -117,6 +127,9 @@ fn render(expression: &str, style: Style) -> String {
     while index < pieces.len() {
         let token = pieces[index];
         let next = pieces.get(index + 1).copied().unwrap_or("");
+        if word_gap[index] && operand_before && token.starts_with(|c: char| c.is_alphanumeric() || c == '_') {
+            out.push(' ');
+        }
         match token {
             "abs" if next == "(" => {
                 out.push('|');
@@ -293,6 +306,7 @@ mod tests {
             ("cd*q'*abs(q')", "cd·q′·|q′|"),
             ("delay(x, tau_f)", "delay(x, τ_f)"),
             ("x^n", "x^n"),
+            ("hub torque 2", "hub torque 2"),
             ("", ""),
         ] {
             assert_eq!(text(source), shown, "{source}");

@@ -154,23 +154,46 @@ pub fn unit(text: &str) -> String {
                 }
             }
             '*' => out.push('·'),
-            ' ' => out.push('\u{a0}'),
             other => out.push(other),
         }
     }
     out
 }
 
-/// A value followed by its unit, with a no-break space; the value alone for an empty unit.
+/// Joins by no-break spaces what must stay on one line: a value and its `±`, a number and its `%` or unit
+/// symbol after it. For running text on the page; the text in `report.json` keeps plain spaces.
+pub fn tie(text: &str) -> String {
+    let mut out = String::with_capacity(text.len());
+    let mut rest = text;
+    while let Some(at) = rest.find(' ') {
+        let (before, after) = (&rest[..at], &rest[at + 1..]);
+        let signs = ['±', '%', '×', '=', '<', '>'];
+        let tight = after.starts_with(signs) || before.ends_with(['±', '×', '=', '<', '>']);
+        // A number and the unit that follows it, not the word that does.
+        let word = after.split([' ', ';', ',', '.']).next().unwrap_or("");
+        let measured = before.ends_with(|c: char| c.is_ascii_digit()) && word.chars().count() <= 2;
+        out.push_str(before);
+        out.push(if tight || (measured && !matches!(word, "to" | "in" | "of" | "or")) {
+            '\u{a0}'
+        } else {
+            ' '
+        });
+        rest = after;
+    }
+    out.push_str(rest);
+    out
+}
+
+/// A value followed by its unit, the value alone for an empty unit.
 pub fn with_unit(value: &str, unit_text: &str) -> String {
     let unit_text = unit(unit_text);
     if unit_text.is_empty() || unit_text == "1" {
         return value.to_owned();
     }
     if value.contains('±') && !value.contains("× 10") {
-        return format!("({value})\u{a0}{unit_text}");
+        return format!("({value}) {unit_text}");
     }
-    format!("{value}\u{a0}{unit_text}")
+    format!("{value} {unit_text}")
 }
 
 /// A snake_case kind as words: `coulomb_friction` → `Coulomb friction`, `dead_zone` → `Dead zone`.
@@ -290,11 +313,15 @@ mod tests {
 
     #[test]
     fn units_and_kinds() {
-        assert_eq!(unit("kg m^2"), "kg\u{a0}m²");
+        assert_eq!(unit("kg m^2"), "kg m²");
         assert_eq!(unit("N*m*s^-1"), "N·m·s⁻¹");
         assert_eq!(unit("x^y"), "x^y");
-        assert_eq!(with_unit("0.115 ± 0.004", "N m"), "(0.115 ± 0.004)\u{a0}N\u{a0}m");
+        assert_eq!(with_unit("0.115 ± 0.004", "N m"), "(0.115 ± 0.004) N m");
         assert_eq!(with_unit("2", ""), "2");
+        assert_eq!(
+            tie("fc = 0.1 ± 0.2 N m; from 28 % to 3"),
+            "fc\u{a0}=\u{a0}0.1\u{a0}±\u{a0}0.2\u{a0}N m; from 28\u{a0}% to 3"
+        );
         assert_eq!(kind("coulomb_friction"), "Coulomb friction");
         assert_eq!(kind("bouc_wen_hysteresis"), "Bouc–Wen hysteresis");
         assert_eq!(kind("dead_zone"), "Dead zone");

@@ -300,6 +300,9 @@ impl View {
         let report = &page.report;
         let mut sentences =
             if report.summary.is_empty() { sentence::summary(report) } else { report.summary.clone() };
+        for text in &mut sentences {
+            *text = format::tie(text);
+        }
         let headline = if sentences.is_empty() { String::new() } else { sentences.remove(0) };
         let (verdict, verdict_class) = match report.verdict {
             Verdict::Consistent => ("The model agrees with the data", "consistent"),
@@ -601,7 +604,7 @@ fn recording_view(page: &Page, recording: &Recording, index: usize, island: &mut
             kind: "time",
             axis,
             sync: sync.clone(),
-            height: 150,
+            height: 170,
             x: "time in s",
             series: vec![line],
             bands: Vec::new(),
@@ -1023,25 +1026,31 @@ fn model_view(nominal: &str, improved: &str) -> Option<ModelView> {
     Some(ModelView { lines, added, removed })
 }
 
-/// Removed lines, then added lines; an added line that stands for a removed one marks its new tokens.
+/// The lines of one change. An added line that stands for a removed one (the same key before the `=`)
+/// follows it directly, with its new tokens marked; all other lines keep their order.
 fn push_hunk(hunk: &[Edit<&str>], lines: &mut Vec<DiffLine>) {
-    let removed: Vec<&str> =
-        hunk.iter().filter_map(|e| if let Edit::Removed(t) = e { Some(*t) } else { None }).collect();
-    let added: Vec<&str> =
-        hunk.iter().filter_map(|e| if let Edit::Added(t) = e { Some(*t) } else { None }).collect();
-    for text in &removed {
-        lines.push(DiffLine { class: "removed", mark: "−", html: escape(text) });
-    }
-    for text in &added {
-        // The line it stands for begins with the same key.
-        let key = |line: &str| line.split('=').next().map(|key| key.trim().to_owned());
-        let old = removed.iter().find(|old| text.contains('=') && key(old) == key(text));
-        let html = match old {
-            Some(old) => marked_tokens(old, text),
+    let removed: Vec<&str> = hunk
+        .iter()
+        .filter_map(|edit| if let Edit::Removed(text) = edit { Some(*text) } else { None })
+        .collect();
+    let key = |line: &str| line.split_once('=').map(|(key, _)| key.trim().to_owned());
+    let mut shown = 0;
+    let minus = |text: &str| DiffLine { class: "removed", mark: "−", html: escape(text) };
+    for edit in hunk {
+        let Edit::Added(text) = edit else { continue };
+        let own = key(text);
+        let twin = removed[shown..].iter().position(|old| own.is_some() && key(old) == own);
+        let html = match twin {
+            Some(offset) => {
+                lines.extend(removed[shown..=shown + offset].iter().map(|old| minus(old)));
+                shown += offset + 1;
+                marked_tokens(removed[shown - 1], text)
+            }
             None => escape(text),
         };
         lines.push(DiffLine { class: "added", mark: "+", html });
     }
+    lines.extend(removed[shown..].iter().map(|old| minus(old)));
 }
 
 fn marked_tokens(old: &str, new: &str) -> String {

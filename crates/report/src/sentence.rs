@@ -113,7 +113,7 @@ pub fn mechanism_sentence(mechanism: &Mechanism) -> String {
         .map(|(name, estimate)| {
             let value = format::with_interval(estimate.value, estimate.ci95);
             let unit = format::unit(&estimate.unit);
-            let space = if unit.is_empty() { "" } else { "\u{a0}" };
+            let space = if unit.is_empty() { "" } else { " " };
             format!("{} = {value}{space}{unit}", expression::text(name))
         })
         .collect();

@@ -50,10 +50,10 @@ alpha = { unit = "rad" }
 [parameters]
 J  = { value = 0.00218, unit = "kg m^2", std = 0.00002 }
 B  = { value = 0.0121,  unit = "N m s" }
-ks = { value = 1.302,   unit = "N m", std = 0.004 }
+ks = { value = 1.302,  unit = "N m", std = 0.004 }
 Jl = { value = 0.00381, unit = "kg m^2", std = 0.00002 }
 Bl = { value = 0.0030,  unit = "N m s" }
-kt = { value = 0.065,   unit = "N m/V", fixed = true }
+kt = { value = 0.065,  unit = "N m/V", fixed = true }
 # found by greybox: explains 94 % of the residual, confidence 98 %
 fc = { value = 0.0652,  unit = "N m", std = 0.0009 }
 
@@ -224,8 +224,9 @@ fn residual(run: &Run, state: usize, windows: &[Interval]) -> Residual {
     let (before, after) = (minus(&channel.calibrated), minus(&channel.improved));
     let noise_density = NOISE[state] * (2.0 * STEP).sqrt();
     let frequencies: Vec<f64> = (0..400).map(|i| i as f64 / (2048.0 * STEP)).collect();
-    // The map shows the equation residual: what the hub lacks, largest where the hub hardly moves.
-    let lacking = |x: &[f64; 4]| (0.065 * (x[2] / 0.01).tanh() - 0.027 * x[2]).abs();
+    // The map shows what the hub equation lacks beyond the calibrated viscous term, which has taken over
+    // at speed.
+    let lacking = |x: &[f64; 4]| 0.065 * (-(x[2] / 2.2).powi(2)).exp() + 0.004;
     Residual {
         recording: run.recording.name.clone(),
         channel: channel.name.clone(),
