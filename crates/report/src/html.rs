@@ -156,6 +156,8 @@ struct View {
     shares: Vec<ShareView>,
     fit: Vec<FitGroup>,
     fit_recordings: Vec<FitGroup>,
+    improved_known: bool,
+    fit_columns: usize,
     window: Option<String>,
     holdout_source: String,
     recordings: Vec<RecordingView>,
@@ -333,6 +335,8 @@ impl View {
             .flatten()
             .collect(),
             fit_recordings: fit_by_recording(&report.fit.recordings, page),
+            improved_known: improved_known(page),
+            fit_columns: if improved_known(page) { 5 } else { 4 },
             window: report.fit.window_s.map(format::plain),
             holdout_source: report.fit.holdout_source.clone(),
             recordings,
@@ -507,6 +511,12 @@ fn unit_of<'a>(page: &'a Page, channel: &str) -> &'a str {
     channels.find(|known| known.name == channel).map_or("", |known| known.unit.as_str())
 }
 
+/// Whether there is an improved model at all; without one its column is left out.
+fn improved_known(page: &Page) -> bool {
+    let fit = &page.report.fit;
+    !fit.train.improved.is_empty() || !fit.holdout.improved.is_empty()
+}
+
 fn fit_group(title: &str, set: &FitSet, page: &Page, suffix: Option<&str>) -> Option<FitGroup> {
     if set.is_empty() {
         return None;
@@ -518,7 +528,11 @@ fn fit_group(title: &str, set: &FitSet, page: &Page, suffix: Option<&str>) -> Op
 
 fn fit_row(channel: &str, set: &FitSet, page: &Page) -> FitRow {
     let unit = unit_of(page, channel);
-    let models = [("nominal", &set.nominal), ("calibrated", &set.calibrated), ("improved", &set.improved)];
+    let mut models =
+        vec![("nominal", &set.nominal), ("calibrated", &set.calibrated), ("improved", &set.improved)];
+    if !improved_known(page) {
+        models.pop();
+    }
     let largest = models
         .iter()
         .filter_map(|(_, scores)| scores.get(channel))
@@ -675,7 +689,7 @@ fn scores_note(page: &Page, file: &str, role: Role, channel: &str) -> String {
                 Some(format!("{name} {}", format::percent_short(scores.get(channel)?.nrmse)))
             })
             .collect();
-    if parts.is_empty() { String::new() } else { format!("error: {}", parts.join(", ")) }
+    if parts.is_empty() { String::new() } else { format::tie(&format!("error: {}", parts.join(", "))) }
 }
 
 fn time_alt(recording: &Recording, channel: &Channel, lines: &[SeriesData], note: &str) -> String {
@@ -733,7 +747,7 @@ fn residual_view(page: &Page, residual: &Residual, island: &mut Island) -> Resid
     let time = PlotView {
         index: island_time(island, &residual.t, &buckets, sync, time_lines, bands, sigma),
         title_html: "Over time".to_owned(),
-        note: note_parts.join(" · "),
+        note: format::tie(&note_parts.join(" · ")),
         alt,
     };
     let map_svg = residual.map.as_ref().and_then(|map| {

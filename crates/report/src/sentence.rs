@@ -31,7 +31,11 @@ pub fn summary(report: &Report) -> Vec<String> {
                  makes up {share} of the residual."
             ));
             out.extend(
-                report.remainder.experiment.as_deref().map(|e| format!("To find out what it is: {e}")),
+                report
+                    .remainder
+                    .experiment
+                    .as_deref()
+                    .map(|e| format!("To find out what it is: {}.", e.trim_end_matches('.'))),
             );
         }
         Verdict::MissingPhysics => missing(report, &mut out),
@@ -71,12 +75,13 @@ fn missing(report: &Report, out: &mut Vec<String>) {
         out.push(sentence);
     }
     if let (false, Some(change)) = (single, change) {
+        let all = match report.mechanisms.len() {
+            2 => "both".to_owned(),
+            n => format!("all {n}"),
+        };
         out.push(format!(
-            "With all {} mechanisms the held-out error{} falls from {} to {}.",
-            report.mechanisms.len(),
-            change.of,
-            change.from,
-            change.to
+            "With {all} mechanisms the held-out error{} falls from {} to {}.",
+            change.of, change.from, change.to
         ));
     }
     for mechanism in &report.mechanisms {

@@ -2,6 +2,8 @@
 //!
 //! Needs Chromium in the path or in `CHROMIUM`. Without it the test says so and passes, except where `CI` is
 //! set: there it fails.
+#![allow(clippy::unwrap_used, reason = "helpers of tests panic like the tests themselves")]
+#![allow(clippy::print_stdout, reason = "a skipped test says so")]
 
 use std::path::{Path, PathBuf};
 use std::process::Command;

@@ -1,4 +1,5 @@
 //! `report.json` against its schema, and the schema against its checked-in copy.
+#![allow(clippy::unwrap_used, reason = "helpers of tests panic like the tests themselves")]
 
 use std::path::Path;
 

@@ -1,4 +1,5 @@
 //! The structure of the page, its size, and that nothing in it can escape from its place.
+#![allow(clippy::unwrap_used, reason = "helpers of tests panic like the tests themselves")]
 
 use greybox_report::Page;
 use greybox_report::contract::{Finding, Severity, Verdict};
@@ -52,7 +53,7 @@ fn the_page_says_what_a_reader_must_know() {
         "0.0634 … 0.0670",
         "a slow sweep of v through zero velocity",
         "Little power above 6 Hz",
-        "<mark> + fc*sign(theta&#39;)</mark>",
+        "<mark>+ fc*sign(theta&#39;) </mark>",
         "kg m²",
         "held fixed",
     ] {
@@ -243,6 +244,21 @@ fn an_empty_page_is_a_page() {
         assert!(html.contains("Nothing to remark"));
         assert_eq!(island(&html)["plots"].as_array().unwrap().len(), 0);
     }
+}
+
+#[test]
+fn without_an_improved_model_its_column_is_left_out() {
+    let mut page = sample::page();
+    page.report.verdict = Verdict::Consistent;
+    page.report.mechanisms.clear();
+    page.report.fit.train.improved.clear();
+    page.report.fit.holdout.improved.clear();
+    page.models.improved.clear();
+    let html = page.to_html().unwrap();
+    assert!(!html.contains(">Improved"));
+    assert!(html.contains("The equations stay as they are."));
+    let header = html.split("<table class=\"fit\">").nth(1).unwrap().split("</thead>").next().unwrap();
+    assert_eq!(header.matches("<th ").count(), 4);
 }
 
 #[test]
