@@ -12,7 +12,7 @@ use std::process::Command;
 mod sample;
 
 fn chromium() -> Option<PathBuf> {
-    if let Some(path) = std::env::var_os("CHROMIUM") {
+    if let Some(path) = std::env::var_os("CHROMIUM").filter(|path| !path.is_empty()) {
         return Some(PathBuf::from(path));
     }
     let path = std::env::var_os("PATH")?;
@@ -24,7 +24,7 @@ fn chromium() -> Option<PathBuf> {
 /// The document after its scripts have run, or `None` without a browser.
 fn dom(html: &str) -> Option<String> {
     let Some(browser) = chromium() else {
-        let ci = std::env::var_os("CI").is_some_and(|value| !value.is_empty());
+        let ci = std::env::var_os("CI").is_some_and(|value| value == "true" || value == "1");
         assert!(!ci, "no Chromium in the path or in CHROMIUM, and CI must not skip this test");
         println!("skipped: no Chromium in the path or in CHROMIUM");
         return None;
