@@ -7,7 +7,7 @@
 //! - [`contract`]: the types of `report.json` and its JSON schema
 //! - [`page`]: what the page shows beside it; [`Page::to_html`] writes the file
 //! - [`sentence`]: the conclusion in plain language, to fill [`Report::summary`]
-//! - [`format`], [`expression`], [`decimate`], [`diff`], [`svg`]: the pure functions underneath
+//! - [`mod@format`], [`expression`], [`decimate`], [`diff`], [`svg`]: the pure functions underneath
 //!
 //! ```
 //! use greybox_report::{Report, sentence};
