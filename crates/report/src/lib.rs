@@ -1,1 +1,53 @@
-//! Reports of a diagnosis: JSON by contract, improved model, self-contained HTML.
+//! Reports of a diagnosis: JSON by contract and a self-contained HTML page.
+//!
+//! This crate turns a finished diagnosis into files and **decides nothing**: every number and every word of
+//! the verdict comes in as plain data. [`Report`] is `report.json`; [`Page`] adds the signals and curves
+//! that only the page shows.
+//!
+//! - [`contract`]: the types of `report.json` and its JSON schema
+//! - [`page`]: what the page shows beside it; [`Page::to_html`] writes the file
+//! - [`sentence`]: the conclusion in plain language, to fill [`Report::summary`]
+//! - [`mod@format`], [`expression`], [`decimate`], [`diff`], [`svg`]: the pure functions underneath
+//!
+//! ```
+//! use greybox_report::{Report, sentence};
+//!
+//! let json = r#"{
+//!   "verdict": "consistent", "mechanisms": [],
+//!   "remainder": {"significant": false, "location": {}, "share_of_residual": 0.01},
+//!   "parameters": {}, "noise_floor": {"theta": 0.015},
+//!   "fit": {"train":   {"nominal": {}, "calibrated": {}, "improved": {}},
+//!           "holdout": {"nominal":    {"theta": {"nrmse": 0.31}},
+//!                       "calibrated": {"theta": {"nrmse": 0.016}}, "improved": {}}}
+//! }"#;
+//! let report = Report::from_json(json)?;
+//! assert_eq!(sentence::summary(&report)[1], "Calibration changes the held-out error from 31 % to 1.6 %.");
+//! # Ok::<(), greybox_report::ReportError>(())
+//! ```
+//!
+//! It depends on no other greybox crate, reads no file and prints nothing.
+
+pub mod contract;
+pub mod decimate;
+pub mod diff;
+pub mod expression;
+pub mod format;
+mod html;
+pub mod page;
+pub mod sentence;
+pub mod svg;
+
+pub use contract::Report;
+pub use page::Page;
+
+/// Why a report could not be written or read.
+#[derive(Debug, thiserror::Error)]
+#[non_exhaustive]
+pub enum ReportError {
+    /// The JSON text is malformed or misses a promised key; the source names line and column.
+    #[error("report.json: {0}")]
+    Json(#[from] serde_json::Error),
+    /// The page could not be rendered.
+    #[error("report.html: {0}")]
+    Html(#[from] askama::Error),
+}

@@ -1,0 +1,1113 @@
+//! The self-contained HTML page.
+//!
+//! One file that loads nothing: style, script, data and uPlot stand inside, and a content security policy
+//! forbids every connection. Numbers and words stand in the page itself as tables and sentences; the script
+//! only draws. Text from a file reaches the page in three ways, each escaped: through the template (escaped
+//! by askama), through [`crate::expression::escape`], and as JSON in the data island, where `<`, `>` and `&`
+//! are written as `\u00XX` so that nothing in it can close the element.
+
+use std::fmt::Write as _;
+
+use askama::Template;
+use serde::Serialize;
+
+use crate::contract::{
+    FitSet, Interval, Location, Mechanism, Names, Ordered, RecordingFit, Score, Severity, Verdict,
+};
+use crate::decimate::{Buckets, MAX_POINTS, round_to_range};
+use crate::diff::{Edit, diff};
+use crate::expression::{self, escape};
+use crate::page::{Channel, MechanismPlot, Page, Recording, Residual, Role};
+use crate::{ReportError, format, sentence, svg};
+
+const UPLOT_JS: &str = include_str!("../assets/uPlot.iife.min.js");
+const UPLOT_CSS: &str = include_str!("../assets/uPlot.min.css");
+const UPLOT_LICENSE: &str = include_str!("../assets/uPlot.LICENSE");
+const STYLE: &str = include_str!("../assets/report.css");
+const SCRIPT: &str = include_str!("../assets/report.js");
+
+/// Most points of a spectrum, on a logarithmic axis.
+const MAX_SPECTRUM_POINTS: usize = 800;
+
+impl Page {
+    /// Renders the page.
+    ///
+    /// # Errors
+    /// [`ReportError::Html`] or [`ReportError::Json`] if a writer fails; no content leads to that.
+    pub fn to_html(&self) -> Result<String, ReportError> {
+        let mut island = Island::default();
+        let view = View::new(self, &mut island);
+        let data = island.to_json()?;
+        let template = ReportTemplate {
+            view: &view,
+            uplot_css: UPLOT_CSS,
+            style: STYLE,
+            uplot_license: UPLOT_LICENSE,
+            uplot_js: UPLOT_JS,
+            script: SCRIPT,
+            data: &data,
+        };
+        Ok(template.render()?)
+    }
+}
+
+#[derive(Template)]
+#[template(path = "report.html")]
+struct ReportTemplate<'a> {
+    view: &'a View,
+    uplot_css: &'a str,
+    style: &'a str,
+    uplot_license: &'a str,
+    uplot_js: &'a str,
+    script: &'a str,
+    data: &'a str,
+}
+
+// ---------------------------------------------------------------------------------------------------------
+// Data island
+
+/// What the script draws.
+#[derive(Serialize, Default)]
+struct Island {
+    axes: Vec<Vec<Option<f64>>>,
+    plots: Vec<PlotData>,
+}
+
+#[derive(Serialize)]
+struct PlotData {
+    kind: &'static str,
+    axis: usize,
+    sync: String,
+    height: u32,
+    x: &'static str,
+    series: Vec<SeriesData>,
+    bands: Vec<[f64; 2]>,
+    sigma: Option<f64>,
+    split: Option<f64>,
+}
+
+#[derive(Serialize)]
+struct SeriesData {
+    label: String,
+    role: &'static str,
+    data: Vec<Option<f64>>,
+}
+
+impl Island {
+    fn axis(&mut self, mut x: Vec<f64>) -> usize {
+        round_to_range(&mut x, 6);
+        let x = optional(x);
+        // Residuals are mostly on the time axis of a recording that is already there.
+        if let Some(index) = self.axes.iter().position(|known| *known == x) {
+            return index;
+        }
+        self.axes.push(x);
+        self.axes.len() - 1
+    }
+
+    fn push(&mut self, plot: PlotData) -> usize {
+        self.plots.push(plot);
+        self.plots.len() - 1
+    }
+
+    fn to_json(&self) -> Result<String, ReportError> {
+        Ok(island_text(&serde_json::to_string(self)?))
+    }
+}
+
+/// JSON for a `<script type="application/json">` element: no character that HTML gives a meaning to.
+fn island_text(json: &str) -> String {
+    let mut out = String::with_capacity(json.len());
+    for c in json.chars() {
+        match c {
+            '<' | '>' | '&' | '\u{2028}' | '\u{2029}' => {
+                let _ = write!(out, "\\u{:04x}", c as u32);
+            }
+            other => out.push(other),
+        }
+    }
+    out
+}
+
+fn optional(values: Vec<f64>) -> Vec<Option<f64>> {
+    values.into_iter().map(|value| value.is_finite().then_some(value)).collect()
+}
+
+fn series(label: &str, role: &'static str, buckets: &Buckets, values: &[f64]) -> Option<SeriesData> {
+    if !values.iter().any(|value| value.is_finite()) {
+        return None;
+    }
+    let mut thinned = buckets.values(values);
+    round_to_range(&mut thinned, 5);
+    Some(SeriesData { label: label.to_owned(), role, data: optional(thinned) })
+}
+
+// ---------------------------------------------------------------------------------------------------------
+// View: what the template prints. Fields named `…_html` hold HTML made here from escaped parts.
+
+struct View {
+    title: String,
+    verdict: &'static str,
+    verdict_class: &'static str,
+    headline: String,
+    sentences: Vec<String>,
+    meta: Vec<(&'static str, String)>,
+    equations: Vec<EquationView>,
+    shares: Vec<ShareView>,
+    fit: Vec<FitGroup>,
+    fit_recordings: Vec<FitGroup>,
+    improved_known: bool,
+    fit_columns: usize,
+    window: Option<String>,
+    holdout_source: String,
+    recordings: Vec<RecordingView>,
+    residuals: Vec<ResidualView>,
+    mechanisms: Vec<MechanismView>,
+    remainder: RemainderView,
+    parameters: Vec<ParameterView>,
+    calibrated_known: bool,
+    model: Option<ModelView>,
+    nominal_text: String,
+    findings: Vec<FindingView>,
+    inputs: Vec<[String; 3]>,
+    thinned: bool,
+    version: String,
+    seed: u64,
+}
+
+struct EquationView {
+    name: String,
+    html: String,
+}
+
+struct ShareView {
+    label: String,
+    text: String,
+    width: String,
+    class: String,
+}
+
+struct FitGroup {
+    title: String,
+    rows: Vec<FitRow>,
+}
+
+struct FitRow {
+    channel: String,
+    cells: Vec<FitCell>,
+    floor: String,
+}
+
+struct FitCell {
+    model: &'static str,
+    text: String,
+    detail: String,
+    windowed: String,
+    bar: String,
+}
+
+struct RecordingView {
+    name: String,
+    role: &'static str,
+    role_class: &'static str,
+    note: String,
+    plots: Vec<PlotView>,
+}
+
+struct PlotView {
+    index: usize,
+    title_html: String,
+    note: String,
+    alt: String,
+}
+
+struct ResidualView {
+    title_html: String,
+    note: String,
+    time: PlotView,
+    map_svg: Option<String>,
+    spectrum: Option<PlotView>,
+}
+
+struct MechanismView {
+    title: String,
+    place: String,
+    expression_html: String,
+    states_html: Vec<String>,
+    share: String,
+    confidence: String,
+    parameters: Vec<[String; 4]>,
+    location: Vec<(&'static str, String)>,
+    alternatives: Vec<AlternativeView>,
+    plots: Vec<LawView>,
+}
+
+struct AlternativeView {
+    title: String,
+    expression_html: String,
+    confidence: String,
+    equivalent: bool,
+    separate: String,
+}
+
+struct LawView {
+    title: String,
+    svg: String,
+    note: String,
+    dots: bool,
+    law: bool,
+}
+
+struct RemainderView {
+    significant: bool,
+    text: String,
+    experiment: Option<String>,
+    plots: Vec<LawView>,
+}
+
+struct ParameterView {
+    name_html: String,
+    code: String,
+    unit: String,
+    nominal: String,
+    calibrated: String,
+    value: String,
+    change: String,
+    fixed: bool,
+}
+
+struct ModelView {
+    lines: Vec<DiffLine>,
+    added: usize,
+    removed: usize,
+}
+
+struct DiffLine {
+    class: &'static str,
+    mark: &'static str,
+    html: String,
+}
+
+struct FindingView {
+    severity: &'static str,
+    class: &'static str,
+    code: String,
+    place: String,
+    message: String,
+    mend: Option<String>,
+}
+
+impl View {
+    fn new(page: &Page, island: &mut Island) -> Self {
+        let report = &page.report;
+        let mut sentences =
+            if report.summary.is_empty() { sentence::summary(report) } else { report.summary.clone() };
+        for text in &mut sentences {
+            *text = format::tie(text);
+        }
+        let headline = if sentences.is_empty() { String::new() } else { sentences.remove(0) };
+        let (verdict, verdict_class) = match report.verdict {
+            Verdict::Consistent => ("The model agrees with the data", "consistent"),
+            Verdict::MissingPhysics => ("Physics is missing", "missing"),
+            Verdict::Unexplained => ("Something is missing, unexplained", "unexplained"),
+        };
+        let recordings: Vec<RecordingView> = page
+            .recordings
+            .iter()
+            .enumerate()
+            .map(|(index, recording)| recording_view(page, recording, index, island))
+            .collect();
+        let residuals = page.residuals.iter().map(|residual| residual_view(page, residual, island)).collect();
+        View {
+            title: page.title.clone(),
+            verdict,
+            verdict_class,
+            headline,
+            sentences,
+            meta: meta(page),
+            equations: equations(page),
+            shares: shares(page),
+            fit: [
+                fit_group("Held-out data", &report.fit.holdout, page, None),
+                fit_group("Training data", &report.fit.train, page, None),
+            ]
+            .into_iter()
+            .flatten()
+            .collect(),
+            fit_recordings: fit_by_recording(&report.fit.recordings, page),
+            improved_known: improved_known(page),
+            fit_columns: if improved_known(page) { 5 } else { 4 },
+            window: report.fit.window_s.map(format::plain),
+            holdout_source: report.fit.holdout_source.clone(),
+            recordings,
+            residuals,
+            mechanisms: report
+                .mechanisms
+                .iter()
+                .enumerate()
+                .map(|(index, mechanism)| mechanism_view(page, index, mechanism))
+                .collect(),
+            remainder: remainder_view(page),
+            parameters: parameters(page),
+            calibrated_known: report.parameters.values().any(|parameter| parameter.calibrated.is_some()),
+            model: model_view(&page.models.nominal, &page.models.improved),
+            nominal_text: page.models.nominal.clone(),
+            findings: findings(page),
+            inputs: report
+                .inputs
+                .iter()
+                .map(|(name, hold)| {
+                    [name.clone(), hold.hold_given.replace('_', " "), hold.hold_best.replace('_', " ")]
+                })
+                .collect(),
+            thinned: page.recordings.iter().any(|recording| recording.t.len() > MAX_POINTS),
+            version: report.greybox.version.clone(),
+            seed: report.greybox.seed,
+        }
+    }
+}
+
+fn meta(page: &Page) -> Vec<(&'static str, String)> {
+    let mut out = Vec::new();
+    let model = &page.report.model;
+    match (model.name.is_empty(), model.file.is_empty()) {
+        (false, false) => out.push(("Model", format!("{} ({})", model.name, model.file))),
+        (false, true) => out.push(("Model", model.name.clone())),
+        (true, false) => out.push(("Model", model.file.clone())),
+        (true, true) => {}
+    }
+    for (role, title) in [(Role::Train, "Trained on"), (Role::Holdout, "Held out")] {
+        let names: Vec<&str> =
+            page.recordings.iter().filter(|r| r.role == role).map(|r| r.name.as_str()).collect();
+        if !names.is_empty() {
+            out.push((title, names.join(", ")));
+        } else if role == Role::Holdout && !page.report.fit.holdout_source.is_empty() {
+            out.push((title, page.report.fit.holdout_source.clone()));
+        }
+    }
+    out
+}
+
+// -- equations --------------------------------------------------------------------------------------------
+
+/// The equations that changed, new terms marked. A model text that is not TOML gives none: the diff below
+/// still shows it.
+fn equations(page: &Page) -> Vec<EquationView> {
+    let before = equation_texts(&page.models.nominal);
+    let after = equation_texts(&page.models.improved);
+    let mut out = Vec::new();
+    for (name, new) in &after {
+        let old = before.iter().find(|(known, _)| known == name).map_or("", |(_, text)| text);
+        if old != new {
+            out.push(EquationView { name: name.clone(), html: marked_equation(old, new) });
+        }
+    }
+    out
+}
+
+fn equation_texts(model: &str) -> Vec<(String, String)> {
+    let Ok(table) = model.parse::<toml::Table>() else { return Vec::new() };
+    let Some(equations) = table.get("equations").and_then(toml::Value::as_table) else { return Vec::new() };
+    equations.iter().filter_map(|(name, value)| Some((name.clone(), value.as_str()?.to_owned()))).collect()
+}
+
+/// The new equation in textbook form. Runs of tokens that are not in the old one are marked; a mark is cut
+/// where parentheses would not balance inside it, since every run is prettified on its own.
+fn marked_equation(old: &str, new: &str) -> String {
+    let shown_old = expression::text(old);
+    let shown_new = expression::text(new);
+    if old.is_empty() {
+        return format!("<ins>{}</ins>", expression::html(new));
+    }
+    // Compare the printed forms (blanks no longer matter), character runs by token.
+    let (a, b) = (expression::tokens(&shown_old), expression::tokens(&shown_new));
+    let mut out = String::new();
+    let mut added = String::new();
+    let flush = |added: &mut String, out: &mut String| {
+        if !added.trim().is_empty() {
+            let _ = write!(out, "<ins>{}</ins>", italic(added.trim()));
+            if added.ends_with(' ') {
+                out.push(' ');
+            }
+        } else {
+            out.push_str(added);
+        }
+        added.clear();
+    };
+    for edit in diff(&a, &b) {
+        match edit {
+            Edit::Same(token) => {
+                flush(&mut added, &mut out);
+                out.push_str(&italic(token));
+            }
+            Edit::Added(token) => {
+                if added.is_empty() && token.starts_with(' ') {
+                    out.push(' ');
+                }
+                added.push_str(token);
+            }
+            Edit::Removed(_) => {}
+        }
+    }
+    flush(&mut added, &mut out);
+    out
+}
+
+/// Escapes prettified text and sets its names in italics.
+fn italic(shown: &str) -> String {
+    let mut out = String::new();
+    for token in expression::tokens(shown) {
+        if token.starts_with(char::is_alphabetic) && !FUNCTIONS.contains(&token) {
+            let _ = write!(out, "<var>{}</var>", escape(token));
+        } else {
+            out.push_str(&escape(token));
+        }
+    }
+    out
+}
+
+/// Functions of the model language, set upright.
+const FUNCTIONS: [&str; 15] = [
+    "sin", "cos", "tan", "exp", "ln", "sqrt", "abs", "sign", "tanh", "min", "max", "delay", "deadzone",
+    "saturate", "step",
+];
+
+// -- where the residual comes from ------------------------------------------------------------------------
+
+fn shares(page: &Page) -> Vec<ShareView> {
+    let report = &page.report;
+    if report.verdict != Verdict::MissingPhysics {
+        return Vec::new();
+    }
+    let known = |share: f64| if share.is_finite() { share.clamp(0.0, 1.0) } else { 0.0 };
+    let mut parts: Vec<(String, f64, String)> = report
+        .mechanisms
+        .iter()
+        .enumerate()
+        .map(|(index, m)| {
+            (format::kind(&m.kind), known(m.share_explained), format!("share-{}", index.min(3)))
+        })
+        .collect();
+    let explained: f64 = parts.iter().map(|part| part.1).sum();
+    let rest = known(report.remainder.share_of_residual);
+    parts.push(("Unexplained".to_owned(), rest, "share-rest".to_owned()));
+    let total = (explained + rest).max(1.0);
+    parts
+        .into_iter()
+        .filter(|part| part.1 > 0.0)
+        .map(|(label, share, class)| ShareView {
+            label,
+            text: format::probability(share),
+            width: format!("{:.2}", 100.0 * share / total),
+            class,
+        })
+        .collect()
+}
+
+// -- fit --------------------------------------------------------------------------------------------------
+
+fn unit_of<'a>(page: &'a Page, channel: &str) -> &'a str {
+    let mut channels = page.recordings.iter().flat_map(|recording| &recording.channels);
+    channels.find(|known| known.name == channel).map_or("", |known| known.unit.as_str())
+}
+
+/// Whether there is an improved model at all; without one its column is left out.
+fn improved_known(page: &Page) -> bool {
+    let fit = &page.report.fit;
+    !fit.train.improved.is_empty() || !fit.holdout.improved.is_empty()
+}
+
+fn fit_group(title: &str, set: &FitSet, page: &Page, suffix: Option<&str>) -> Option<FitGroup> {
+    if set.is_empty() {
+        return None;
+    }
+    let rows = set.channels().into_iter().map(|channel| fit_row(channel, set, page)).collect();
+    let title = suffix.map_or_else(|| title.to_owned(), |suffix| format!("{title}, {suffix}"));
+    Some(FitGroup { title, rows })
+}
+
+fn fit_row(channel: &str, set: &FitSet, page: &Page) -> FitRow {
+    let unit = unit_of(page, channel);
+    let mut models =
+        vec![("nominal", &set.nominal), ("calibrated", &set.calibrated), ("improved", &set.improved)];
+    if !improved_known(page) {
+        models.pop();
+    }
+    let largest = models
+        .iter()
+        .filter_map(|(_, scores)| scores.get(channel))
+        .map(|score| score.nrmse)
+        .filter(|nrmse| nrmse.is_finite())
+        .fold(0.0, f64::max);
+    let cells = models.into_iter().map(|(model, scores)| fit_cell(model, scores.get(channel), unit, largest));
+    let floor = page.report.noise_floor.get(channel).copied().unwrap_or(f64::NAN);
+    FitRow { channel: expression::text(channel), cells: cells.collect(), floor: format::percent(floor) }
+}
+
+fn fit_cell(model: &'static str, score: Option<&Score>, unit: &str, largest: f64) -> FitCell {
+    let Some(score) = score else {
+        let text = format::UNKNOWN.to_owned();
+        return FitCell { model, text, detail: String::new(), windowed: String::new(), bar: "0".to_owned() };
+    };
+    let bar = if score.nrmse.is_finite() && largest > 0.0 { 100.0 * score.nrmse / largest } else { 0.0 };
+    let rmse = score.rmse.filter(|rmse| rmse.is_finite());
+    FitCell {
+        model,
+        text: format::percent(score.nrmse),
+        detail: rmse.map(|rmse| format::with_unit(&format::number(rmse), unit)).unwrap_or_default(),
+        windowed: score.nrmse_windowed.map(format::percent).unwrap_or_default(),
+        bar: format!("{bar:.1}"),
+    }
+}
+
+fn fit_by_recording(recordings: &Ordered<RecordingFit>, page: &Page) -> Vec<FitGroup> {
+    let mut out = Vec::new();
+    for (file, fit) in recordings {
+        for (set, suffix) in [(&fit.holdout, "held out"), (&fit.train, "training")] {
+            out.extend(set.as_ref().and_then(|set| fit_group(file, set, page, Some(suffix))));
+        }
+    }
+    out
+}
+
+// -- signals ----------------------------------------------------------------------------------------------
+
+fn recording_view(page: &Page, recording: &Recording, index: usize, island: &mut Island) -> RecordingView {
+    let buckets = Buckets::even(recording.t.len(), MAX_POINTS);
+    let axis = island.axis(buckets.axis(&recording.t));
+    let sync = format!("recording {index}");
+    let mut plots = Vec::new();
+    for channel in &recording.channels {
+        let lines: Vec<SeriesData> = [
+            series("nominal", "nominal", &buckets, &channel.nominal),
+            series("calibrated", "calibrated", &buckets, &channel.calibrated),
+            series("measured", "measured", &buckets, &channel.measured),
+            series("improved", "improved", &buckets, &channel.improved),
+        ]
+        .into_iter()
+        .flatten()
+        .collect();
+        if lines.is_empty() {
+            continue;
+        }
+        let note = scores_note(page, &recording.name, recording.role, &channel.name);
+        let alt = time_alt(recording, channel, &lines, &note);
+        let plot = PlotData {
+            kind: "time",
+            axis,
+            sync: sync.clone(),
+            height: 270,
+            x: "time in s",
+            series: lines,
+            bands: Vec::new(),
+            sigma: None,
+            split: recording.holdout_from.filter(|t| t.is_finite()),
+        };
+        plots.push(PlotView {
+            index: island.push(plot),
+            title_html: quantity_html(&channel.name, &channel.unit),
+            note,
+            alt,
+        });
+    }
+    for input in &recording.inputs {
+        let Some(line) = series(&expression::text(&input.name), "input", &buckets, &input.values) else {
+            continue;
+        };
+        let plot = PlotData {
+            kind: "time",
+            axis,
+            sync: sync.clone(),
+            height: 170,
+            x: "time in s",
+            series: vec![line],
+            bands: Vec::new(),
+            sigma: None,
+            split: None,
+        };
+        let alt = format!(
+            "Input {} of {} over {}{}",
+            expression::text(&input.name),
+            recording.name,
+            span(&recording.t),
+            extent(&input.values, &input.unit)
+        );
+        plots.push(PlotView {
+            index: island.push(plot),
+            title_html: format!("Input {}", quantity_html(&input.name, &input.unit)),
+            note: String::new(),
+            alt,
+        });
+    }
+    let (role, role_class) = match recording.role {
+        Role::Train => ("training", "train"),
+        Role::Holdout => ("held out", "holdout"),
+    };
+    let mut note = format!("{} samples, {}", recording.t.len(), span(&recording.t));
+    if let Some(from) = recording.holdout_from.filter(|t| t.is_finite()) {
+        let _ = write!(note, "; held out from {} s (dashed line)", format::plain(from));
+    }
+    RecordingView { name: recording.name.clone(), role, role_class, note, plots }
+}
+
+/// `θ <small>in rad</small>`
+fn quantity_html(name: &str, unit: &str) -> String {
+    let unit = format::unit(unit);
+    let name = expression::html(name);
+    if unit.is_empty() { name } else { format!("{name} <small>in {}</small>", escape(&unit)) }
+}
+
+fn span(t: &[f64]) -> String {
+    match (t.first(), t.last()) {
+        (Some(first), Some(last)) => format!("{} s", format::plain(last - first)),
+        _ => "no time".to_owned(),
+    }
+}
+
+fn extent(values: &[f64], unit: &str) -> String {
+    let finite = || values.iter().copied().filter(|value| value.is_finite());
+    let (low, high) = (finite().fold(f64::INFINITY, f64::min), finite().fold(f64::NEG_INFINITY, f64::max));
+    if low > high {
+        return String::new();
+    }
+    format!(": {} to {}", format::number(low), format::with_unit(&format::number(high), unit))
+}
+
+/// `error: nominal 31 %, calibrated 22 %, improved 2.0 %` for this channel of this recording.
+fn scores_note(page: &Page, file: &str, role: Role, channel: &str) -> String {
+    let fit = &page.report.fit;
+    let Some(entry) = fit.recordings.get(file) else { return String::new() };
+    let set = match role {
+        Role::Train => entry.train.as_ref(),
+        Role::Holdout => entry.holdout.as_ref(),
+    };
+    let Some(set) = set else { return String::new() };
+    let parts: Vec<String> =
+        [("nominal", &set.nominal), ("calibrated", &set.calibrated), ("improved", &set.improved)]
+            .into_iter()
+            .filter_map(|(name, scores)| {
+                Some(format!("{name} {}", format::percent_short(scores.get(channel)?.nrmse)))
+            })
+            .collect();
+    if parts.is_empty() { String::new() } else { format::tie(&format!("error: {}", parts.join(", "))) }
+}
+
+fn time_alt(recording: &Recording, channel: &Channel, lines: &[SeriesData], note: &str) -> String {
+    let names: Vec<&str> = lines.iter().map(|line| line.label.as_str()).collect();
+    let mut alt = format!(
+        "{} of {} over {}: {}. Measured range{}",
+        expression::text(&channel.name),
+        recording.name,
+        span(&recording.t),
+        sentence::joined(&names, "and"),
+        extent(&channel.measured, &channel.unit)
+    );
+    if !note.is_empty() {
+        let _ = write!(alt, "; {note}");
+    }
+    alt
+}
+
+// -- residual ---------------------------------------------------------------------------------------------
+
+fn residual_view(page: &Page, residual: &Residual, island: &mut Island) -> ResidualView {
+    let buckets = Buckets::even(residual.t.len(), MAX_POINTS);
+    let recording = page.recordings.iter().position(|known| known.name == residual.recording);
+    let sync = match recording {
+        Some(index) => format!("recording {index}"),
+        None => format!("residual {}", island.plots.len()),
+    };
+    let shown = expression::text(&residual.channel);
+    let sigma = Some(residual.noise_sigma).filter(|sigma| sigma.is_finite() && *sigma > 0.0);
+    let bands: Vec<[f64; 2]> = residual
+        .windows
+        .iter()
+        .filter(|window| window.low.is_finite() && window.high.is_finite())
+        .map(|window| [window.low, window.high])
+        .collect();
+    let mut note_parts = Vec::new();
+    if !bands.is_empty() {
+        note_parts.push("shaded: where the mechanism acts".to_owned());
+    }
+    if let Some(sigma) = sigma {
+        let size = format::with_unit(&format::number(2.0 * sigma), &residual.unit);
+        note_parts.push(format!("grey band: ±2σ of the noise, {size}"));
+    }
+    let time_lines = [
+        series("calibrated", "calibrated", &buckets, &residual.before),
+        series("improved", "improved", &buckets, &residual.after),
+    ];
+    let rms_text = |values: &[f64]| format::with_unit(&format::number(rms(values)), &residual.unit);
+    let alt = format!(
+        "Residual of {shown} on {} over time: RMS {} with the calibrated model, {} with the improved one",
+        residual.recording,
+        rms_text(&residual.before),
+        rms_text(&residual.after),
+    );
+    let time = PlotView {
+        index: island_time(island, &residual.t, &buckets, sync, time_lines, bands, sigma),
+        title_html: "Over time".to_owned(),
+        note: format::tie(&note_parts.join(" · ")),
+        alt,
+    };
+    let map_svg = residual.map.as_ref().and_then(|map| {
+        let alt = format!(
+            "Magnitude of the residual of {shown} over {} and {}",
+            expression::label(&map.x_label),
+            expression::label(&map.y_label)
+        );
+        svg::state_map(map, &alt)
+    });
+    let spectrum = residual.spectrum.as_ref().and_then(|spectrum| {
+        let start = spectrum.freq.iter().position(|&f| f > 0.0)?;
+        let freq = &spectrum.freq[start..];
+        let buckets = Buckets::logarithmic(freq, MAX_SPECTRUM_POINTS);
+        let positive = |values: &[f64]| -> Vec<f64> {
+            let tail = values.get(start..).unwrap_or(&[]);
+            tail.iter().map(|&v| if v > 0.0 { v } else { f64::NAN }).collect()
+        };
+        let lines: Vec<SeriesData> = [
+            log_series("noise", "noise", &buckets, &positive(&spectrum.noise)),
+            log_series("calibrated", "calibrated", &buckets, &positive(&spectrum.before)),
+            log_series("improved", "improved", &buckets, &positive(&spectrum.after)),
+        ]
+        .into_iter()
+        .flatten()
+        .collect();
+        if lines.is_empty() {
+            return None;
+        }
+        let axis = island.axis_exact(buckets.axis(freq));
+        let plot = PlotData {
+            kind: "spectrum",
+            axis,
+            sync: format!("spectrum {}", island.plots.len()),
+            height: 300,
+            x: "frequency in Hz",
+            series: lines,
+            bands: Vec::new(),
+            sigma: None,
+            split: None,
+        };
+        let unit = format::unit(&residual.unit);
+        let unit = if unit.is_empty() { "1".to_owned() } else { unit };
+        Some(PlotView {
+            index: island.push(plot),
+            title_html: format!("Over frequency <small>in {}/√Hz</small>", escape(&unit)),
+            note: String::new(),
+            alt: format!("Amplitude spectrum of the residual of {shown} with both models and of the noise"),
+        })
+    });
+    ResidualView {
+        title_html: expression::html(&residual.channel),
+        note: residual.recording.clone(),
+        time,
+        map_svg,
+        spectrum,
+    }
+}
+
+fn island_time(
+    island: &mut Island,
+    t: &[f64],
+    buckets: &Buckets,
+    sync: String,
+    lines: [Option<SeriesData>; 2],
+    bands: Vec<[f64; 2]>,
+    sigma: Option<f64>,
+) -> usize {
+    let axis = island.axis(buckets.axis(t));
+    island.push(PlotData {
+        kind: "time",
+        axis,
+        sync,
+        height: 230,
+        x: "time in s",
+        series: lines.into_iter().flatten().collect(),
+        bands,
+        sigma,
+        split: None,
+    })
+}
+
+impl Island {
+    /// An axis whose values span decades: four significant digits each instead of a share of the range.
+    fn axis_exact(&mut self, x: Vec<f64>) -> usize {
+        self.axes.push(optional(x.into_iter().map(four_digits).collect()));
+        self.axes.len() - 1
+    }
+}
+
+fn log_series(label: &str, role: &'static str, buckets: &Buckets, values: &[f64]) -> Option<SeriesData> {
+    if !values.iter().any(|value| value.is_finite()) {
+        return None;
+    }
+    let thinned = buckets.values(values).into_iter().map(four_digits).collect();
+    Some(SeriesData { label: label.to_owned(), role, data: optional(thinned) })
+}
+
+/// Rounds to five significant digits.
+fn four_digits(value: f64) -> f64 {
+    if value.is_finite() { format!("{value:.4e}").parse().unwrap_or(value) } else { value }
+}
+
+fn rms(values: &[f64]) -> f64 {
+    let (sum, count) = values
+        .iter()
+        .filter(|value| value.is_finite())
+        .fold((0.0, 0usize), |(sum, count), value| (sum + value * value, count + 1));
+    if count == 0 { f64::NAN } else { (sum / count as f64).sqrt() }
+}
+
+// -- mechanisms -------------------------------------------------------------------------------------------
+
+fn mechanism_view(page: &Page, index: usize, mechanism: &Mechanism) -> MechanismView {
+    let place = match &mechanism.channel {
+        Some(channel) => format!("in the measurement of {}", expression::text(channel)),
+        None => sentence::equations(&mechanism.equation).trim_start().to_owned(),
+    };
+    let mut expression_html = expression::html(&mechanism.expression);
+    if let Some(replaced) = &mechanism.replaces {
+        expression_html = format!("{} → {expression_html}", expression::html(replaced));
+    }
+    let parameters = mechanism.parameters.iter().map(|(name, estimate)| {
+        [
+            expression::html(name),
+            format::with_interval(estimate.value, estimate.ci95),
+            format::interval(estimate.ci95),
+            format::unit(&estimate.unit),
+        ]
+    });
+    let alternatives = mechanism.alternatives.iter().map(|alternative| AlternativeView {
+        title: format::kind(&alternative.kind),
+        expression_html: alternative.expression.as_deref().map(expression::html).unwrap_or_default(),
+        confidence: format::probability(alternative.confidence),
+        equivalent: alternative.equivalent,
+        separate: alternative.separate.clone().unwrap_or_default(),
+    });
+    MechanismView {
+        title: format::kind(&mechanism.kind),
+        place,
+        expression_html,
+        states_html: mechanism.states.values().map(|equation| expression::html(equation)).collect(),
+        share: format::probability(mechanism.share_explained),
+        confidence: format::probability(mechanism.confidence),
+        parameters: parameters.collect(),
+        location: location(&mechanism.location, page),
+        alternatives: alternatives.collect(),
+        plots: law_views(page, Some(index)),
+    }
+}
+
+fn law_views(page: &Page, mechanism: Option<usize>) -> Vec<LawView> {
+    page.mechanism_plots.iter().filter(|plot| plot.mechanism == mechanism).filter_map(law_view).collect()
+}
+
+fn law_view(plot: &MechanismPlot) -> Option<LawView> {
+    let law = plot.curve.iter().any(|p| p[0].is_finite() && p[1].is_finite());
+    let dots = plot.points.iter().any(|p| p[0].is_finite() && p[1].is_finite());
+    let alt = format!(
+        "{}: {} over {}{}",
+        plot.title,
+        expression::label(&plot.y_label),
+        expression::label(&plot.x_label),
+        if law { ", points from the data and the fitted law" } else { ", points from the data" }
+    );
+    let drawn = svg::law_plot(plot, &alt)?;
+    let mut note = Vec::new();
+    if drawn.every > 1 {
+        note.push(format!("one point in {} drawn", drawn.every));
+    }
+    if drawn.outside > 0 {
+        note.push(format!("{} of {} points lie outside the frame", drawn.outside, plot.points.len()));
+    }
+    Some(LawView { title: plot.title.clone(), svg: drawn.svg, note: note.join("; "), dots, law })
+}
+
+fn location(location: &Location, page: &Page) -> Vec<(&'static str, String)> {
+    let mut out = Vec::new();
+    let names = location.equation.as_ref().map(Names::as_slice).unwrap_or(&[]);
+    if !names.is_empty() {
+        out.push(("Equation", names.join(", ")));
+    }
+    let when = sentence::region(&location.region);
+    if !when.is_empty() {
+        out.push(("Acts when", sentence::joined(&when, "and")));
+    }
+    if let Some(band) = sentence::band(location.band_hz) {
+        out.push(("Band", band));
+    }
+    for (file, windows) in &location.windows_s {
+        out.push(("Windows", windows_text(file, windows, page)));
+    }
+    out
+}
+
+/// `6 windows in train.csv, 5.2 s of 20 s: 1.2 … 1.9 s, …`
+fn windows_text(file: &str, windows: &[Interval], page: &Page) -> String {
+    let total: f64 = windows.iter().map(|w| w.high - w.low).filter(|length| length.is_finite()).sum();
+    let length = page
+        .recordings
+        .iter()
+        .find(|recording| recording.name == file)
+        .and_then(|recording| Some(recording.t.last()? - recording.t.first()?));
+    let of = length.map(|length| format!(" of {}", format::plain(length))).unwrap_or_default();
+    let noun = if windows.len() == 1 { "window" } else { "windows" };
+    let mut text = format!("{} {noun} in {file}, {}{of} s", windows.len(), format::plain(total));
+    const SHOWN: usize = 6;
+    let listed: Vec<String> = windows
+        .iter()
+        .take(SHOWN)
+        .map(|w| format!("{}–{}", format::plain(w.low), format::plain(w.high)))
+        .collect();
+    if !listed.is_empty() {
+        let more = if windows.len() > SHOWN { ", …" } else { "" };
+        let _ = write!(text, " (at {}{more})", listed.join(", "));
+    }
+    text
+}
+
+fn remainder_view(page: &Page) -> RemainderView {
+    let remainder = &page.report.remainder;
+    let share = format::probability(remainder.share_of_residual);
+    let mut text = if remainder.significant {
+        format!("{share} of the calibrated model's residual is still unexplained: more than noise can do.")
+    } else {
+        format!("{share} of the calibrated model's residual is left: no more than noise can do.")
+    };
+    for (title, value) in location(&remainder.location, page) {
+        let _ = write!(text, " {title}: {value}.");
+    }
+    RemainderView {
+        significant: remainder.significant,
+        text,
+        experiment: remainder.experiment.clone(),
+        plots: law_views(page, None),
+    }
+}
+
+// -- parameters, model, findings --------------------------------------------------------------------------
+
+fn parameters(page: &Page) -> Vec<ParameterView> {
+    let rows = page.report.parameters.iter().map(|(name, parameter)| {
+        let change = parameter.value / parameter.nominal - 1.0;
+        let change = if parameter.fixed {
+            "held fixed".to_owned()
+        } else if !change.is_finite() {
+            format::UNKNOWN.to_owned()
+        } else {
+            let percent = format!("{:+.1} %", 100.0 * change).replace('-', "−");
+            if matches!(percent.as_str(), "+0.0 %" | "−0.0 %") { "0.0 %".to_owned() } else { percent }
+        };
+        ParameterView {
+            name_html: expression::html(name),
+            code: name.clone(),
+            unit: parameter.unit.as_deref().map(format::unit).unwrap_or_default(),
+            nominal: format::number(parameter.nominal),
+            calibrated: match parameter.calibrated {
+                Some(value) => format::with_interval(value, parameter.calibrated_ci95),
+                None => format::UNKNOWN.to_owned(),
+            },
+            value: format::with_interval(parameter.value, parameter.ci95),
+            change,
+            fixed: parameter.fixed,
+        }
+    });
+    rows.collect()
+}
+
+fn model_view(nominal: &str, improved: &str) -> Option<ModelView> {
+    if improved.trim().is_empty() {
+        return None;
+    }
+    let (a, b): (Vec<&str>, Vec<&str>) = (nominal.lines().collect(), improved.lines().collect());
+    let edits = diff(&a, &b);
+    let mut lines = Vec::with_capacity(edits.len());
+    let mut rest = edits.as_slice();
+    while let Some(first) = rest.first() {
+        if let Edit::Same(text) = first {
+            lines.push(DiffLine { class: "same", mark: " ", html: escape(text) });
+            rest = &rest[1..];
+            continue;
+        }
+        let hunk = rest.iter().take_while(|edit| !matches!(edit, Edit::Same(_))).count();
+        let (changed, tail) = rest.split_at(hunk);
+        push_hunk(changed, &mut lines);
+        rest = tail;
+    }
+    let added = edits.iter().filter(|edit| matches!(edit, Edit::Added(_))).count();
+    let removed = edits.iter().filter(|edit| matches!(edit, Edit::Removed(_))).count();
+    Some(ModelView { lines, added, removed })
+}
+
+/// The lines of one change. An added line that stands for a removed one (the same key before the `=`)
+/// follows it directly, with its new tokens marked; all other lines keep their order.
+fn push_hunk(hunk: &[Edit<&str>], lines: &mut Vec<DiffLine>) {
+    let removed: Vec<&str> = hunk
+        .iter()
+        .filter_map(|edit| if let Edit::Removed(text) = edit { Some(*text) } else { None })
+        .collect();
+    let key = |line: &str| line.split_once('=').map(|(key, _)| key.trim().to_owned());
+    let mut shown = 0;
+    let minus = |text: &str| DiffLine { class: "removed", mark: "−", html: escape(text) };
+    for edit in hunk {
+        let Edit::Added(text) = edit else { continue };
+        let own = key(text);
+        let twin = removed[shown..].iter().position(|old| own.is_some() && key(old) == own);
+        let html = match twin {
+            Some(offset) => {
+                lines.extend(removed[shown..=shown + offset].iter().map(|old| minus(old)));
+                shown += offset + 1;
+                marked_tokens(removed[shown - 1], text)
+            }
+            None => escape(text),
+        };
+        lines.push(DiffLine { class: "added", mark: "+", html });
+    }
+    lines.extend(removed[shown..].iter().map(|old| minus(old)));
+}
+
+fn marked_tokens(old: &str, new: &str) -> String {
+    let (a, b) = (expression::tokens(old), expression::tokens(new));
+    let mut out = String::new();
+    let mut marked = false;
+    for edit in diff(&a, &b) {
+        let (token, is_new) = match edit {
+            Edit::Same(token) => (token, false),
+            Edit::Added(token) => (token, true),
+            Edit::Removed(_) => continue,
+        };
+        if is_new != marked {
+            out.push_str(if is_new { "<mark>" } else { "</mark>" });
+            marked = is_new;
+        }
+        out.push_str(&escape(token));
+    }
+    if marked {
+        out.push_str("</mark>");
+    }
+    out
+}
+
+fn findings(page: &Page) -> Vec<FindingView> {
+    let mut sorted: Vec<_> = page.report.findings.iter().collect();
+    sorted.sort_by_key(|finding| std::cmp::Reverse(finding.severity));
+    let view = sorted.into_iter().map(|finding| {
+        let (severity, class) = match finding.severity {
+            Severity::Info => ("note", "info"),
+            Severity::Warning => ("warning", "warning"),
+            Severity::Error => ("error", "error"),
+        };
+        let place: Vec<&str> =
+            finding.recording.as_deref().into_iter().chain(finding.channel.as_deref()).collect();
+        FindingView {
+            severity,
+            class,
+            code: finding.code.replace('_', " "),
+            place: place.join(", "),
+            message: finding.message.clone(),
+            mend: finding.mend.clone(),
+        }
+    });
+    view.collect()
+}

@@ -1,0 +1,259 @@
+//! The conclusion in plain language, worded from the numbers of a [`Report`].
+
+use crate::contract::{FitSet, Interval, Location, Mechanism, Names, Ordered, Report, Verdict};
+use crate::{expression, format};
+
+/// The summary of a report: the headline first, then what a reader must know beside it.
+///
+/// Every number is taken from the report as it is. Meant to fill [`Report::summary`]; the page uses it where
+/// that is empty.
+pub fn summary(report: &Report) -> Vec<String> {
+    let mut out = Vec::new();
+    match report.verdict {
+        Verdict::Consistent => {
+            out.push(
+                "The model agrees with the recordings: once its parameters are calibrated, nothing beyond \
+                 measurement noise is missing."
+                    .to_owned(),
+            );
+            out.extend(error_change(&report.fit.holdout, Baseline::Nominal).map(|change| {
+                format!(
+                    "Calibration changes the held-out error{} from {} to {}.",
+                    change.of, change.from, change.to
+                )
+            }));
+        }
+        Verdict::Unexplained => {
+            let place = place(&report.remainder.location);
+            let share = format::probability(report.remainder.share_of_residual);
+            out.push(format!(
+                "Something is missing from the model{place}, and no mechanism in the library explains it; it \
+                 makes up {share} of the residual."
+            ));
+            out.extend(
+                report
+                    .remainder
+                    .experiment
+                    .as_deref()
+                    .map(|e| format!("To find out what it is: {}.", e.trim_end_matches('.'))),
+            );
+        }
+        Verdict::MissingPhysics => missing(report, &mut out),
+    }
+    if report.verdict != Verdict::Unexplained && report.remainder.significant {
+        out.push(format!(
+            "Something more is missing: {} of the residual is still unexplained{}.",
+            format::probability(report.remainder.share_of_residual),
+            place(&report.remainder.location)
+        ));
+    }
+    for (name, hold) in &report.inputs {
+        if hold.hold_given != hold.hold_best {
+            out.push(format!(
+                "Input {} is stated with hold {}, but the recordings fit {} better.",
+                expression::text(name),
+                hold.hold_given.replace('_', " "),
+                hold.hold_best.replace('_', " ")
+            ));
+        }
+    }
+    out
+}
+
+fn missing(report: &Report, out: &mut Vec<String>) {
+    let change = error_change(&report.fit.holdout, Baseline::Calibrated);
+    let single = report.mechanisms.len() == 1;
+    for mechanism in &report.mechanisms {
+        let mut sentence = mechanism_sentence(mechanism);
+        if let (true, Some(change)) = (single, &change) {
+            sentence.push_str(&format!(
+                "; held-out error{} falls from {} to {}",
+                change.of, change.from, change.to
+            ));
+        }
+        sentence.push('.');
+        out.push(sentence);
+    }
+    if let (false, Some(change)) = (single, change) {
+        let all = match report.mechanisms.len() {
+            2 => "both".to_owned(),
+            n => format!("all {n}"),
+        };
+        out.push(format!(
+            "With {all} mechanisms the held-out error{} falls from {} to {}.",
+            change.of, change.from, change.to
+        ));
+    }
+    for mechanism in &report.mechanisms {
+        let twins: Vec<String> = mechanism
+            .alternatives
+            .iter()
+            .filter(|alternative| alternative.equivalent)
+            .map(|alternative| format::kind_in_sentence(&alternative.kind))
+            .collect();
+        if !twins.is_empty() {
+            out.push(format!(
+                "These recordings cannot separate {} from {}.",
+                format::kind_in_sentence(&mechanism.kind),
+                joined(&twins, "or")
+            ));
+        }
+    }
+}
+
+/// `Coulomb friction is missing in the hub equation; fc = 0.115 ± 0.004 N m; it acts when |θ′| < 0.2`,
+/// without the final full stop.
+pub fn mechanism_sentence(mechanism: &Mechanism) -> String {
+    let mut text = format!("{} is missing", format::kind(&mechanism.kind));
+    match &mechanism.channel {
+        Some(channel) => text.push_str(&format!(" in the measurement of {}", expression::text(channel))),
+        None => text.push_str(&equations(&mechanism.equation)),
+    }
+    if let Some(parameter) = &mechanism.drifting {
+        text.push_str(&format!(" (in {})", expression::text(parameter)));
+    }
+    let values: Vec<String> = mechanism
+        .parameters
+        .iter()
+        .map(|(name, estimate)| {
+            let value = format::with_interval(estimate.value, estimate.ci95);
+            let unit = format::unit(&estimate.unit);
+            let space = if unit.is_empty() { "" } else { " " };
+            format!("{} = {value}{space}{unit}", expression::text(name))
+        })
+        .collect();
+    if !values.is_empty() {
+        text.push_str(&format!("; {}", values.join(", ")));
+    }
+    let when = region(&mechanism.location.region);
+    if !when.is_empty() {
+        text.push_str(&format!("; it acts when {}", joined(&when, "and")));
+    }
+    text
+}
+
+/// ` in the hub equation`, ` in the hub and link equations`, or nothing.
+pub fn equations(names: &Names) -> String {
+    match names.as_slice() {
+        [] => String::new(),
+        [one] => format!(" in the {one} equation"),
+        many => format!(" in the {} equations", joined(many, "and")),
+    }
+}
+
+/// The ranges of a region as conditions: `|θ′| < 0.2`, `x > 0.1`, `−0.1 < v < 0.4`.
+pub fn region(ranges: &Ordered<[Option<f64>; 2]>) -> Vec<String> {
+    let mut out = Vec::new();
+    for (source, &[low, high]) in ranges {
+        let shown = expression::text(source);
+        let (low, high) = (low.filter(|v| v.is_finite()), high.filter(|v| v.is_finite()));
+        match (low, high) {
+            (Some(low), Some(high)) if low < 0.0 && (low + high).abs() <= 0.02 * (high - low) => {
+                out.push(format!("|{shown}| < {}", format::plain(0.5 * (high - low))));
+            }
+            (Some(0.0), Some(high)) if source.starts_with("abs(") => {
+                out.push(format!("{shown} < {}", format::plain(high)));
+            }
+            (Some(low), Some(high)) => {
+                out.push(format!("{} < {shown} < {}", format::plain(low), format::plain(high)));
+            }
+            (Some(low), None) => out.push(format!("{shown} > {}", format::plain(low))),
+            (None, Some(high)) => out.push(format!("{shown} < {}", format::plain(high))),
+            (None, None) => {}
+        }
+    }
+    out
+}
+
+/// A frequency band as text, `0.1 … 2 Hz`, or `None` where unknown.
+pub fn band(band_hz: Option<Interval>) -> Option<String> {
+    let band = band_hz?;
+    match (band.low.is_finite(), band.high.is_finite()) {
+        (true, true) => Some(format!("{} … {} Hz", format::plain(band.low), format::plain(band.high))),
+        (false, true) => Some(format!("below {} Hz", format::plain(band.high))),
+        (true, false) => Some(format!("above {} Hz", format::plain(band.low))),
+        (false, false) => None,
+    }
+}
+
+fn place(location: &Location) -> String {
+    let mut text = location.equation.as_ref().map(equations).unwrap_or_default();
+    let when = region(&location.region);
+    if !when.is_empty() {
+        text.push_str(&format!(", when {}", joined(&when, "and")));
+    }
+    if let Some(band) = band(location.band_hz) {
+        text.push_str(&format!(", at {band}"));
+    }
+    text
+}
+
+#[derive(Clone, Copy, PartialEq)]
+enum Baseline {
+    Nominal,
+    Calibrated,
+}
+
+struct Change {
+    /// ` of θ` where there is more than one channel.
+    of: String,
+    from: String,
+    to: String,
+}
+
+/// The channel whose free-run error changes most, from the baseline to the final model. Without a usable
+/// improved fit the calibrated model is the final one.
+fn error_change(fit: &FitSet, baseline: Baseline) -> Option<Change> {
+    let (before, after) = match baseline {
+        Baseline::Nominal => (&fit.nominal, &fit.calibrated),
+        Baseline::Calibrated => (&fit.calibrated, &fit.improved),
+    };
+    let pairs = before.iter().filter_map(|(channel, from)| {
+        let to = after.get(channel)?;
+        (from.nrmse.is_finite() && to.nrmse.is_finite()).then_some((channel, from.nrmse, to.nrmse))
+    });
+    let best = pairs.max_by(|a, b| (a.1 - a.2).total_cmp(&(b.1 - b.2)))?;
+    if baseline == Baseline::Calibrated && best.2 >= best.1 {
+        return None;
+    }
+    let of = if before.len() > 1 { format!(" of {}", expression::text(best.0)) } else { String::new() };
+    Some(Change { of, from: format::percent_short(best.1), to: format::percent_short(best.2) })
+}
+
+/// `a`, `a and b`, `a, b and c`.
+pub(crate) fn joined<S: AsRef<str>>(items: &[S], last: &str) -> String {
+    match items {
+        [] => String::new(),
+        [one] => one.as_ref().to_owned(),
+        [head @ .., tail] => {
+            let head: Vec<&str> = head.iter().map(AsRef::as_ref).collect();
+            format!("{} {last} {}", head.join(", "), tail.as_ref())
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn regions_read_as_conditions() {
+        let one = |name: &str, range| region(&Ordered::from_iter([(name.to_owned(), range)])).join(";");
+        assert_eq!(one("theta'", [Some(-0.2), Some(0.2)]), "|θ′| < 0.2");
+        assert_eq!(one("x1 - x2", [Some(-1.0), Some(1.0)]), "|x₁ − x₂| < 1");
+        assert_eq!(one("x", [Some(-0.1), Some(0.4)]), "−0.1 < x < 0.4");
+        assert_eq!(one("v", [Some(2.0), None]), "v > 2");
+        assert_eq!(one("abs(v)", [Some(0.0), Some(1.0)]), "|v| < 1");
+        assert_eq!(one("v", [None, Some(f64::INFINITY)]), "");
+    }
+
+    #[test]
+    fn lists_and_equations() {
+        assert_eq!(joined(&["a", "b", "c"], "or"), "a, b or c");
+        assert_eq!(
+            equations(&Names::Many(vec!["hub".into(), "link".into()])),
+            " in the hub and link equations"
+        );
+        assert_eq!(equations(&Names::Many(Vec::new())), "");
+    }
+}

@@ -1,0 +1,383 @@
+//! Drawings that need no script: the residual over the state space and a law against its points.
+//!
+//! Sizes are in SVG user units; the page scales the drawing to its column. Every text is escaped.
+
+use std::fmt::Write as _;
+
+use crate::expression::{escape, label};
+use crate::format;
+use crate::page::{MechanismPlot, StateMap};
+
+const WIDTH: f64 = 520.0;
+const HEIGHT: f64 = 350.0;
+const LEFT: f64 = 66.0;
+const TOP: f64 = 14.0;
+const BOTTOM: f64 = 50.0;
+
+/// Cells of the state-space map, across and upward.
+const CELLS: (usize, usize) = (44, 30);
+/// Colour steps of the map.
+const LEVELS: usize = 16;
+/// Most points drawn in a law plot.
+const MAX_DOTS: usize = 1500;
+
+/// Viridis (Smith & van der Walt 2015) at nine even steps; between them linear in sRGB.
+const VIRIDIS: [[u8; 3]; 9] = [
+    [0x44, 0x01, 0x54],
+    [0x47, 0x2d, 0x7b],
+    [0x3b, 0x52, 0x8b],
+    [0x2c, 0x72, 0x8e],
+    [0x21, 0x91, 0x8c],
+    [0x28, 0xae, 0x80],
+    [0x5e, 0xc9, 0x62],
+    [0xad, 0xdc, 0x30],
+    [0xfd, 0xe7, 0x25],
+];
+
+/// Round values (1, 2 or 5 times a power of ten) that cover [low, high] in about `target` steps.
+///
+/// Returns the ticks inside the range and the number of decimals they need. An empty or not finite range
+/// gives no ticks.
+pub fn nice_ticks(low: f64, high: f64, target: usize) -> (Vec<f64>, usize) {
+    let span = high - low;
+    if !span.is_finite() || span <= 0.0 {
+        return (Vec::new(), 0);
+    }
+    let rough = span / target.max(1) as f64;
+    let power = 10f64.powf(rough.log10().floor());
+    let factor = match rough / power {
+        f if f <= 1.0 + 1e-9 => 1.0,
+        f if f <= 2.0 + 1e-9 => 2.0,
+        f if f <= 5.0 + 1e-9 => 5.0,
+        _ => 10.0,
+    };
+    let step = factor * power;
+    let (first, last) = ((low / step - 1e-9).ceil(), (high / step + 1e-9).floor());
+    let count = (last - first).clamp(-1.0, 1000.0) as i64 + 1;
+    let ticks = (0..count.max(0)).map(|i| (first + i as f64) * step).collect();
+    let decimals = (-step.log10().floor()).clamp(0.0, 12.0) as usize;
+    (ticks, decimals)
+}
+
+fn tick_label(value: f64, decimals: usize) -> String {
+    let zero_free = if value.abs() < 0.5 * 10f64.powi(-(decimals as i32)) { 0.0 } else { value };
+    if decimals > 5 || value.abs() >= 1e6 {
+        return format::significant(zero_free, 2);
+    }
+    format!("{zero_free:.decimals$}").replace('-', "−")
+}
+
+/// The linear map from data to user units of one drawing.
+struct Frame {
+    x: (f64, f64),
+    y: (f64, f64),
+    right: f64,
+}
+
+impl Frame {
+    fn px(&self, x: f64) -> f64 {
+        LEFT + (x - self.x.0) / (self.x.1 - self.x.0) * (self.right - LEFT)
+    }
+
+    fn py(&self, y: f64) -> f64 {
+        HEIGHT - BOTTOM - (y - self.y.0) / (self.y.1 - self.y.0) * (HEIGHT - BOTTOM - TOP)
+    }
+
+    fn contains(&self, x: f64, y: f64) -> bool {
+        x >= self.x.0 && x <= self.x.1 && y >= self.y.0 && y <= self.y.1
+    }
+
+    /// Grid, ticks and axis labels.
+    fn axes(&self, out: &mut String, x_label: &str, y_label: &str) {
+        let base = HEIGHT - BOTTOM;
+        let (ticks, decimals) = nice_ticks(self.x.0, self.x.1, 6);
+        for tick in ticks {
+            let x = self.px(tick);
+            let text = tick_label(tick, decimals);
+            let _ = write!(
+                out,
+                "<path class=\"grid\" d=\"M{x:.1} {TOP}V{base}\"/>\
+                 <text x=\"{x:.1}\" y=\"{:.1}\" text-anchor=\"middle\">{text}</text>",
+                base + 17.0
+            );
+        }
+        let (ticks, decimals) = nice_ticks(self.y.0, self.y.1, 6);
+        for tick in ticks {
+            let y = self.py(tick);
+            let text = tick_label(tick, decimals);
+            let _ = write!(
+                out,
+                "<path class=\"grid\" d=\"M{LEFT} {y:.1}H{:.1}\"/>\
+                 <text x=\"{:.1}\" y=\"{:.1}\" text-anchor=\"end\">{text}</text>",
+                self.right,
+                LEFT - 7.0,
+                y + 4.5
+            );
+        }
+        let _ = write!(
+            out,
+            "<text class=\"axis\" x=\"{:.1}\" y=\"{:.1}\" text-anchor=\"middle\">{}</text>\
+             <text class=\"axis\" transform=\"translate(15 {:.1}) rotate(-90)\" text-anchor=\"middle\">{}</text>",
+            0.5 * (LEFT + self.right),
+            HEIGHT - 10.0,
+            escape(&label(x_label)),
+            0.5 * (TOP + base),
+            escape(&label(y_label)),
+        );
+    }
+
+    fn border(&self, out: &mut String) {
+        let _ = write!(
+            out,
+            "<path class=\"frame\" d=\"M{LEFT} {TOP}H{r:.1}V{b}H{LEFT}Z\"/>",
+            r = self.right,
+            b = HEIGHT - BOTTOM
+        );
+    }
+}
+
+fn open(alt: &str) -> String {
+    format!(
+        "<svg class=\"drawing\" viewBox=\"0 0 {WIDTH} {HEIGHT}\" role=\"img\" aria-label=\"{}\">",
+        escape(alt)
+    )
+}
+
+/// Smallest and largest finite value, widened by `margin` of the range on both sides.
+fn range(values: impl Iterator<Item = f64>, margin: f64) -> Option<(f64, f64)> {
+    let (mut low, mut high) = (f64::INFINITY, f64::NEG_INFINITY);
+    for value in values.filter(|value| value.is_finite()) {
+        low = low.min(value);
+        high = high.max(value);
+    }
+    if low > high {
+        return None;
+    }
+    let span = high - low;
+    let pad = if span > 0.0 { margin * span } else { 0.5 * low.abs().max(1e-12) };
+    let widened = (low - pad, high + pad);
+    (widened.1 - widened.0).is_finite().then_some(widened)
+}
+
+/// The q-quantile of the finite values, 0 ≤ q ≤ 1 (nearest rank).
+fn quantile(values: impl Iterator<Item = f64>, q: f64) -> Option<f64> {
+    let mut sorted: Vec<f64> = values.filter(|value| value.is_finite()).collect();
+    sorted.sort_by(f64::total_cmp);
+    let last = sorted.len().checked_sub(1)?;
+    sorted.get((q.clamp(0.0, 1.0) * last as f64).round() as usize).copied()
+}
+
+fn viridis(level: f64) -> String {
+    let place = level.clamp(0.0, 1.0) * (VIRIDIS.len() - 1) as f64;
+    let index = (place as usize).min(VIRIDIS.len() - 2);
+    let part = place - index as f64;
+    let mut hex = String::from("#");
+    for (a, b) in VIRIDIS[index].iter().zip(VIRIDIS[index + 1]) {
+        let mixed = f64::from(*a) + part * (f64::from(b) - f64::from(*a));
+        let _ = write!(hex, "{:02x}", mixed.round() as u8);
+    }
+    hex
+}
+
+/// The residual over the state space: the RMS of the values in each cell of a grid as colour, from zero to
+/// the 98 % quantile of the cells. `None` when no point is finite.
+pub fn state_map(map: &StateMap, alt: &str) -> Option<String> {
+    let points: Vec<(f64, f64, f64)> = map
+        .x
+        .iter()
+        .zip(&map.y)
+        .zip(&map.value)
+        .map(|((&x, &y), &value)| (x, y, value))
+        .filter(|(x, y, value)| x.is_finite() && y.is_finite() && value.is_finite())
+        .collect();
+    let frame = Frame {
+        x: range(points.iter().map(|p| p.0), 0.0)?,
+        y: range(points.iter().map(|p| p.1), 0.0)?,
+        right: WIDTH - 92.0,
+    };
+    let (columns, rows) = CELLS;
+    let cell = |value: f64, (low, high): (f64, f64), count: usize| {
+        (((value - low) / (high - low) * count as f64) as usize).min(count - 1)
+    };
+    let mut sums = vec![(0.0, 0u32); columns * rows];
+    for &(x, y, value) in &points {
+        let sum = &mut sums[cell(y, frame.y, rows) * columns + cell(x, frame.x, columns)];
+        sum.0 += value * value;
+        sum.1 += 1;
+    }
+    let rms = |&(sum, count): &(f64, u32)| (count > 0).then(|| (sum / f64::from(count)).sqrt());
+    let top = quantile(sums.iter().filter_map(rms), 0.98)?;
+    let top = if top > 0.0 && top.is_finite() { top } else { 1.0 };
+
+    let mut paths = vec![String::new(); LEVELS];
+    let (w, h) = ((frame.right - LEFT) / columns as f64, (HEIGHT - BOTTOM - TOP) / rows as f64);
+    for (index, sum) in sums.iter().enumerate() {
+        let Some(value) = rms(sum) else { continue };
+        let level = ((value / top * LEVELS as f64) as usize).min(LEVELS - 1);
+        let x = LEFT + (index % columns) as f64 * w;
+        let y = HEIGHT - BOTTOM - ((index / columns) as f64 + 1.0) * h;
+        let _ = write!(paths[level], "M{x:.1} {y:.1}h{:.1}v{:.1}h-{0:.1}z", w + 0.15, h + 0.15);
+    }
+    let mut out = open(alt);
+    frame.axes(&mut out, &map.x_label, &map.y_label);
+    for (level, path) in paths.iter().enumerate().filter(|(_, path)| !path.is_empty()) {
+        let colour = viridis((level as f64 + 0.5) / LEVELS as f64);
+        let _ = write!(out, "<path fill=\"{colour}\" d=\"{path}\"/>");
+    }
+    frame.border(&mut out);
+    colour_bar(&mut out, top, &map.value_label);
+    out.push_str("</svg>");
+    Some(out)
+}
+
+fn colour_bar(out: &mut String, top: f64, value_label: &str) {
+    let (x, width) = (WIDTH - 80.0, 13.0);
+    let height = HEIGHT - BOTTOM - TOP;
+    let step = height / LEVELS as f64;
+    for level in 0..LEVELS {
+        let y = HEIGHT - BOTTOM - (level as f64 + 1.0) * step;
+        let colour = viridis((level as f64 + 0.5) / LEVELS as f64);
+        let _ =
+            write!(out, "<path fill=\"{colour}\" d=\"M{x} {y:.1}h{width}v{:.1}h-{width}z\"/>", step + 0.15);
+    }
+    let (ticks, decimals) = nice_ticks(0.0, top, 4);
+    for tick in ticks {
+        let y = HEIGHT - BOTTOM - tick / top * height;
+        let text = tick_label(tick, decimals);
+        let _ = write!(out, "<text x=\"{}\" y=\"{:.1}\">{text}</text>", x + width + 5.0, y + 4.5);
+    }
+    let _ = write!(
+        out,
+        "<text class=\"axis\" transform=\"translate({} {:.1}) rotate(-90)\" text-anchor=\"middle\">{}</text>",
+        WIDTH - 6.0,
+        TOP + 0.5 * height,
+        escape(&label(value_label))
+    );
+}
+
+/// A drawing of a law and how many of its points lie outside the frame.
+#[derive(Debug, Clone, PartialEq)]
+pub struct LawPlot {
+    /// The SVG element.
+    pub svg: String,
+    /// Points beyond the drawn range.
+    pub outside: usize,
+    /// Points beyond the number that is drawn (every k-th is).
+    pub every: usize,
+}
+
+/// The estimated force as dots and the fitted law as a line. The frame covers the law and the central 99 %
+/// of the points; `None` when neither has a finite point.
+pub fn law_plot(plot: &MechanismPlot, alt: &str) -> Option<LawPlot> {
+    let finite: Vec<[f64; 2]> =
+        plot.points.iter().copied().filter(|[x, y]| x.is_finite() && y.is_finite()).collect();
+    let central = |axis: usize| {
+        let low = quantile(finite.iter().map(|p| p[axis]), 0.005);
+        let high = quantile(finite.iter().map(|p| p[axis]), 0.995);
+        low.into_iter().chain(high)
+    };
+    let frame = Frame {
+        x: range(central(0).chain(plot.curve.iter().map(|p| p[0])), 0.03)?,
+        y: range(central(1).chain(plot.curve.iter().map(|p| p[1])), 0.06)?,
+        right: WIDTH - 12.0,
+    };
+    let mut out = open(alt);
+    frame.axes(&mut out, &plot.x_label, &plot.y_label);
+    if frame.x.0 < 0.0 && frame.x.1 > 0.0 {
+        let _ = write!(out, "<path class=\"zero\" d=\"M{:.1} {TOP}V{}\"/>", frame.px(0.0), HEIGHT - BOTTOM);
+    }
+    if frame.y.0 < 0.0 && frame.y.1 > 0.0 {
+        let _ = write!(out, "<path class=\"zero\" d=\"M{LEFT} {:.1}H{:.1}\"/>", frame.py(0.0), frame.right);
+    }
+    let every = finite.len().div_ceil(MAX_DOTS).max(1);
+    let mut dots = String::new();
+    for &[x, y] in finite.iter().step_by(every).filter(|[x, y]| frame.contains(*x, *y)) {
+        let _ = write!(dots, "M{:.1} {:.1}h0", frame.px(x), frame.py(y));
+    }
+    if !dots.is_empty() {
+        let _ = write!(out, "<path class=\"dots\" d=\"{dots}\"/>");
+    }
+    let mut line = String::new();
+    let mut pen_down = false;
+    for &[x, y] in &plot.curve {
+        if x.is_finite() && y.is_finite() {
+            let _ = write!(line, "{}{:.1} {:.1}", if pen_down { 'L' } else { 'M' }, frame.px(x), frame.py(y));
+            pen_down = true;
+        } else {
+            pen_down = false;
+        }
+    }
+    if !line.is_empty() {
+        let _ = write!(out, "<path class=\"halo\" d=\"{line}\"/><path class=\"law\" d=\"{line}\"/>");
+    }
+    frame.border(&mut out);
+    out.push_str("</svg>");
+    let outside = finite.iter().filter(|[x, y]| !frame.contains(*x, *y)).count();
+    Some(LawPlot { svg: out, outside, every })
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn ticks_are_round() {
+        let (ticks, decimals) = nice_ticks(-0.32, 0.47, 6);
+        assert_eq!(decimals, 1);
+        let labels: Vec<String> = ticks.iter().map(|&t| tick_label(t, decimals)).collect();
+        assert_eq!(labels, ["−0.2", "0.0", "0.2", "0.4"]);
+        assert!(nice_ticks(1.0, 1.0, 5).0.is_empty());
+        assert!(nice_ticks(f64::NAN, 1.0, 5).0.is_empty());
+        assert!(nice_ticks(-f64::MAX, f64::MAX, 5).0.is_empty());
+    }
+
+    #[test]
+    fn nothing_finite_draws_nothing_and_one_point_draws() {
+        let mut map = StateMap {
+            x_label: "x".into(),
+            y_label: "y".into(),
+            value_label: "r".into(),
+            x: vec![f64::NAN],
+            y: vec![0.0],
+            value: vec![1.0],
+        };
+        assert_eq!(state_map(&map, ""), None);
+        map.x = vec![0.0];
+        map.value = vec![0.0];
+        let svg = state_map(&map, "a \"map\"").unwrap();
+        assert!(svg.contains("a &quot;map&quot;") && !svg.contains("NaN"), "{svg}");
+    }
+
+    #[test]
+    fn the_map_shows_where_the_residual_is_large() {
+        let n = 2000;
+        let x: Vec<f64> = (0..n).map(|i| (i as f64 * 0.7).sin()).collect();
+        let y: Vec<f64> = (0..n).map(|i| (i as f64 * 0.31).cos()).collect();
+        let value: Vec<f64> = x.iter().map(|&x| if x > 0.8 { 5.0 } else { 0.0 }).collect();
+        let map = StateMap { x_label: "x".into(), y_label: "y".into(), value_label: "r".into(), x, y, value };
+        let svg = state_map(&map, "").unwrap();
+        let bright = viridis(1.0 - 0.5 / LEVELS as f64);
+        let cells = svg.split("<path").find(|p| p.contains(&bright)).unwrap();
+        let left = cells.split('M').skip(1).filter_map(|m| m.split(' ').next()?.parse::<f64>().ok());
+        assert!(left.fold(f64::INFINITY, f64::min) > 0.8 * (WIDTH - 92.0), "only the right end is bright");
+    }
+
+    #[test]
+    fn an_outlier_does_not_squash_the_law() {
+        let mut points: Vec<[f64; 2]> = (0..1000).map(|i| [i as f64 / 1000.0, 0.1]).collect();
+        points[5][1] = 1e9;
+        points.push([f64::NAN, 1.0]);
+        let plot = MechanismPlot {
+            mechanism: Some(0),
+            title: String::new(),
+            x_label: "x".into(),
+            y_label: "f".into(),
+            points,
+            curve: vec![[0.0, 0.0], [f64::NAN, 0.0], [1.0, 0.2]],
+        };
+        let drawn = law_plot(&plot, "").unwrap();
+        // Beyond the frame: the outlier only, the frame reaches past the 99 % of x.
+        assert_eq!((drawn.outside, drawn.every), (1, 1));
+        assert!(!drawn.svg.contains("NaN"));
+    }
+}

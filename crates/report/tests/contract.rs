@@ -1,0 +1,158 @@
+//! `report.json` against its schema, and the schema against its checked-in copy.
+#![allow(clippy::unwrap_used, reason = "helpers of tests panic like the tests themselves")]
+
+use std::path::Path;
+
+use greybox_report::Report;
+use greybox_report::contract::{Interval, Location, Names, Verdict, schema};
+
+#[path = "../examples/sample/mod.rs"]
+mod sample;
+
+fn assert_valid(report: &Report) -> serde_json::Value {
+    let json: serde_json::Value = serde_json::from_str(&report.to_json().unwrap()).unwrap();
+    let validator = jsonschema::validator_for(&schema()).unwrap();
+    let errors: Vec<String> =
+        validator.iter_errors(&json).map(|e| format!("{}: {e}", e.instance_path())).collect();
+    assert!(errors.is_empty(), "{errors:#?}");
+    json
+}
+
+/// `UPDATE=1 cargo test -p greybox-report` rewrites the file.
+#[test]
+fn the_checked_in_schema_is_current() {
+    let path = Path::new(env!("CARGO_MANIFEST_DIR")).join("../../docs/report.schema.json");
+    let generated = schema();
+    if std::env::var_os("UPDATE").is_some() {
+        let text = serde_json::to_string_pretty(&generated).unwrap() + "\n";
+        std::fs::create_dir_all(path.parent().unwrap()).unwrap();
+        std::fs::write(&path, text).unwrap();
+    }
+    let text =
+        std::fs::read_to_string(&path).expect("docs/report.schema.json exists; else run with UPDATE=1");
+    let checked_in: serde_json::Value = serde_json::from_str(&text).unwrap();
+    assert_eq!(checked_in, generated, "docs/report.schema.json is stale: run the tests with UPDATE=1");
+}
+
+#[test]
+fn a_report_satisfies_the_schema_and_comes_back_unchanged() {
+    let report = sample::page().report;
+    let json = assert_valid(&report);
+    assert_eq!(json["verdict"], "missing_physics");
+    assert_eq!(json["mechanisms"][0]["equation"], "hub");
+    assert_eq!(json["mechanisms"][0]["parameters"]["fc"]["ci95"].as_array().unwrap().len(), 2);
+    assert_eq!(json["remainder"]["location"], serde_json::json!({}));
+    assert!(json["fit"]["holdout"]["improved"]["theta"]["nrmse"].as_f64().unwrap() < 0.1);
+    // Shortest round-trip formatting of numbers: what is read back is what was written.
+    assert_eq!(Report::from_json(&report.to_json().unwrap()).unwrap(), report);
+}
+
+/// The promised keys, in the words of the design; renaming a field must fail here.
+#[test]
+fn the_promised_keys_are_there() {
+    let promised = serde_json::json!({
+        "verdict": "missing_physics",
+        "mechanisms": [
+            {"kind": "coulomb_friction", "equation": ["hub", "link"], "expression": "fc*sign(theta')",
+             "parameters": {"fc": {"value": 0.11, "ci95": [0.10, 0.12], "unit": "N m"}},
+             "share_explained": 0.81, "confidence": 0.99,
+             "alternatives": [{"kind": "stribeck_friction", "confidence": 0.2, "equivalent": true}],
+             "location": {"equation": "hub", "windows_s": {"train.csv": [[1.2, 1.9]]},
+                          "region": {"theta'": [-0.2, null]}, "band_hz": [0.1, 2.0]}}
+        ],
+        "remainder": {"significant": false, "location": {}, "share_of_residual": 0.03},
+        "parameters": {"J": {"nominal": 0.0021, "value": 0.0024, "ci95": [0.0023, 0.0025]}},
+        "fit": {"train": {"nominal": {"theta": {"nrmse": 0.31}}, "calibrated": {"theta": {"nrmse": 0.22}},
+                          "improved": {"theta": {"nrmse": 0.02}}},
+                "holdout": {"nominal": {}, "calibrated": {}, "improved": {}}},
+        "noise_floor": {"theta": 0.015}
+    });
+    let report = Report::from_json(&promised.to_string()).unwrap();
+    assert_eq!(report.verdict, Verdict::MissingPhysics);
+    let written = assert_valid(&report);
+    assert_contains(&written, &promised, "report");
+}
+
+/// Everything in `expected` stands in `actual`, which may hold more keys.
+fn assert_contains(actual: &serde_json::Value, expected: &serde_json::Value, place: &str) {
+    use serde_json::Value;
+    match (actual, expected) {
+        (Value::Object(actual), Value::Object(expected)) => {
+            for (key, value) in expected {
+                let found = actual.get(key).unwrap_or_else(|| panic!("{place}.{key} is missing"));
+                assert_contains(found, value, &format!("{place}.{key}"));
+            }
+        }
+        (Value::Array(actual), Value::Array(expected)) => {
+            assert_eq!(actual.len(), expected.len(), "{place}");
+            for (index, (a, e)) in actual.iter().zip(expected).enumerate() {
+                assert_contains(a, e, &format!("{place}[{index}]"));
+            }
+        }
+        _ => assert_eq!(actual, expected, "{place}"),
+    }
+}
+
+#[test]
+fn numbers_that_are_not_finite_become_null() {
+    let mut report = sample::page().report;
+    report.noise_floor.insert("dead".to_owned(), f64::INFINITY);
+    report.remainder.share_of_residual = f64::NAN;
+    report.fit.window_s = Some(f64::NAN);
+    report.remainder.location = Location {
+        band_hz: Some(Interval::new(f64::NEG_INFINITY, 3.0)),
+        region: [("x".to_owned(), [Some(f64::NEG_INFINITY), Some(f64::NAN)])].into_iter().collect(),
+        ..Location::default()
+    };
+    for scores in [&mut report.fit.train.nominal, &mut report.fit.holdout.improved] {
+        for score in scores.values_mut() {
+            score.nrmse = f64::NAN;
+            score.rmse = Some(f64::INFINITY);
+            score.nrmse_windowed = Some(f64::NAN);
+            score.rmse_windowed = Some(f64::NAN);
+        }
+    }
+    let mechanism = &mut report.mechanisms[0];
+    mechanism.share_explained = f64::NAN;
+    mechanism.confidence = f64::INFINITY;
+    mechanism.alternatives[0].confidence = f64::NAN;
+    mechanism.location.windows_s["train.csv"] = vec![Interval::new(1.0, f64::INFINITY)];
+    let estimate = &mut mechanism.parameters["fc"];
+    (estimate.value, estimate.ci95) = (f64::NAN, Some(Interval::new(f64::NAN, 1.0)));
+    let parameter = &mut report.parameters["J"];
+    (parameter.nominal, parameter.value, parameter.calibrated) = (f64::NAN, f64::NAN, Some(f64::NAN));
+
+    let json = assert_valid(&report);
+    assert!(json["noise_floor"]["dead"].is_null());
+    assert_eq!(json["remainder"]["location"]["band_hz"], serde_json::json!([null, 3.0]));
+    assert_eq!(json["remainder"]["location"]["region"]["x"], serde_json::json!([null, null]));
+    let back = Report::from_json(&report.to_json().unwrap()).unwrap();
+    assert!(back.noise_floor["dead"].is_nan());
+    assert!(back.mechanisms[0].parameters["fc"].value.is_nan());
+    // The page prints such a report, too.
+    let mut page = sample::page();
+    page.report = report;
+    let html = page.to_html().unwrap();
+    assert!(!html.contains("NaN %") && !html.contains("inf %"));
+}
+
+#[test]
+fn maps_keep_their_order() {
+    let text = sample::page().report.to_json().unwrap();
+    let at = |key: &str| text.find(&format!("\"{key}\": {{\n      \"nominal\"")).unwrap();
+    assert!(at("J") < at("B") && at("B") < at("ks") && at("ks") < at("Jl"), "the order of the model");
+}
+
+#[test]
+fn one_name_stays_a_string() {
+    assert_eq!(Names::from(vec!["hub".to_owned()]), Names::One("hub".to_owned()));
+    let two = Names::from(vec!["hub".to_owned(), "link".to_owned()]);
+    assert_eq!(two.as_slice(), ["hub", "link"]);
+    assert_eq!(serde_json::to_string(&two).unwrap(), r#"["hub","link"]"#);
+}
+
+#[test]
+fn a_malformed_report_names_the_place() {
+    let error = Report::from_json("{\n  \"verdict\": \"maybe\"\n}").unwrap_err().to_string();
+    assert!(error.contains("maybe") && error.contains("line 2"), "{error}");
+}
