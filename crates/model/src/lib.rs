@@ -10,9 +10,11 @@ pub mod model;
 mod nearest;
 pub mod parse;
 pub mod units;
+mod write;
 
 pub use error::{ModelError, Place, Problem};
 pub use expr::{BinOp, Expr, Func};
 pub use model::{Equation, Hold, Input, Measurement, Model, Parameter, State};
 pub use parse::{Parsed, ParsedEquation, SyntaxError, parse, parse_equation};
 pub use units::{Dimension, Unit, UnitError};
+pub use write::WriteOptions;

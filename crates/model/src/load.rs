@@ -527,26 +527,25 @@ fn check_arguments(model: &Model, place: &Place, source: &Source, parsed: &Parse
     parsed.expr.walk(&mut |e| {
         let Expr::Call(f @ (Func::Step | Func::Delay), args) = e else { return };
         let [first, second] = args.as_slice() else { return };
-        let mut reject = |at: &Expr, reason: &str, help: String| {
+        let mut reject = |reason: &str, help: String| {
             let problem =
                 Problem::Argument { place: place.clone(), call: e.to_string(), reason: reason.to_owned() };
-            found.get_or_insert(fault(problem, source.span(parsed.span_of(at)), help));
+            found.get_or_insert(fault(problem, source.span(parsed.span_of(e)), help));
         };
         if *f == Func::Step && *first != Expr::var("t") {
-            reject(first, "the first argument of `step` must be the time `t`", format!("write `step(t, {second})`"));
+            reject("the first argument of `step` must be the time `t`", format!("write `step(t, {second})`"));
         }
         let moving = second.variables().into_iter().find(|(n, _)| &**n != "pi" && model.parameter(n).is_none());
         if let Some((name, _)) = moving {
             let what = if *f == Func::Delay { "the delay" } else { "the switching time" };
             reject(
-                second,
                 &format!("{what} must consist of parameters and numbers, found `{name}`"),
                 format!("make {what} a parameter"),
             );
         }
         let value = |name: &str, _| model.parameter(name).map(|i| model.parameters[i].value);
         if *f == Func::Delay && second.eval(&value).is_some_and(|tau| tau < 0.0 || tau.is_nan()) {
-            reject(second, "the delay is negative", "a delay is zero or positive".into());
+            reject("the delay is negative", "a delay is zero or positive".into());
         }
     });
     found.map_or(Ok(()), Err)
