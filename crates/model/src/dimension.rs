@@ -169,11 +169,9 @@ impl<'a> Checker<'a> {
 
     /// The dimension of a name, without primes.
     fn symbol(&self, name: &str) -> Option<Quantity> {
-        let of = |which: Unstated, unit: Option<&Unit>| {
-            match self.unstated.iter().position(|u| *u == which) {
-                Some(i) => self.unknown(i),
-                None => self.known(unit.map_or(Dimension::NONE, |u| u.dimension)),
-            }
+        let of = |which: Unstated, unit: Option<&Unit>| match self.unstated.iter().position(|u| *u == which) {
+            Some(i) => self.unknown(i),
+            None => self.known(unit.map_or(Dimension::NONE, |u| u.dimension)),
         };
         if let Some(i) = self.model.parameter(name) {
             return Some(of(Unstated::Parameter(i), self.model.parameters[i].unit.as_ref()));
@@ -268,7 +266,14 @@ impl<'a> Checker<'a> {
     }
 
     /// Demands that `e`, a part of `whole`, is in `expected`.
-    fn need(&mut self, whole: &Expr, e: &Expr, expected: Dimension, role: &str, place: &Place) -> Result<(), Fault> {
+    fn need(
+        &mut self,
+        whole: &Expr,
+        e: &Expr,
+        expected: Dimension,
+        role: &str,
+        place: &Place,
+    ) -> Result<(), Fault> {
         let Dim::Is(q) = self.dimension(e, place)? else { return Ok(()) };
         let ratio = q.combine(&self.known(expected), -1.0);
         self.demand_none(&ratio).map_err(|leftover| {
@@ -380,7 +385,11 @@ impl<'a> Checker<'a> {
             .filter_map(|(name, _)| Some((name, self.reduce(&self.symbol(name)?).known)))
             .map(|(name, d)| format!("`{name}` is in {d}"))
             .collect();
-        if named.is_empty() { "check the units".into() } else { format!("check the units: {}", named.join(", ")) }
+        if named.is_empty() {
+            "check the units".into()
+        } else {
+            format!("check the units: {}", named.join(", "))
+        }
     }
 }
 

@@ -55,7 +55,9 @@ impl Model {
         write_section(root, "parameters", parameters, |old, parameter| {
             let mut item = write_parameter(old, parameter);
             let comment = options.comments.iter().find(|(name, _)| *name == parameter.name);
-            if let (None, true, Some((_, comment)), Some(value)) = (old, may_comment, comment, item.as_value_mut()) {
+            if let (None, true, Some((_, comment)), Some(value)) =
+                (old, may_comment, comment, item.as_value_mut())
+            {
                 // A line break would end the comment.
                 let line: String = comment.chars().map(|c| if c.is_control() { ' ' } else { c }).collect();
                 value.decor_mut().set_suffix(format!("  # {line}"));
@@ -114,6 +116,10 @@ fn write_section<'a, T: 'a>(
         .map(|(key, _)| key.to_owned())
         .filter(|key| !wanted.iter().any(|(name, _)| name == key))
         .collect();
+    if wanted.is_empty() && !gone.is_empty() {
+        root.remove(name);
+        return;
+    }
     for key in gone {
         table.remove(&key);
     }
@@ -204,7 +210,8 @@ fn write_number(table: &mut dyn TableLike, key: &str, si: f64, factor: f64) {
 /// As it is where nine significant digits suffice (a person wrote it), else six: more would claim
 /// what no calibration knows.
 fn decimal(v: f64) -> Value {
-    let digits = |v: f64| format!("{v:e}").split('e').next().unwrap_or("").bytes().filter(u8::is_ascii_digit).count();
+    let digits =
+        |v: f64| format!("{v:e}").split('e').next().unwrap_or("").bytes().filter(u8::is_ascii_digit).count();
     let rounded: f64 = if digits(v) <= 9 { v } else { format!("{v:.5e}").parse().unwrap_or(v) };
     let size = rounded.abs();
     let text = if rounded == 0.0 || (1e-4..1e7).contains(&size) {
@@ -261,7 +268,8 @@ fn write_state(old: Option<&Item>, state: &State) -> Item {
             None => as_number(item).map(|v| vec![v]),
         });
         let same = old_initial.as_ref().is_some_and(|old| {
-            old.len() == state.initial.len() && old.iter().zip(&state.initial).all(|(v, si)| v * factor == *si)
+            old.len() == state.initial.len()
+                && old.iter().zip(&state.initial).all(|(v, si)| v * factor == *si)
         });
         match state.initial.as_slice() {
             _ if same => {}

@@ -72,7 +72,10 @@ fn values_become_si_at_the_edge() {
     "#;
     let model = Model::from_toml(text, "si.toml").unwrap();
     assert_eq!(model.inputs[0].hold, Hold::Zero);
-    assert_eq!(model.states[0].initial, [90.0 * (std::f64::consts::PI / 180.0), 180.0 * (std::f64::consts::PI / 180.0)]);
+    assert_eq!(
+        model.states[0].initial,
+        [90.0 * (std::f64::consts::PI / 180.0), 180.0 * (std::f64::consts::PI / 180.0)]
+    );
     assert_eq!((model.parameters[0].value, model.parameters[0].std), (0.005, Some(0.001)));
     assert_eq!(model.parameters[1].value, 16.0);
     assert_eq!(model.parameters[1].unit.as_ref().unwrap().text, "1/s");
@@ -163,11 +166,14 @@ fn dimension_of_takes_the_whole_language() {
     }
 }
 
+/// Text, what to put for it, line and column of the fault, fragments of the message.
+type Case = (&'static str, &'static str, (usize, usize), &'static [&'static str]);
+
 /// A change of the flexible link → where the fault is found, and what its message says.
 #[test]
 fn bad_files_name_place_and_mend() {
     let hub = "J*theta'' + B*theta' - ks*alpha = kt*v";
-    let cases: &[(&str, &str, (usize, usize), &[&str])] = &[
+    let cases: &[Case] = &[
         // TOML
         ("name = ", "name ", (1, 6), &["not TOML"]),
         ("hub  =", "link =", (20, 1), &["not TOML", "duplicate key"]),
@@ -188,7 +194,12 @@ fn bad_files_name_place_and_mend() {
         ("Bl = {", "sin = {", (14, 1), &["`sin` cannot name a parameter", "function"]),
         ("Bl = {", "t = {", (14, 1), &["it is the time"]),
         ("Bl = {", "\"B-l\" = {", (14, 1), &["a letter, then letters", "write `B_l`"]),
-        ("ks*alpha = kt*v", "ks*alfa = kt*v", (19, 35), &["equation \"hub\"", "`alfa` is not defined", "declare `alfa`"]),
+        (
+            "ks*alpha = kt*v",
+            "ks*alfa = kt*v",
+            (19, 35),
+            &["equation \"hub\"", "`alfa` is not defined", "declare `alfa`"],
+        ),
         ("ks*alpha = kt*v", "ks*alpa = kt*v", (19, 35), &["did you mean `alpha`?"]),
         ("B*theta'", "B*theta_dot", (19, 23), &["primes: `theta'`"]),
         ("kt*v", "kt*v'", (19, 46), &["an input is known by its samples only"]),
@@ -198,22 +209,61 @@ fn bad_files_name_place_and_mend() {
         ("J*theta''", "2J*theta''", (19, 10), &["write `2*J`"]),
         ("ks*alpha = kt", "ks*sine(alpha) = kt", (19, 35), &["unknown function `sine`", "`sin`"]),
         // structure
-        ("link = \"Jl*(theta'' + alpha'') + Bl*alpha' + ks*alpha = 0\"\n", "", (8, 1), &["the state `alpha` never appears with a prime"]),
+        (
+            "link = \"Jl*(theta'' + alpha'') + Bl*alpha' + ks*alpha = 0\"\n",
+            "",
+            (8, 1),
+            &["the state `alpha` never appears with a prime"],
+        ),
         ("link = ", "more = \"theta'' = 0*kt/J*v\"\nlink = ", (21, 8), &["3 equations for 2 states"]),
         ("J*theta''", "J*sin(theta'')", (19, 9), &["`J*sin(theta'')` is not affine", "inside `sin`"]),
-        ("J*theta''", "J*theta''^2", (19, 9), &["the term `J*theta''^2` is not affine in the highest derivative `theta''`"]),
+        (
+            "J*theta''",
+            "J*theta''^2",
+            (19, 9),
+            &["the term `J*theta''^2` is not affine in the highest derivative `theta''`"],
+        ),
         ("ks*alpha = kt*v", "B*sign(theta'' - alpha'') = kt*v", (19, 32), &["not affine", "inside `sign`"]),
-        ("J*theta'' + B", "0*theta'' + B", (19, 8), &["equation \"hub\" cannot be solved", "no highest derivative"]),
+        (
+            "J*theta'' + B",
+            "0*theta'' + B",
+            (19, 8),
+            &["equation \"hub\" cannot be solved", "no highest derivative"],
+        ),
         ("kt*v", "kt*step(theta, 1)", (19, 46), &["must be the time `t`", "write `step(t, 1)`"]),
         ("kt*v", "kt*delay(v, alpha)", (19, 46), &["must consist of parameters and numbers, found `alpha`"]),
         ("kt*v", "kt*delay(v, -J)", (19, 46), &["the delay is negative"]),
         // measurements
         ("channel = \"alpha\"", "channel = \"theta\"", (8, 1), &["channel `theta` measures `theta` already"]),
-        ("channel = \"alpha\"", "channel = \"alpha\", measured = false", (8, 35), &["names a channel, but `measured = false`"]),
-        ("channel = \"alpha\"", "initial = [0, 0, 1]", (8, 1), &["`initial` has 3 values, its order is 2", "[alpha, alpha']"]),
+        (
+            "channel = \"alpha\"",
+            "channel = \"alpha\", measured = false",
+            (8, 35),
+            &["names a channel, but `measured = false`"],
+        ),
+        (
+            "channel = \"alpha\"",
+            "initial = [0, 0, 1]",
+            (8, 1),
+            &["`initial` has 3 values, its order is 2", "[alpha, alpha']"],
+        ),
         // units
-        ("B*theta' -", "B*theta -", (19, 21), &["equation \"hub\"", "the term `B*theta` is in N m s, but `J*theta''`, `ks*alpha`, `kt*v` are in N m", "check the unit of `B`, stated as N m s/rad: with N m"]),
-        ("J*theta''", "5 + J*theta''", (19, 9), &["the term `5` is in 1 (dimensionless)", "a parameter with the unit N m"]),
+        (
+            "B*theta' -",
+            "B*theta -",
+            (19, 21),
+            &[
+                "equation \"hub\"",
+                "the term `B*theta` is in N m s, but `J*theta''`, `ks*alpha`, `kt*v` are in N m",
+                "check the unit of `B`, stated as N m s/rad: with N m",
+            ],
+        ),
+        (
+            "J*theta''",
+            "5 + J*theta''",
+            (19, 9),
+            &["the term `5` is in 1 (dimensionless)", "a parameter with the unit N m"],
+        ),
         ("kt*v", "kt*v*sin(v)", (19, 48), &["the argument of `sin` must be dimensionless, but `v` is in V"]),
         ("Bl*alpha'", "Bl*alpha' + Bl*alpha", (20, 46), &["no unit of `Bl` lets the term `Bl*alpha` share"]),
     ];
@@ -244,14 +294,19 @@ fn bad_files_name_place_and_mend() {
 fn explicit_measurements_replace_and_conflict() {
     let text = format!("{LINK}[measurements]\nalpha = \"alpha + J/J\"\nenc = \"2*theta'\"\n");
     let model = Model::from_toml(&text, "m.toml").unwrap();
-    let channels: Vec<String> = model.measurements.iter().map(|m| format!("{}: {}", m.channel, m.expr)).collect();
+    let channels: Vec<String> =
+        model.measurements.iter().map(|m| format!("{}: {}", m.channel, m.expr)).collect();
     assert_eq!(channels, ["theta: theta", "alpha: alpha + J/J", "enc: 2*theta'"]);
     for (from, to, fragment) in [
         ("channel = \"alpha\"", "channel = \"a2\"", "measured by channel `a2`, and by this expression too"),
         ("2*theta'", "2*theta'''", "the equations know derivatives up to `theta''`"),
         ("2*theta'", "2*theto", "measurement \"enc\": `theto` is not defined"),
         ("2*theta'", "theta + v", "measurement \"enc\": the term `v`"),
-        ("\"2*theta'\"", "{ expression = \"2*theta'\", unit = \"V\" }", "its unit is V, but `2*theta'` is in 1/s"),
+        (
+            "\"2*theta'\"",
+            "{ expression = \"2*theta'\", unit = \"V\" }",
+            "its unit is V, but `2*theta'` is in 1/s",
+        ),
         ("\"2*theta'\"", "{ unit = \"V\" }", "lacks `expression`"),
         ("\"2*theta'\"", "3", "expected a string, found the number 3"),
     ] {
@@ -293,7 +348,8 @@ fn nominal_models_of_the_recordings_load() {
             let file = file.unwrap().path();
             if file.extension().is_some_and(|e| e == "toml") {
                 let text = std::fs::read_to_string(&file).unwrap();
-                let model = Model::from_toml(&text, &file.display().to_string()).unwrap_or_else(|e| panic!("{e}"));
+                let model =
+                    Model::from_toml(&text, &file.display().to_string()).unwrap_or_else(|e| panic!("{e}"));
                 assert!(model.parameters.iter().all(|p| p.unit.is_some()));
                 loaded += 1;
             }
