@@ -323,7 +323,14 @@ fn read_unit(table: &DeTable<'_>, item: &str) -> Result<Option<Unit>, Located> {
     let text = string(value, item)?;
     Unit::parse(text).map(Some).map_err(|e| {
         let problem = Problem::Unit { item: item.to_owned(), text: text.to_owned(), message: e.message };
-        let inner = value.span().start + 1 + e.span.start..value.span().start + 1 + e.span.end;
+        // Without escapes the string is its text between two quotes.
+        let plain = value.span().len() == text.len() + 2;
+        let inner = if plain {
+            let start = value.span().start + 1;
+            start + e.span.start..start + e.span.end
+        } else {
+            value.span()
+        };
         fault(problem, inner, e.help.unwrap_or_else(|| "write units like `N m/V`".into()))
     })
 }
