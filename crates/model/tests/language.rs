@@ -230,6 +230,16 @@ fn bad_files_name_place_and_mend() {
             (19, 8),
             &["equation \"hub\" cannot be solved", "no highest derivative"],
         ),
+        (
+            "Jl*(theta'' + alpha'')",
+            "Jl*(theta'' + 0*alpha'')",
+            (20, 8),
+            &[
+                "equation \"link\" cannot be solved",
+                "it contains `theta''`, which \"hub\" determines already; no equation is left for `alpha''`",
+                "write one that contains `alpha''`",
+            ],
+        ),
         ("kt*v", "kt*step(theta, 1)", (19, 46), &["must be the time `t`", "write `step(t, 1)`"]),
         ("kt*v", "kt*delay(v, alpha)", (19, 46), &["must consist of parameters and numbers, found `alpha`"]),
         ("kt*v", "kt*delay(v, -J)", (19, 46), &["the delay is negative"]),
