@@ -66,7 +66,8 @@ impl Setup {
             method: Method::Rk4 { substeps: 1 },
             free,
         };
-        setup.choose_method();
+        let tolerance: Vec<f64> = setup.data.spread.iter().map(|s| 1e-3 * s).collect();
+        setup.choose_method(&tolerance);
         Ok(setup)
     }
 
@@ -95,14 +96,13 @@ impl Setup {
         for (input, hold) in model.inputs.iter_mut().zip(&holds) {
             input.hold = *hold;
         }
-        let mut setup = Setup { holds, environments, model, ..self.clone() };
-        setup.choose_method();
-        setup
+        Setup { holds, environments, model, ..self.clone() }
     }
 
-    /// The cheapest fixed-step method whose error stays below a twentieth of the noise (or 10⁻⁶ of the
-    /// signal) over a stretch of the data, judged against Dormand–Prince with tight tolerances.
-    pub fn choose_method(&mut self) {
+    /// The cheapest fixed-step method whose error stays below `tolerance` (SI, per channel; at least a
+    /// twentieth of the noise and 10⁻⁶ of the signal) over a stretch of the data, judged against
+    /// Dormand–Prince with tight tolerances.
+    pub fn choose_method(&mut self, tolerance: &[f64]) {
         let Some((piece, data)) =
             self.data.pieces.iter().enumerate().max_by_key(|(_, p)| p.len.min(1500))
         else {
@@ -129,7 +129,9 @@ impl Setup {
         for method in ladder {
             let trial = run(method);
             let accurate = (0..self.system.ny).all(|c| {
-                let limit = (0.05 * self.data.sigma[c]).max(1e-6 * self.data.spread[c]);
+                let limit = tolerance[c]
+                    .max(0.05 * self.data.sigma[c])
+                    .max(1e-6 * self.data.spread[c]);
                 (0..good).all(|k| {
                     (trial.y[c * n + k] - reference.y[c * n + k]).abs() <= limit
                 })

@@ -1,11 +1,19 @@
 //! Finds the physics a simulation leaves out.
 pub mod along;
 pub mod candidate;
+pub mod diagnosis;
 pub mod evidence;
 pub mod library;
+pub mod locate;
 pub mod place;
 pub mod screen;
 pub mod search;
+pub mod surface;
+
+pub use diagnosis::{
+    Calibration, DiagnoseError, Diagnosis, Estimate, Options, Verdict, calibrate, diagnose,
+};
+pub use library::{Mechanism, MechanismError, built_in};
 
 /// Where the diagnosis is, for progress bars and logs.
 #[derive(Debug, Clone, PartialEq)]

@@ -114,6 +114,10 @@ pub struct Mechanism {
     pub surcharge: f64,
     /// Where it acts, for laws with a threshold.
     pub region: Option<Region>,
+    /// The sum of other mechanisms at the same place that it equals exactly: (kind, parameter,
+    /// expression in this mechanism's parameters). Where all of them are candidates, it is reported as
+    /// that sum, with itself as an equivalent alternative.
+    pub equals: Vec<(String, String, Expr)>,
     /// Prose.
     pub about: About,
 }
@@ -151,6 +155,8 @@ struct File {
     #[serde(default)]
     inner: toml::map::Map<String, toml::Value>,
     location: Option<LocationFile>,
+    #[serde(default)]
+    equals: toml::map::Map<String, toml::Value>,
     #[serde(default)]
     about: About,
 }
@@ -231,6 +237,14 @@ impl Mechanism {
                 high: l.high.as_deref().map(|t| expression(t, "high")).transpose()?,
             }),
         };
+        let mut equals = Vec::new();
+        for (kind, value) in raw.equals {
+            let table: std::collections::BTreeMap<String, String> =
+                value.try_into().map_err(|e: toml::de::Error| fail(format!("[equals] {kind}: {}", e.message())))?;
+            for (parameter, text) in table {
+                equals.push((kind.clone(), parameter, expression(&text, "equals")?));
+            }
+        }
         // Every name in the law is a placeholder or a parameter.
         let placeholders: &[&str] = match raw.on {
             On::Motion => &["d", "t", "pi"],
@@ -278,6 +292,7 @@ impl Mechanism {
             require: raw.require.iter().map(|t| expression(t, "require")).collect::<Result<_, _>>()?,
             surcharge: raw.surcharge,
             region,
+            equals,
             about: raw.about,
         })
     }

@@ -90,6 +90,8 @@ pub struct Search<'a> {
     pub library: &'a [Mechanism],
     /// Watches.
     pub observer: &'a dyn Observer,
+    /// Never try another hold than the stated ones.
+    pub keep_holds: bool,
     nominal: Setup,
     all: Vec<Candidate>,
 }
@@ -118,7 +120,7 @@ impl<'a> Search<'a> {
     pub fn new(nominal: Setup, library: &'a [Mechanism], observer: &'a dyn Observer) -> Search<'a> {
         let places = places(&nominal.model);
         let all = candidates(&nominal.model, library, &places);
-        Search { library, observer, nominal, all }
+        Search { library, observer, keep_holds: false, nominal, all }
     }
 
     /// The candidates it considers.
@@ -169,6 +171,15 @@ impl<'a> Search<'a> {
                 (part.candidate.clone(), values, part.scales.clone())
             })
             .collect()
+    }
+
+    /// An integration method whose error is a fiftieth of the residual.
+    fn method(&self, fitted: &mut Fitted, scale: &[f64]) {
+        for (p, v) in fitted.setup.model.parameters.iter_mut().zip(&fitted.fit.point.parameters) {
+            p.value = *v;
+        }
+        let tolerance: Vec<f64> = scale.iter().map(|s| 0.02 * s).collect();
+        fitted.setup.choose_method(&tolerance);
     }
 
     /// The model fitted at another level, from the stitched trajectory or the measurements.
@@ -239,6 +250,9 @@ impl<'a> Search<'a> {
     /// Tries the other holds of every input; switches where the cost falls by more than `margin`.
     fn redecide_holds(&self, fitted: &Fitted, scale: &[f64], margin: f64) -> Fitted {
         let mut best = fitted.clone();
+        if self.keep_holds {
+            return best;
+        }
         for i in 0..fitted.setup.holds.len() {
             for hold in [Hold::Zero, Hold::Linear, Hold::BandLimited] {
                 if hold == best.setup.holds[i] {
@@ -247,7 +261,7 @@ impl<'a> Search<'a> {
                 let mut holds = best.setup.holds.clone();
                 holds[i] = hold;
                 let trial = Fitted { setup: best.setup.with_holds(holds), ..best.clone() };
-                let trial = self.refit(&trial, scale, 6);
+                let trial = self.refit(&trial, scale, 4);
                 if trial.fit.cost < best.fit.cost * (1.0 - margin) {
                     best = trial;
                 }
@@ -289,7 +303,26 @@ impl<'a> Search<'a> {
         let enough = (e.drop > 0.02 && e.held_out > 0.01)
             || (e.kappa > 0.8 && e.drop > 0.005 && e.held_out > 0.004 && e.t > 2.5);
         let steady = (e.t > 2.0 && e.improving >= 0.6) || (e.t > 1.5 && e.improving >= 0.8);
-        e.score > threshold && (first || share > LEAST_SHARE) && enough && steady
+        // A second effect may be small beside the first; it must then be seen everywhere.
+        let visible = first || share > LEAST_SHARE || (e.drop > 0.1 && e.t > 5.0 && e.improving >= 0.9);
+        e.score > threshold && visible && enough && steady
+    }
+
+    /// Residual sum of squares of `calibrated` at the level of `like`, in units of `scale`.
+    pub fn rss_at(&self, calibrated: &Fitted, like: &Fitted, scale: &[f64]) -> f64 {
+        let mut f = calibrated.clone();
+        if f.level.segments != like.level.segments {
+            let fixed = Setup { free: Vec::new(), ..f.setup.clone() };
+            let point = fixed.stitch(&f.level, &f.fit.point, &like.level, scale);
+            f.fit = fixed.fit(&like.level, scale, &[point], limits(8));
+            f.level = like.level.clone();
+        }
+        calibrated_rss(&f, scale)
+    }
+
+    /// Residual sum of squares of a model without its part `index`, refitted.
+    pub fn rss_without(&self, fitted: &Fitted, index: usize, scale: &[f64]) -> Option<f64> {
+        Some(self.without(fitted, index, scale, 10)?.fit.rss.iter().sum())
     }
 
     /// Runs all levels.
@@ -305,6 +338,7 @@ impl<'a> Search<'a> {
         let fit = self.nominal.fit(&level, &scale, &[start], limits(30));
         let mut calibrated = Fitted { setup: self.nominal.clone(), parts: Vec::new(), level, fit };
         scale = next_scale(&calibrated.fit, &scale, &sigma);
+        self.method(&mut calibrated, &scale);
         calibrated = self.refit(&calibrated, &scale, 15);
         calibrated = self.redecide_holds(&calibrated, &scale, 0.02);
         let mut current = calibrated.clone();
@@ -423,11 +457,40 @@ impl<'a> Search<'a> {
             }
             // A refinement has replaced its simpler relative.
             accepted.retain(|a| chosen.parts.iter().any(|p| p.candidate == a.candidate));
-            *current = chosen;
-            accepted.push(Accepted { candidate: winner, evidence, rivals });
+            match self.split(&chosen, scale) {
+                Some(split) => {
+                    let whole = Rival {
+                        candidate: winner.clone(),
+                        instance: chosen.parts[chosen.parts.len() - 1].instance.clone(),
+                        evidence,
+                        equivalent: true,
+                    };
+                    for part in &split.parts[chosen.parts.len() - 1..] {
+                        let mut others = vec![whole.clone()];
+                        others.extend(rivals.iter().filter(|r| r.candidate != part.candidate).cloned());
+                        accepted.push(Accepted {
+                            candidate: part.candidate.clone(),
+                            evidence,
+                            rivals: others,
+                        });
+                    }
+                    *current = split;
+                }
+                None => {
+                    *current = chosen;
+                    accepted.push(Accepted { candidate: winner, evidence, rivals });
+                }
+            }
             *scale = next_scale(&current.fit, scale, sigma);
+            self.method(current, scale);
             *current = self.refit(current, scale, 10);
+            let holds = current.setup.holds.clone();
             *current = self.redecide_holds(current, scale, 0.002);
+            if current.setup.holds != holds {
+                *scale = next_scale(&current.fit, scale, sigma);
+                self.method(current, scale);
+                *current = self.refit(current, scale, 10);
+            }
             *scale = next_scale(&current.fit, scale, sigma);
             *current = self.refit(current, scale, 5);
             self.prune(current, accepted, scale);
@@ -478,6 +541,38 @@ impl<'a> Search<'a> {
                 self.extend(&base, candidate, again.first()?, scale, 20)
             }
         }
+    }
+
+    /// The last part written as the sum of simpler mechanisms that it equals exactly.
+    fn split(&self, fitted: &Fitted, scale: &[f64]) -> Option<Fitted> {
+        let n0 = self.nominal.model.parameters.len();
+        let mut parts = self.parts(fitted);
+        let (whole, values, _) = parts.pop()?;
+        let mechanism = &self.library[whole.mechanism];
+        if mechanism.equals.is_empty() {
+            return None;
+        }
+        let Place::Motion(motion) = &whole.place else { return None };
+        let touched: Vec<usize> = (0..motion.weights.len()).filter(|&e| motion.weights[e] != 0.0).collect();
+        let value = |n: &str| Some(values[mechanism.parameters().position(|p| p == n)?]);
+        for (kind, _, expression) in &mechanism.equals {
+            let part = self.all.iter().find(|c| {
+                self.library[c.mechanism].kind == *kind
+                    && !parts.iter().any(|p| p.0 == **c)
+                    && match &c.place {
+                        Place::Equation(e) => touched == [*e] && motion.weights[*e] == 1.0,
+                        place => *place == whole.place && !c.mirrored,
+                    }
+            })?;
+            parts.push((part.clone(), vec![expression.eval(&|n, _| value(n))?], Vec::new()));
+        }
+        let head = &fitted.fit.point.parameters[..n0];
+        let (setup, kept) = self.assemble(&fitted.setup.holds, head, &parts, &fitted.setup).ok()?;
+        let mut parameters = head.to_vec();
+        parameters.extend(parts.iter().flat_map(|p| p.1.iter().copied()));
+        let point = Point { parameters, starts: fitted.fit.point.starts.clone() };
+        let fit = setup.fit(&fitted.level, scale, &[point], limits(3));
+        Some(Fitted { setup, parts: kept, level: fitted.level.clone(), fit })
     }
 
     /// The model without the winner, from the winner's parameters.
@@ -584,7 +679,3 @@ fn calibrated_rss(calibrated: &Fitted, scale: &[f64]) -> f64 {
     calibrated.setup.with_problem(&calibrated.level, scale, |p| p.rss(&rows)).0.iter().sum()
 }
 
-/// The equations' names a candidate touches in a model.
-pub fn touched(model: &Model, place: &Place) -> Vec<String> {
-    place.equations(model)
-}

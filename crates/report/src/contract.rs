@@ -235,17 +235,17 @@ pub struct Alternative {
 }
 
 /// Where something acts: in which equation, when, in which part of the state space, at which frequencies.
-/// What is not known is left out; an empty location is `{}`.
+/// An unknown equation or band is left out; unknown windows and regions are empty.
 #[derive(Debug, Clone, PartialEq, Default, Serialize, Deserialize, JsonSchema)]
 pub struct Location {
     /// Equation or equations of the model.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub equation: Option<Names>,
     /// Time windows in s from the start of each recording, by file name.
-    #[serde(default, skip_serializing_if = "Ordered::is_empty")]
+    #[serde(default)]
     pub windows_s: Ordered<Vec<Interval>>,
     /// Ranges of expressions of the model language (`theta'`, `abs(v)`); an open end is `null`.
-    #[serde(default, skip_serializing_if = "Ordered::is_empty")]
+    #[serde(default)]
     pub region: Ordered<[Option<f64>; 2]>,
     /// Frequency band in Hz.
     #[serde(default, skip_serializing_if = "Option::is_none")]

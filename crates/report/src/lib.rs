@@ -28,6 +28,7 @@
 //! It depends on no other greybox crate, reads no file and prints nothing.
 
 pub mod contract;
+pub mod convert;
 pub mod decimate;
 pub mod diff;
 pub mod expression;

@@ -42,9 +42,9 @@ pub fn summary(report: &Report) -> Vec<String> {
     }
     if report.verdict != Verdict::Unexplained && report.remainder.significant {
         out.push(format!(
-            "Something more is missing: {} of the residual is still unexplained{}.",
-            format::probability(report.remainder.share_of_residual),
-            place(&report.remainder.location)
+            "Something smaller is still missing{}: {} of the calibrated model's residual is left and is not noise.",
+            place(&report.remainder.location),
+            format::probability(report.remainder.share_of_residual)
         ));
     }
     for (name, hold) in &report.inputs {

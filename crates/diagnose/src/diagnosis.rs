@@ -1,0 +1,891 @@
+//! From recordings and a nominal model to the finished diagnosis.
+
+use std::sync::Arc;
+
+use greybox_calibrate::{Data, DataError, FreeRun, Limits, Point, Score, Setup, free_parameters, qr, window_length};
+use greybox_model::{Hold, Model};
+use greybox_model::system::CompileError;
+use greybox_recording::Recording;
+
+use crate::along::Along;
+use crate::evidence::Evidence;
+use crate::library::{Mechanism, MechanismError, built_in};
+use crate::locate::{Location, force, locate};
+use crate::place::Place;
+use crate::screen::project;
+use crate::search::{Fitted, Found, Search, rms};
+use crate::surface::{Surface, Variable};
+use crate::{Observer, Stage};
+
+/// Share of each recording held out when no recording is.
+pub const HELD_OUT_SHARE: f64 = 0.2;
+
+/// What may be chosen.
+#[derive(Debug, Clone, Default)]
+pub struct Options {
+    /// Seed, echoed into the report. (Nothing in the present algorithm is random.)
+    pub seed: u64,
+    /// Mechanisms instead of the built-in library.
+    pub library: Option<Vec<Mechanism>>,
+}
+
+/// Why a diagnosis could not be made.
+#[derive(Debug, thiserror::Error)]
+#[non_exhaustive]
+pub enum DiagnoseError {
+    /// The recordings do not fit the model.
+    #[error(transparent)]
+    Data(#[from] DataError),
+    /// The model does not compile.
+    #[error(transparent)]
+    Compile(#[from] CompileError),
+    /// A mechanism file is wrong.
+    #[error(transparent)]
+    Mechanism(#[from] MechanismError),
+    /// No recording to learn from.
+    #[error("no training recording: name at least one CSV file")]
+    NoTraining,
+    /// Too little data.
+    #[error("{file}: only {found} samples to learn from; a diagnosis needs at least {needed}. Record longer")]
+    TooShort {
+        /// File.
+        file: String,
+        /// Samples there are.
+        found: usize,
+        /// Samples needed.
+        needed: usize,
+    },
+    /// The simulation leaves every bound with the nominal parameters and cannot be calibrated.
+    #[error(
+        "the simulation of the nominal model diverges within the first samples of `{file}`, whatever its parameters: check signs and units of the model's equations"
+    )]
+    Diverges {
+        /// File.
+        file: String,
+    },
+}
+
+/// The answer.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum Verdict {
+    /// Nothing beyond noise is missing once the parameters are calibrated.
+    Consistent,
+    /// Physics is missing and named.
+    MissingPhysics,
+    /// Something is missing that no mechanism explains.
+    Unexplained,
+}
+
+/// A value with its 95 % interval, SI.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct Estimate {
+    /// Value.
+    pub value: f64,
+    /// Lower and upper end; `None` for a parameter known exactly.
+    pub ci95: Option<(f64, f64)>,
+}
+
+/// A parameter of the nominal model before and after.
+#[derive(Debug, Clone)]
+pub struct ParameterChange {
+    /// Index in the model.
+    pub index: usize,
+    /// As given.
+    pub nominal: f64,
+    /// In the calibrated model.
+    pub calibrated: Estimate,
+    /// In the improved model.
+    pub improved: Estimate,
+}
+
+/// Another explanation.
+#[derive(Debug, Clone)]
+pub struct Alternative {
+    /// Kind.
+    pub kind: String,
+    /// Its probability beside the named mechanism.
+    pub confidence: f64,
+    /// The data cannot separate them.
+    pub equivalent: bool,
+    /// Its law.
+    pub expression: String,
+    /// The recording that would.
+    pub separate: String,
+}
+
+/// A mechanism that was found.
+#[derive(Debug, Clone)]
+pub struct Finding {
+    /// Kind.
+    pub kind: String,
+    /// What it looks like.
+    pub signature: String,
+    /// Names of the equations it enters.
+    pub equations: Vec<String>,
+    /// Channel, for a fault of a sensor.
+    pub channel: Option<String>,
+    /// Input, for a fault of the actuation.
+    pub input: Option<String>,
+    /// The law in the model's names.
+    pub expression: String,
+    /// Parameters: name in the report, index in the improved model, estimate.
+    pub parameters: Vec<(String, usize, Estimate)>,
+    /// Share of the calibrated model's misfit that is lost without it.
+    pub share_explained: f64,
+    /// Probability among the explanations tried.
+    pub confidence: f64,
+    /// Others.
+    pub alternatives: Vec<Alternative>,
+    /// Where it acts.
+    pub location: Location,
+    /// Evidence when it was accepted.
+    pub evidence: Evidence,
+    /// Its law against the residual: variable, and per training sample (variable, residual force,
+    /// law's force).
+    pub curve: Option<Curve>,
+}
+
+/// A law beside the force that the rest of the model leaves over.
+#[derive(Debug, Clone)]
+pub struct Curve {
+    /// Expression of the variable.
+    pub variable: String,
+    /// (variable, force left over by the improved model without this mechanism), SI.
+    pub points: Vec<(f64, f64)>,
+    /// (variable, force of the law), sorted, SI.
+    pub law: Vec<(f64, f64)>,
+}
+
+/// What is still unexplained.
+#[derive(Debug, Clone)]
+pub struct Remainder {
+    /// Whether free shapes still predict the residual.
+    pub significant: bool,
+    /// Where.
+    pub location: Location,
+    /// What free shapes still explain on data they have not seen, as a share of the calibrated model's
+    /// residual.
+    pub share_of_residual: f64,
+    /// A sentence on its shape.
+    pub shape: Option<String>,
+}
+
+/// Free runs and scores of one model on one role's recordings.
+#[derive(Debug, Clone)]
+pub struct Run {
+    /// Simulated outputs.
+    pub run: FreeRun,
+    /// Scores over all recordings, per channel.
+    pub scores: Vec<Score>,
+    /// Scores per recording, per channel.
+    pub by_recording: Vec<Vec<Score>>,
+}
+
+/// The three models on one role's recordings.
+#[derive(Debug)]
+pub struct Role {
+    /// The data.
+    pub data: Arc<Data>,
+    /// The model as given.
+    pub nominal: Run,
+    /// The same equations, refitted.
+    pub calibrated: Run,
+    /// With the mechanisms.
+    pub improved: Run,
+}
+
+/// Everything a report needs.
+#[derive(Debug)]
+pub struct Diagnosis {
+    /// Verdict.
+    pub verdict: Verdict,
+    /// As given.
+    pub nominal: Model,
+    /// Refitted.
+    pub calibrated: Model,
+    /// With the mechanisms (equal to `calibrated` when none was found).
+    pub improved: Model,
+    /// Mechanisms, largest share first.
+    pub mechanisms: Vec<Finding>,
+    /// Remainder.
+    pub remainder: Remainder,
+    /// Parameters of the nominal model.
+    pub parameters: Vec<ParameterChange>,
+    /// Training recordings.
+    pub train: Role,
+    /// Held-out recordings.
+    pub holdout: Role,
+    /// Where the held-out data come from, in words.
+    pub holdout_source: String,
+    /// Window of the restarted simulations, s.
+    pub window: f64,
+    /// Noise over the spread of each channel.
+    pub noise_floor: Vec<f64>,
+    /// Hold of each input: as given, and the better one.
+    pub holds: Vec<(Hold, Hold)>,
+    /// Whether the better hold mattered.
+    pub better_holds: Vec<usize>,
+    /// Seed.
+    pub seed: u64,
+}
+
+/// Diagnoses a model.
+///
+/// # Errors
+/// [`DiagnoseError`] when the recordings do not fit the model or hold too little data.
+pub fn diagnose(
+    model: &Model,
+    train: &[Recording],
+    holdout: &[Recording],
+    options: &Options,
+    observer: &dyn Observer,
+) -> Result<Diagnosis, DiagnoseError> {
+    let library = match &options.library {
+        Some(library) => library.clone(),
+        None => built_in()?,
+    };
+    let Layout { train, holdout, source } = layout(model, train, holdout)?;
+    let nominal = Setup::new(model, train.clone(), free_parameters(model))?;
+    let search = Search::new(nominal.clone(), &library, observer);
+    let found = search.run();
+    conclude(&nominal, holdout, source, &library, &search, found, options, observer)
+}
+
+/// Training and held-out data.
+pub struct Layout {
+    /// Training.
+    pub train: Arc<Data>,
+    /// Held out.
+    pub holdout: Arc<Data>,
+    /// Where the held-out data come from.
+    pub source: String,
+}
+
+/// Lays the recordings out, holding out the last fifth of each when none is held out.
+///
+/// # Errors
+/// As [`diagnose`].
+pub fn layout(model: &Model, train: &[Recording], holdout: &[Recording]) -> Result<Layout, DiagnoseError> {
+    if train.is_empty() {
+        return Err(DiagnoseError::NoTraining);
+    }
+    // The whole recordings first: errors name them as they are.
+    let whole = Data::new(model, train)?;
+    let needed = 4 * model.states.iter().map(|s| s.order).sum::<usize>() + 4 * model.parameters.len().min(8) + 8;
+    let found: usize = whole.pieces.iter().map(|p| p.len).sum();
+    if found < needed {
+        return Err(DiagnoseError::TooShort { file: whole.recordings.join(", "), found, needed });
+    }
+    if holdout.is_empty() {
+        let (head, tail) = Data::split_tail(train, HELD_OUT_SHARE);
+        if !head.is_empty() {
+            return Ok(Layout {
+                train: Arc::new(Data::new(model, &head)?),
+                holdout: Arc::new(Data::new(model, &tail)?),
+                source: "the last fifth of each recording".to_string(),
+            });
+        }
+    }
+    let held = Data::new(model, if holdout.is_empty() { train } else { holdout })?;
+    let source = if holdout.is_empty() {
+        "none: the recordings are too short to hold anything out; these are the training figures".to_string()
+    } else {
+        format!("recordings held out: {}", held.recordings.join(", "))
+    };
+    Ok(Layout { train: Arc::new(whole), holdout: Arc::new(held), source })
+}
+
+fn conclude(
+    nominal: &Setup,
+    holdout: Arc<Data>,
+    holdout_source: String,
+    library: &[Mechanism],
+    search: &Search<'_>,
+    found: Found,
+    options: &Options,
+    observer: &dyn Observer,
+) -> Result<Diagnosis, DiagnoseError> {
+    let train = nominal.data.clone();
+    let durations: Vec<f64> =
+        train.pieces.iter().map(|p| (p.len.saturating_sub(1)) as f64 * p.dt).collect();
+    let dt = train.pieces.iter().map(|p| p.dt).fold(0.0, f64::max);
+    let window = window_length(&durations, dt);
+    observer.stage(Stage::Simulating);
+    let calibrated = polish_baseline(&found.calibrated, &nominal.values(), &found.scale);
+    let improved = if found.improved.parts.is_empty() {
+        Fitted { ..calibrated.clone() }
+    } else {
+        polish(&found.improved, &found.scale, window)
+    };
+    let scale = residual_scale(&improved, &found.scale);
+    let calibrated_scale = residual_scale(&calibrated, &found.scale);
+    let intervals = |f: &Fitted, scale: &[f64]| interval_widths(f, scale);
+    let calibrated_widths = intervals(&calibrated, &calibrated_scale);
+    let improved_widths = intervals(&improved, &scale);
+    let value_of = |f: &Fitted, widths: &[f64], index: usize| {
+        let value = f.fit.point.parameters[index];
+        let width = f.setup.free.iter().position(|x| x.index == index).map(|i| widths[i]);
+        Estimate { value, ci95: width.map(|w| (value - w, value + w)) }
+    };
+    let final_model = |f: &Fitted| {
+        let mut model = f.setup.model.clone();
+        for (p, v) in model.parameters.iter_mut().zip(&f.fit.point.parameters) {
+            p.value = *v;
+        }
+        // The mechanisms' units follow from the equations they enter.
+        let _ = model.resolve_units();
+        model
+    };
+    let (calibrated_model, improved_model) = (final_model(&calibrated), final_model(&improved));
+    let parameters = (0..nominal.model.parameters.len())
+        .map(|i| ParameterChange {
+            index: i,
+            nominal: nominal.model.parameters[i].value,
+            calibrated: value_of(&calibrated, &calibrated_widths, i),
+            improved: value_of(&improved, &improved_widths, i),
+        })
+        .collect();
+
+    // Free runs.
+    let role = |data: &Arc<Data>, held: bool| -> Result<Role, DiagnoseError> {
+        let run = |f: &Setup, parameters: &[f64], scale: &[f64]| -> Result<Run, DiagnoseError> {
+            let setup = if held {
+                let mut s = Setup::new(&f.model, data.clone(), Vec::new())?;
+                s.method = f.method;
+                s
+            } else {
+                f.clone()
+            };
+            let run = setup.free_run(parameters, scale);
+            let scores = setup.scores(&run, parameters, window, None);
+            let by_recording = (0..data.recordings.len())
+                .map(|r| setup.scores(&run, parameters, window, Some(r)))
+                .collect();
+            Ok(Run { run, scores, by_recording })
+        };
+        let nominal_scale: Vec<f64> = data.spread.iter().map(|s| s.max(1e-300)).collect();
+        Ok(Role {
+            data: data.clone(),
+            nominal: run(nominal, &nominal.values(), &nominal_scale)?,
+            calibrated: run(&calibrated.setup, &calibrated.fit.point.parameters, &calibrated_scale)?,
+            improved: run(&improved.setup, &improved.fit.point.parameters, &scale)?,
+        })
+    };
+    let train_role = role(&train, false)?;
+    let holdout_role = role(&holdout, true)?;
+
+    // Mechanisms, remainder, verdict.
+    let surface = surface(&improved, &scale);
+    let misfit = rms(&improved.fit, &found.scale)
+        .iter()
+        .zip(&train.sigma)
+        .map(|(r, s)| r / s)
+        .fold(0.0, f64::max);
+    let fired = |gain: f64, ratio: f64| {
+        surface.as_ref().is_some_and(|s| s.gain > gain && s.t > 2.5) && misfit > ratio
+    };
+    let full: f64 = improved.fit.rss.iter().sum();
+    let base = search.rss_at(&calibrated, &improved, &found.scale);
+    let explained = 1.0 - full / base.max(1e-300);
+    let verdict = if improved.parts.is_empty() {
+        if fired(0.2, 1.3) { Verdict::Unexplained } else { Verdict::Consistent }
+    } else if fired(0.2, 1.3) && explained < 0.5 {
+        Verdict::Unexplained
+    } else {
+        Verdict::MissingPhysics
+    };
+    let significant = if improved.parts.is_empty() { fired(0.2, 1.3) } else { fired(0.05, 1.1) };
+    let mut mechanisms = if verdict == Verdict::MissingPhysics {
+        findings(&improved, &found, library, search, &scale, base, full, &train_role, &improved_widths)
+    } else {
+        Vec::new()
+    };
+    mechanisms.sort_by(|a, b| b.share_explained.total_cmp(&a.share_explained));
+    let remainder = remainder(&improved, surface, significant, full / base.max(1e-300));
+    let noise_floor =
+        train.sigma.iter().zip(&train.spread).map(|(s, d)| s / d.max(1e-300)).collect();
+    let holds = nominal.holds.iter().copied().zip(improved.setup.holds.iter().copied()).collect();
+    let unexplained = verdict != Verdict::MissingPhysics && !improved.parts.is_empty();
+    Ok(Diagnosis {
+        verdict,
+        nominal: nominal.model.clone(),
+        improved: if unexplained { calibrated_model.clone() } else { improved_model },
+        calibrated: calibrated_model,
+        mechanisms,
+        remainder,
+        parameters,
+        train: train_role,
+        holdout: holdout_role,
+        holdout_source,
+        window,
+        noise_floor,
+        holds,
+        better_holds: found.better_holds.iter().map(|b| b.0).collect(),
+        seed: options.seed,
+    })
+}
+
+fn residual_scale(fitted: &Fitted, scale: &[f64]) -> Vec<f64> {
+    rms(&fitted.fit, scale)
+        .iter()
+        .zip(&fitted.setup.data.sigma)
+        .map(|(r, s)| r.max(0.7 * s))
+        .collect()
+}
+
+/// The baseline refitted on whole pieces, from the segments' parameters and from the nominal ones: the
+/// parameters that simulate the training recordings best in free run.
+fn polish_baseline(fitted: &Fitted, nominal: &[f64], scale: &[f64]) -> Fitted {
+    let setup = &fitted.setup;
+    let own = residual_scale(fitted, scale);
+    let level = setup.level(1);
+    let free_run = |p: &[f64]| -> f64 {
+        let run = setup.free_run(p, &own);
+        let scores = setup.scores(&run, p, f64::INFINITY, None);
+        scores.iter().map(|s| s.nrmse.powi(2)).sum()
+    };
+    let mut best = (free_run(&fitted.fit.point.parameters), None);
+    let stitched = setup.stitch(&fitted.level, &fitted.fit.point, &level, &own);
+    for mut start in [
+        stitched,
+        Point { parameters: nominal.to_vec(), starts: setup.starts(&level, nominal) },
+    ] {
+        for (s, prior) in start.starts.iter_mut().zip(&level.priors) {
+            for (x, (mean, std)) in s.iter_mut().zip(prior) {
+                if std.is_finite() {
+                    *x = *mean;
+                }
+            }
+        }
+        let whole = setup.fit(&level, &own, &[start], Limits { iterations: 30, tolerance: 1e-6 });
+        let quality = free_run(&whole.point.parameters);
+        if quality < best.0 {
+            best = (quality, Some(whole.point.parameters));
+        }
+    }
+    with_parameters(fitted, best.1, scale)
+}
+
+/// The improved model refitted on whole pieces, kept where its free run gains and its restarted windows
+/// do not lose: an axis that integrates would otherwise bend its parameters to absorb drift.
+fn polish(fitted: &Fitted, scale: &[f64], window: f64) -> Fitted {
+    let setup = &fitted.setup;
+    let level = setup.level(1);
+    if level.segments == fitted.level.segments {
+        return fitted.clone();
+    }
+    let own = residual_scale(fitted, scale);
+    let stitched = setup.stitch(&fitted.level, &fitted.fit.point, &level, &own);
+    let hats = Point {
+        parameters: fitted.fit.point.parameters.clone(),
+        starts: setup.starts(&level, &fitted.fit.point.parameters),
+    };
+    let whole = setup.fit(&level, &own, &[stitched, hats], Limits { iterations: 20, tolerance: 1e-6 });
+    let quality = |p: &[f64]| -> (f64, f64) {
+        let run = setup.free_run(p, &own);
+        let scores = setup.scores(&run, p, window, None);
+        (scores.iter().map(|s| s.nrmse.ln()).sum(), scores.iter().map(|s| s.nrmse_windowed.ln()).sum())
+    };
+    let before = quality(&fitted.fit.point.parameters);
+    let after = quality(&whole.point.parameters);
+    let keep = after.0 < before.0 && after.1 < before.1 + 0.02;
+    with_parameters(fitted, keep.then_some(whole.point.parameters), scale)
+}
+
+/// The model at other parameters, its segments' starts refitted: for intervals and tests.
+fn with_parameters(fitted: &Fitted, parameters: Option<Vec<f64>>, scale: &[f64]) -> Fitted {
+    let Some(parameters) = parameters else { return fitted.clone() };
+    let free = Setup { free: Vec::new(), ..fitted.setup.clone() };
+    let point = Point { parameters, starts: fitted.fit.point.starts.clone() };
+    let fit = free.fit(&fitted.level, scale, &[point], Limits { iterations: 8, tolerance: 1e-6 });
+    Fitted { fit, ..fitted.clone() }
+}
+
+/// Half widths of the 95 % intervals of the free parameters: the larger of the Gauss–Newton and the
+/// block-sandwich covariance, with a t quantile for the number of blocks.
+pub fn interval_widths(fitted: &Fitted, scale: &[f64]) -> Vec<f64> {
+    let setup = &fitted.setup;
+    let (nx, ny, np) = (setup.system.nx, setup.system.ny, setup.free.len());
+    if np == 0 {
+        return Vec::new();
+    }
+    let rows = setup.with_problem(&fitted.level, scale, |p| p.rows(&fitted.fit.point, true, None));
+    let total: usize = fitted.level.segments.iter().map(|s| s.range.len()).sum();
+    let length = (total / 40).max(1);
+    let mut h = vec![0.0; np * np];
+    let mut scores: Vec<Vec<f64>> = Vec::new();
+    let (mut rss, mut count) = (0.0, 0usize);
+    for (segment, rows) in fitted.level.segments.iter().zip(rows) {
+        let p = project(rows, nx);
+        let (n, m) = (segment.range.len(), p.rows);
+        rss += qr::dot(&p.r, &p.r);
+        count += ny * n;
+        for a in 0..np {
+            for b in 0..np {
+                h[a * np + b] += qr::dot(&p.jp[a * m..(a + 1) * m], &p.jp[b * m..(b + 1) * m]);
+            }
+        }
+        let parts = (n as f64 / length as f64).round().max(1.0) as usize;
+        for b in 0..parts {
+            let (from, to) = (b * n / parts, (b + 1) * n / parts);
+            scores.push(
+                (0..np)
+                    .map(|a| {
+                        (0..ny)
+                            .map(|c| {
+                                let r = c * n + from..c * n + to;
+                                qr::dot(&p.jp[a * m..(a + 1) * m][r.clone()], &p.r[r])
+                            })
+                            .sum()
+                    })
+                    .collect(),
+            );
+        }
+    }
+    for (i, f) in setup.free.iter().enumerate() {
+        if f.std.is_finite() && f.std > 0.0 {
+            h[i * np + i] += 1.0 / (f.std * f.std);
+        }
+    }
+    let d: Vec<f64> = (0..np).map(|i| h[i * np + i].max(1e-300).sqrt()).collect();
+    let scaled: Vec<f64> = (0..np * np).map(|i| h[i] / (d[i / np] * d[i % np])).collect();
+    let inverse: Vec<Vec<f64>> = (0..np)
+        .map(|i| {
+            let mut e = vec![0.0; np];
+            e[i] = 1.0;
+            qr::solve_spd(&scaled, np, &e)
+        })
+        .collect();
+    let variance = rss / (count.saturating_sub(np)).max(1) as f64;
+    let blocks = scores.len();
+    let freedom = (blocks as f64 - np as f64).max(2.0);
+    use statrs::distribution::{ContinuousCDF, StudentsT};
+    let t = StudentsT::new(0.0, 1.0, freedom).map_or(2.0, |s| s.inverse_cdf(0.975));
+    (0..np)
+        .map(|i| {
+            let naive = inverse[i][i] * variance;
+            let sandwich: f64 = scores
+                .iter()
+                .map(|s| (0..np).map(|a| inverse[i][a] * s[a] / d[a]).sum::<f64>().powi(2))
+                .sum::<f64>()
+                * blocks as f64
+                / freedom;
+            t * naive.max(sandwich).max(0.0).sqrt() / d[i]
+        })
+        .collect()
+}
+
+fn surface(fitted: &Fitted, scale: &[f64]) -> Option<Surface> {
+    crate::surface::test(&fitted.setup, &fitted.level, scale, &fitted.fit.point)
+}
+
+fn findings(
+    improved: &Fitted,
+    found: &Found,
+    library: &[Mechanism],
+    search: &Search<'_>,
+    scale: &[f64],
+    base: f64,
+    full: f64,
+    train: &Role,
+    widths: &[f64],
+) -> Vec<Finding> {
+    let mut setup = improved.setup.clone();
+    for (p, v) in setup.model.parameters.iter_mut().zip(&improved.fit.point.parameters) {
+        p.value = *v;
+    }
+    let along = Along::simulated(&setup, &train.improved.run.x, &improved.fit.point.parameters);
+    let hats = Along::smoothed(&setup, &improved.level, scale, &improved.fit.point);
+    improved
+        .parts
+        .iter()
+        .enumerate()
+        .map(|(i, part)| {
+            let mechanism = &library[part.candidate.mechanism];
+            let accepted = found.accepted.iter().find(|a| a.candidate == part.candidate);
+            let without = search.rss_without(improved, i, &found.scale).unwrap_or(base);
+            let evidence = accepted.map_or(
+                Evidence { score: 0.0, drop: 0.0, held_out: 0.0, t: 0.0, improving: 0.0, kappa: 1.0 },
+                |a| a.evidence,
+            );
+            // Posterior weights of the explanations tried; equivalent ones share their weight.
+            let rivals = accepted.map_or(&[][..], |a| &a.rivals[..]);
+            let weight = |score: f64| (0.5 * (score - evidence.score)).clamp(-60.0, 0.0).exp();
+            let others: f64 =
+                rivals.iter().filter(|r| !r.equivalent).map(|r| weight(r.evidence.score)).sum();
+            let nothing = weight(0.0);
+            let confidence = (1.0 / (1.0 + others + nothing)).clamp(0.01, 0.99);
+            let mut alternatives: Vec<Alternative> = rivals
+                .iter()
+                .map(|r| {
+                    let m = &library[r.candidate.mechanism];
+                    let probability = if r.equivalent {
+                        confidence
+                    } else {
+                        (weight(r.evidence.score) / (1.0 + others + nothing)).clamp(0.0, 0.99)
+                    };
+                    Alternative {
+                        kind: m.kind.clone(),
+                        confidence: probability,
+                        equivalent: r.equivalent,
+                        expression: r.instance.expression.to_string(),
+                        separate: m.about.separate.clone(),
+                    }
+                })
+                .filter(|a| a.equivalent || a.confidence > 0.001)
+                .collect();
+            twins(&mut alternatives, mechanism, part.candidate.clone(), &setup, confidence);
+            alternatives.sort_by(|a, b| {
+                b.equivalent.cmp(&a.equivalent).then(b.confidence.total_cmp(&a.confidence))
+            });
+            let parameters = part
+                .instance
+                .names
+                .iter()
+                .filter_map(|name| {
+                    let index = setup.model.parameter(name)?;
+                    let value = improved.fit.point.parameters[index];
+                    let width = setup.free.iter().position(|f| f.index == index).map(|i| widths[i]);
+                    let estimate = Estimate { value, ci95: width.map(|w| (value - w, value + w)) };
+                    Some((name.clone(), index, estimate))
+                })
+                .collect();
+            let (channel, input) = match &part.candidate.place {
+                Place::Measurement(c) => (Some(setup.model.measurements[*c].channel.clone()), None),
+                Place::Input(u) => (None, Some(setup.model.inputs[*u].name.clone())),
+                _ => (None, None),
+            };
+            Finding {
+                kind: mechanism.kind.clone(),
+                signature: mechanism.about.signature.clone(),
+                equations: part.candidate.place.equations(&setup.model),
+                channel,
+                input,
+                expression: part.instance.expression.to_string(),
+                parameters,
+                share_explained: ((without - full) / base.max(1e-300)).clamp(0.0, 1.0),
+                confidence,
+                alternatives,
+                location: locate(&setup, &along, mechanism, &part.instance),
+                evidence,
+                curve: curve(&setup, &hats, mechanism, &part.instance, &part.candidate.place),
+            }
+        })
+        .collect()
+}
+
+/// Algebraic twins that no recording of this kind can tell apart are declared even when they were not
+/// tried: an input offset and a constant force where the input enters linearly.
+fn twins(
+    alternatives: &mut Vec<Alternative>,
+    mechanism: &Mechanism,
+    candidate: crate::candidate::Candidate,
+    setup: &Setup,
+    confidence: f64,
+) {
+    let (twin, separate) = match mechanism.kind.as_str() {
+        "constant_offset" => ("input_offset", "another gain of the amplifier: an input offset scales with it, a constant force does not"),
+        "input_offset" => ("constant_offset", "the input switched off with the machine free to move"),
+        _ => return,
+    };
+    // Where the input enters linearly, both make the same constant in the equation.
+    let equations = candidate.place.equations(&setup.model);
+    let linear = setup.model.inputs.iter().any(|input| {
+        setup.model.equations.iter().any(|e| {
+            equations.contains(&e.name)
+                && e.residual().mentions(&input.name)
+                && e.residual()
+                    .derivative(&input.name, 0)
+                    .simplify()
+                    .variables()
+                    .iter()
+                    .all(|(n, _)| setup.model.parameter(n).is_some())
+        })
+    });
+    if !linear {
+        return;
+    }
+    match alternatives.iter_mut().find(|a| a.kind == twin) {
+        Some(a) => {
+            a.equivalent = true;
+            a.confidence = confidence;
+        }
+        None => alternatives.push(Alternative {
+            kind: twin.to_string(),
+            confidence,
+            equivalent: true,
+            expression: String::new(),
+            separate: separate.to_string(),
+        }),
+    }
+}
+
+/// The law over its variable beside the force that the rest of the equation leaves over (computed from
+/// the smoothed measurements; for plots only).
+fn curve(
+    setup: &Setup,
+    hats: &Along<'_>,
+    mechanism: &Mechanism,
+    instance: &crate::candidate::Instance,
+    place: &Place,
+) -> Option<Curve> {
+    let (variable, equation, weight) = match place {
+        Place::Motion(m) => {
+            let rate = mechanism.law.contains("d", 1);
+            let variable = if rate { m.rate.clone()? } else { m.position.clone()? };
+            let e = m.weights.iter().position(|w| *w != 0.0)?;
+            (variable, e, m.weights[e])
+        }
+        _ => return None,
+    };
+    let x = hats.eval(std::slice::from_ref(&variable), &[])?.pop()?;
+    let f = force(setup, hats, mechanism, instance)?;
+    let left = left_over(setup, hats, equation)?;
+    let mut points = Vec::new();
+    let mut law = Vec::new();
+    for ((x, f), left) in x.iter().zip(&f).zip(&left) {
+        for ((x, f), left) in x.iter().zip(f).zip(left) {
+            if x.is_finite() && f.is_finite() && left.is_finite() {
+                points.push((*x, f - left / weight));
+                law.push((*x, *f));
+            }
+        }
+    }
+    // A few thousand points tell as much as sixty thousand.
+    let keep = points.len().div_ceil(2500).max(1);
+    let points = points.into_iter().step_by(keep).collect();
+    law.sort_by(|a, b| a.0.total_cmp(&b.0));
+    let keep = law.len().div_ceil(400).max(1);
+    let law = law.into_iter().step_by(keep).collect();
+    Some(Curve { variable: variable.to_string(), points, law })
+}
+
+/// Residual of an equation along the smoothed measurements, SI: what the improved model still lacks.
+pub fn left_over(setup: &Setup, hats: &Along<'_>, equation: usize) -> Option<Vec<Vec<f64>>> {
+    let residual = setup.model.equations[equation].residual();
+    // The highest derivatives come from the smoothed measurements, too.
+    let highest: Vec<(&str, u8)> =
+        setup.model.states.iter().map(|s| (s.name.as_str(), s.order as u8)).collect();
+    let (mass, rest) = residual.affine_in(&highest)?;
+    let mut exprs = mass;
+    exprs.push(rest);
+    let mut values = hats.eval(&exprs, &[])?;
+    let mut total = values.pop()?;
+    for (j, column) in values.iter().enumerate() {
+        for (p, (t, c)) in total.iter_mut().zip(column).enumerate() {
+            match &setup.hats.highest[p][j] {
+                Some(z) => {
+                    for ((t, c), z) in t.iter_mut().zip(c).zip(z) {
+                        *t += c * z;
+                    }
+                }
+                None if c.iter().any(|v| *v != 0.0) => return None,
+                None => {}
+            }
+        }
+    }
+    Some(total)
+}
+
+fn remainder(improved: &Fitted, surface: Option<Surface>, significant: bool, left: f64) -> Remainder {
+    let model = &improved.setup.model;
+    let mut location = Location::default();
+    let mut shape = None;
+    let share = surface.as_ref().map_or(0.0, |s| s.gain.clamp(0.0, 1.0) * left.min(1.0));
+    if significant
+        && let Some(Surface { variable: Some((variable, _)), .. }) = &surface
+    {
+        let (motion, text) = match variable {
+            Variable::Position(m) => (m, m.position.as_ref().map(|e| format!("a force that depends on {e}"))),
+            Variable::Rate(m) => (m, m.rate.as_ref().map(|e| format!("a force that depends on {e}"))),
+            Variable::Both(m) => (
+                m,
+                match (&m.position, &m.rate) {
+                    (Some(d), Some(v)) => Some(format!("a force that depends on {d} and {v} together")),
+                    _ => None,
+                },
+            ),
+            Variable::Input(u, m) => {
+                (m, Some(format!("a force that depends on the input {}", model.inputs[*u].name)))
+            }
+            Variable::Time(m) => (m, Some("a force that changes slowly with time".to_string())),
+        };
+        location.equations = Place::Motion(motion.clone()).equations(model);
+        shape = text;
+    }
+    Remainder { significant, location, share_of_residual: share, shape }
+}
+
+/// Calibrates only: the same equations, parameters refitted.
+#[derive(Debug)]
+pub struct Calibration {
+    /// The model with the fitted parameters.
+    pub model: Model,
+    /// Nominal and calibrated value with interval per parameter.
+    pub parameters: Vec<ParameterChange>,
+    /// Scores on the training recordings: nominal, calibrated.
+    pub train: (Vec<Score>, Vec<Score>),
+    /// Scores on the held-out recordings.
+    pub holdout: (Vec<Score>, Vec<Score>),
+    /// Where the held-out data come from.
+    pub holdout_source: String,
+    /// Window of the restarted simulations, s.
+    pub window: f64,
+    /// The data.
+    pub data: Arc<Data>,
+}
+
+/// Refits the parameters of a model, with uncertainties.
+///
+/// # Errors
+/// As [`diagnose`].
+pub fn calibrate(
+    model: &Model,
+    train: &[Recording],
+    holdout: &[Recording],
+    observer: &dyn Observer,
+) -> Result<Calibration, DiagnoseError> {
+    let Layout { train, holdout, source } = layout(model, train, holdout)?;
+    let nominal = Setup::new(model, train.clone(), free_parameters(model))?;
+    let mut search = Search::new(nominal.clone(), &[], observer);
+    search.keep_holds = true; // it changes parameters and nothing else
+    let found = search.run();
+    let durations: Vec<f64> =
+        train.pieces.iter().map(|p| (p.len.saturating_sub(1)) as f64 * p.dt).collect();
+    let window = window_length(&durations, train.pieces.iter().map(|p| p.dt).fold(0.0, f64::max));
+    let fitted = polish_baseline(&found.calibrated, &nominal.values(), &found.scale);
+    let scale = residual_scale(&fitted, &found.scale);
+    let widths = interval_widths(&fitted, &scale);
+    let values = &fitted.fit.point.parameters;
+    let mut calibrated = model.clone();
+    for (p, v) in calibrated.parameters.iter_mut().zip(values) {
+        p.value = *v;
+    }
+    let parameters = (0..model.parameters.len())
+        .map(|i| {
+            let width = fitted.setup.free.iter().position(|f| f.index == i).map(|k| widths[k]);
+            let e = Estimate { value: values[i], ci95: width.map(|w| (values[i] - w, values[i] + w)) };
+            ParameterChange { index: i, nominal: model.parameters[i].value, calibrated: e, improved: e }
+        })
+        .collect();
+    let spread: Vec<f64> = train.spread.iter().map(|s| s.max(1e-300)).collect();
+    let scores = |data: &Arc<Data>| -> Result<(Vec<Score>, Vec<Score>), DiagnoseError> {
+        let mut setup = Setup::new(model, data.clone(), Vec::new())?;
+        setup.method = fitted.setup.method;
+        let before = setup.free_run(&nominal.values(), &spread);
+        let after = setup.free_run(values, &scale);
+        Ok((
+            setup.scores(&before, &nominal.values(), window, None),
+            setup.scores(&after, values, window, None),
+        ))
+    };
+    Ok(Calibration {
+        model: calibrated,
+        parameters,
+        train: scores(&train)?,
+        holdout: scores(&holdout)?,
+        holdout_source: source,
+        window,
+        data: train,
+    })
+}

@@ -1,0 +1,274 @@
+//! The non-parametric rival: forces of free shape, to see whether anything systematic is left.
+//!
+//! Piecewise linear functions of the motion d (7 knots), of d' (7), of both (5 × 5), of each input (7),
+//! and of slow time (6 knots × \[1, d, d'\]) are injected like any candidate. What they explain on folds
+//! they were not fitted to is force that acts on the machine and has a shape; noise gains nothing.
+
+use greybox_calibrate::{Level, Point, Setup, qr};
+use greybox_simulate::SignalLanes;
+use rayon::prelude::*;
+
+use crate::along::Along;
+use crate::place::{Motion, Place, places};
+use crate::screen::project;
+
+const FOLDS: usize = 10;
+
+/// What free shapes explain beyond the model.
+#[derive(Debug, Clone, PartialEq)]
+pub struct Surface {
+    /// Relative drop of the held-out residual sum of squares.
+    pub gain: f64,
+    /// Mean over standard error of the folds' drops.
+    pub t: f64,
+    /// The variable whose functions alone explain most, and what they gain.
+    pub variable: Option<(Variable, f64)>,
+}
+
+/// A variable of the free shapes.
+#[derive(Debug, Clone, PartialEq)]
+pub enum Variable {
+    /// Position of a motion.
+    Position(Motion),
+    /// Rate of a motion.
+    Rate(Motion),
+    /// Both.
+    Both(Motion),
+    /// An input, acting where the motion acts.
+    Input(usize, Motion),
+    /// Slow time.
+    Time(Motion),
+}
+
+fn knots(values: &[Vec<f64>], n: usize) -> Option<Vec<f64>> {
+    let mut all: Vec<f64> = values.iter().flatten().copied().filter(|v| v.is_finite()).collect();
+    if all.len() < 4 * n {
+        return None;
+    }
+    all.sort_by(f64::total_cmp);
+    // Between the 1 % and 99 % quantiles, evenly in value: rare extremes get no knot of their own.
+    let (lo, hi) = (all[all.len() / 100], all[all.len() - 1 - all.len() / 100]);
+    (hi > lo).then(|| (0..n).map(|i| lo + (hi - lo) * i as f64 / (n - 1) as f64).collect())
+}
+
+/// Hat function `i` over even knots.
+fn hat(knots: &[f64], i: usize, v: f64) -> f64 {
+    let h = knots[1] - knots[0];
+    let v = v.clamp(knots[0], knots[knots.len() - 1]);
+    (1.0 - ((v - knots[i]) / h).abs()).max(0.0)
+}
+
+/// Tests a fitted model against free shapes.
+pub fn test(setup: &Setup, level: &Level, scale: &[f64], point: &Point) -> Option<Surface> {
+    let along = Along::smoothed(setup, level, scale, point);
+    let motions: Vec<Motion> = places(&setup.model)
+        .into_iter()
+        .filter_map(|p| match p {
+            Place::Motion(m) if m.weights.iter().filter(|w| **w != 0.0).count() == 1 => Some(m),
+            _ => None,
+        })
+        .take(3)
+        .collect();
+    let mut columns: Vec<(Vec<f64>, Vec<Vec<f64>>)> = Vec::new();
+    let mut groups: Vec<(Variable, std::ops::Range<usize>)> = Vec::new();
+    let pieces = &setup.data.pieces;
+    for motion in &motions {
+        let eval = |e: &Option<greybox_model::Expr>| {
+            e.as_ref().and_then(|e| along.eval(std::slice::from_ref(e), &[])?.pop())
+        };
+        let (d, v) = (eval(&motion.position), eval(&motion.rate));
+        let mut push = |variable: Variable, made: Vec<Vec<Vec<f64>>>| {
+            let first = columns.len();
+            columns.extend(made.into_iter().map(|series| (motion.weights.clone(), series)));
+            groups.push((variable, first..columns.len()));
+        };
+        let shapes = |series: &Vec<Vec<f64>>, n: usize| -> Vec<Vec<Vec<f64>>> {
+            let Some(k) = knots(series, n) else { return Vec::new() };
+            (0..n)
+                .map(|i| series.iter().map(|s| s.iter().map(|x| hat(&k, i, *x)).collect()).collect())
+                .collect()
+        };
+        if let Some(d) = &d {
+            push(Variable::Position(motion.clone()), shapes(d, 7));
+        }
+        if let Some(v) = &v {
+            push(Variable::Rate(motion.clone()), shapes(v, 7));
+        }
+        if let (Some(d), Some(v)) = (&d, &v)
+            && let (Some(kd), Some(kv)) = (knots(d, 5), knots(v, 5))
+        {
+            let mut both = Vec::new();
+            for i in 0..5 {
+                for j in 0..5 {
+                    both.push(
+                        d.iter()
+                            .zip(v)
+                            .map(|(d, v)| {
+                                d.iter().zip(v).map(|(d, v)| hat(&kd, i, *d) * hat(&kv, j, *v)).collect()
+                            })
+                            .collect(),
+                    );
+                }
+            }
+            push(Variable::Both(motion.clone()), both);
+        }
+        for u in 0..setup.system.nu {
+            let series: Vec<Vec<f64>> = pieces.iter().map(|p| p.inputs[u].clone()).collect();
+            push(Variable::Input(u, motion.clone()), shapes(&series, 7));
+        }
+        let times: Vec<Vec<f64>> = pieces
+            .iter()
+            .map(|p| (0..p.len).map(|k| p.start + k as f64 * p.dt).collect())
+            .collect();
+        let mut slow = Vec::new();
+        for shape in shapes(&times, 6) {
+            for factor in [None, d.as_ref(), v.as_ref()] {
+                slow.push(match factor {
+                    None => shape.clone(),
+                    Some(f) => shape
+                        .iter()
+                        .zip(f)
+                        .map(|(s, f)| s.iter().zip(f).map(|(a, b)| a * b).collect())
+                        .collect(),
+                });
+            }
+        }
+        push(Variable::Time(motion.clone()), slow);
+    }
+    if columns.is_empty() {
+        return None;
+    }
+    let (lanes, nz) = (columns.len(), setup.system.nz);
+    let signals: Vec<SignalLanes> = pieces
+        .iter()
+        .enumerate()
+        .map(|(p, piece)| {
+            let mut weights = vec![0.0; nz * lanes];
+            let mut force = vec![0.0; piece.len * lanes];
+            for (l, (w, series)) in columns.iter().enumerate() {
+                for e in 0..nz {
+                    weights[e * lanes + l] = w[e];
+                }
+                for (k, v) in series[p].iter().enumerate() {
+                    force[k * lanes + l] = if v.is_finite() { *v } else { 0.0 };
+                }
+            }
+            SignalLanes { lanes, weights, force, inputs: Vec::new() }
+        })
+        .collect();
+    let (nx, ny, np) = (setup.system.nx, setup.system.ny, setup.free.len());
+    let width = np + lanes + 1;
+    let rows = setup.with_problem(level, scale, |p| p.rows(point, true, Some(&signals)));
+    let total: usize = level.segments.iter().map(|s| s.range.len()).sum();
+    let length = (total / 40).max(1);
+    // Gram matrix of [J | G | r] per block.
+    let jobs: Vec<_> = rows.into_iter().zip(&level.segments).collect();
+    let per_segment: Vec<Vec<Vec<f64>>> = jobs
+        .into_par_iter()
+        .map(|(rows, segment)| {
+            let p = project(rows, nx);
+            let (n, m) = (segment.range.len(), p.rows);
+            let parts = (n as f64 / length as f64).round().max(1.0) as usize;
+            let column = |i: usize| -> &[f64] {
+                if i < np {
+                    &p.jp[i * m..(i + 1) * m]
+                } else if i < np + lanes {
+                    &p.g[(i - np) * m..(i - np + 1) * m]
+                } else {
+                    &p.r
+                }
+            };
+            (0..parts)
+                .map(|b| {
+                    let (from, to) = (b * n / parts, (b + 1) * n / parts);
+                    let mut gram = vec![0.0; width * width];
+                    for i in 0..width {
+                        for j in 0..=i {
+                            let mut sum = 0.0;
+                            for c in 0..ny {
+                                let r = c * n + from..c * n + to;
+                                sum += qr::dot(&column(i)[r.clone()], &column(j)[r]);
+                            }
+                            gram[i * width + j] = sum;
+                            gram[j * width + i] = sum;
+                        }
+                    }
+                    gram
+                })
+                .collect()
+        })
+        .collect();
+    let blocks: Vec<Vec<f64>> = per_segment.into_iter().flatten().collect();
+    let count = FOLDS.min(blocks.len());
+    if count < 4 {
+        return None;
+    }
+    let mut whole = vec![0.0; width * width];
+    let mut folds = vec![vec![0.0; width * width]; count];
+    for (b, gram) in blocks.iter().enumerate() {
+        for (i, v) in gram.iter().enumerate() {
+            whole[i] += v;
+            folds[b % count][i] += v;
+        }
+    }
+    let errors = |chosen: &[usize]| -> Vec<f64> {
+        let n = chosen.len();
+        let r = width - 1;
+        folds
+            .iter()
+            .map(|fold| {
+                let d: Vec<f64> = chosen
+                    .iter()
+                    .map(|&i| {
+                        let v = whole[i * width + i];
+                        if v > 0.0 { v.sqrt() } else { 1.0 }
+                    })
+                    .collect();
+                let mut a = vec![0.0; n * n];
+                let mut b = vec![0.0; n];
+                for (x, &i) in chosen.iter().enumerate() {
+                    for (y, &j) in chosen.iter().enumerate() {
+                        a[x * n + y] = (whole[i * width + j] - fold[i * width + j]) / (d[x] * d[y]);
+                    }
+                    a[x * n + x] += if i < np { 1e-6 } else { 1e-3 };
+                    b[x] = (whole[i * width + r] - fold[i * width + r]) / d[x];
+                }
+                let x: Vec<f64> = qr::solve_spd(&a, n, &b).iter().zip(&d).map(|(x, d)| x / d).collect();
+                let mut sse = fold[r * width + r];
+                for (p, &i) in chosen.iter().enumerate() {
+                    sse -= 2.0 * x[p] * fold[i * width + r];
+                    for (q, &j) in chosen.iter().enumerate() {
+                        sse += x[p] * x[q] * fold[i * width + j];
+                    }
+                }
+                sse
+            })
+            .collect()
+    };
+    let parameters: Vec<usize> = (0..np).collect();
+    let base = errors(&parameters);
+    let base_sum: f64 = base.iter().sum();
+    let gain_of = |lanes: &mut dyn Iterator<Item = usize>| {
+        let mut chosen = parameters.clone();
+        chosen.extend(lanes.map(|l| np + l));
+        let e = errors(&chosen);
+        let differences: Vec<f64> = base.iter().zip(&e).map(|(a, b)| a - b).collect();
+        let k = differences.len() as f64;
+        let mean = differences.iter().sum::<f64>() / k;
+        let variance = differences.iter().map(|d| (d - mean).powi(2)).sum::<f64>() / (k - 1.0);
+        (mean * k / base_sum.max(1e-300), mean / (variance / k).sqrt().max(1e-300))
+    };
+    let (gain, t) = gain_of(&mut (0..lanes));
+    let mut best: Option<(Variable, f64)> = None;
+    let mut single = (0.0, 0.0);
+    for (variable, range) in &groups {
+        let (g, s) = gain_of(&mut range.clone());
+        if best.as_ref().is_none_or(|b| g > b.1) {
+            best = Some((variable.clone(), g));
+            single = (g, s);
+        }
+    }
+    // All functions together may overfit where one family does not: the better of the two counts.
+    let (gain, t) = if single.0 > gain { single } else { (gain, t) };
+    Some(Surface { gain, t, variable: best })
+}

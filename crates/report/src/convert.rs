@@ -1,0 +1,466 @@
+//! From a finished [`Diagnosis`] to the report's types: units, names and order change here, nothing is
+//! decided.
+
+use greybox_calibrate::Data;
+use greybox_diagnose::diagnosis::{Estimate as Estimated, Finding as Found, Role as RoleRuns, Run};
+use greybox_diagnose::locate::{Location as Located, spectrum};
+use greybox_diagnose::{Diagnosis, Verdict as Answer};
+use greybox_model::{Model, WriteOptions};
+use greybox_recording::{Recording, Severity as Level, health};
+
+use crate::contract::*;
+use crate::page::{self, MechanismPlot, ModelTexts, Page, Residual, Spectrum, StateMap};
+
+/// What the conversion needs beside the diagnosis.
+pub struct Sources<'a> {
+    /// File name of the model.
+    pub model_file: &'a str,
+    /// Text of the model file.
+    pub model_text: &'a str,
+    /// Training recordings.
+    pub train: &'a [Recording],
+    /// Held-out recordings.
+    pub holdout: &'a [Recording],
+}
+
+/// The contract's report.
+pub fn report(diagnosis: &Diagnosis, sources: &Sources<'_>) -> Report {
+    let d = diagnosis;
+    let mut report = Report {
+        greybox: Producer { version: env!("CARGO_PKG_VERSION").to_string(), seed: d.seed },
+        model: ModelId { name: d.nominal.name.clone(), file: sources.model_file.to_string() },
+        verdict: match d.verdict {
+            Answer::Consistent => Verdict::Consistent,
+            Answer::MissingPhysics => Verdict::MissingPhysics,
+            Answer::Unexplained => Verdict::Unexplained,
+        },
+        summary: Vec::new(),
+        mechanisms: d.mechanisms.iter().map(|m| mechanism(m, &d.improved)).collect(),
+        remainder: Remainder {
+            significant: d.remainder.significant,
+            location: location(&d.remainder.location),
+            share_of_residual: d.remainder.share_of_residual,
+            experiment: d.remainder.shape.as_ref().map(|shape| {
+                format!(
+                    "the residual looks like {shape}; record slow sweeps over the whole range of that variable, at two amplitudes"
+                )
+            }),
+        },
+        parameters: parameters(d),
+        fit: fit(d),
+        noise_floor: names(&d.train.data).into_iter().zip(d.noise_floor.iter().copied()).collect(),
+        inputs: d
+            .nominal
+            .inputs
+            .iter()
+            .zip(&d.holds)
+            .map(|(input, (given, best))| {
+                let hold =
+                    InputHold { hold_given: given.name().to_string(), hold_best: best.name().to_string() };
+                (input.name.clone(), hold)
+            })
+            .collect(),
+        findings: findings(d, sources),
+    };
+    report.summary = crate::sentence::summary(&report);
+    report
+}
+
+fn names(data: &Data) -> Vec<String> {
+    data.channels.iter().map(|c| c.name.clone()).collect()
+}
+
+fn interval(ci: Option<(f64, f64)>, factor: f64) -> Option<Interval> {
+    ci.map(|(low, high)| {
+        let (a, b) = (low / factor, high / factor);
+        Interval { low: a.min(b), high: a.max(b) }
+    })
+}
+
+fn equation_names(list: &[String]) -> Names {
+    match list {
+        [one] => Names::One(one.clone()),
+        many => Names::Many(many.to_vec()),
+    }
+}
+
+fn mechanism(found: &Found, improved: &Model) -> Mechanism {
+    Mechanism {
+        kind: found.kind.clone(),
+        equation: equation_names(&found.equations),
+        channel: found.channel.clone(),
+        expression: found.expression.clone(),
+        replaces: found.input.clone(),
+        states: Ordered::new(),
+        drifting: None,
+        parameters: found
+            .parameters
+            .iter()
+            .map(|(name, index, e)| {
+                let unit = improved
+                    .parameters
+                    .get(*index)
+                    .and_then(|p| p.unit.as_ref())
+                    .map_or_else(String::new, |u| u.text.clone());
+                (name.clone(), estimate(e, unit))
+            })
+            .collect(),
+        share_explained: found.share_explained,
+        confidence: found.confidence,
+        alternatives: found
+            .alternatives
+            .iter()
+            .map(|a| Alternative {
+                kind: a.kind.clone(),
+                confidence: a.confidence,
+                equivalent: a.equivalent,
+                expression: (!a.expression.is_empty()).then(|| a.expression.clone()),
+                separate: (!a.separate.is_empty()).then(|| a.separate.clone()),
+            })
+            .collect(),
+        location: location(&found.location),
+    }
+}
+
+fn estimate(e: &Estimated, unit: String) -> Estimate {
+    Estimate { value: e.value, ci95: interval(e.ci95, 1.0), unit }
+}
+
+fn location(l: &Located) -> Location {
+    Location {
+        equation: (!l.equations.is_empty()).then(|| equation_names(&l.equations)),
+        windows_s: l
+            .windows
+            .iter()
+            .map(|(file, w)| (file.clone(), w.iter().map(|(a, b)| Interval { low: *a, high: *b }).collect()))
+            .collect(),
+        region: l.region.iter().map(|(e, lo, hi)| (e.clone(), [*lo, *hi])).collect(),
+        band_hz: l.band.map(|(a, b)| Interval { low: a, high: b }),
+    }
+}
+
+fn parameters(d: &Diagnosis) -> Ordered<Parameter> {
+    d.parameters
+        .iter()
+        .map(|p| {
+            let parameter = &d.nominal.parameters[p.index];
+            let factor = parameter.unit.as_ref().map_or(1.0, |u| u.factor);
+            let entry = Parameter {
+                nominal: p.nominal / factor,
+                value: p.improved.value / factor,
+                ci95: interval(p.improved.ci95, factor),
+                unit: parameter.unit.as_ref().map(|u| u.text.clone()),
+                fixed: parameter.fixed,
+                calibrated: Some(p.calibrated.value / factor),
+                calibrated_ci95: interval(p.calibrated.ci95, factor),
+            };
+            (parameter.name.clone(), entry)
+        })
+        .collect()
+}
+
+fn scores(data: &Data, scores: &[greybox_calibrate::Score]) -> Ordered<Score> {
+    data.channels
+        .iter()
+        .zip(scores)
+        .map(|(c, s)| {
+            let score = Score {
+                nrmse: s.nrmse,
+                rmse: Some(s.rmse / c.factor),
+                nrmse_windowed: Some(s.nrmse_windowed),
+                rmse_windowed: Some(s.rmse_windowed / c.factor),
+            };
+            (c.name.clone(), score)
+        })
+        .collect()
+}
+
+fn fit_set(role: &RoleRuns, of: impl Fn(&Run) -> Vec<greybox_calibrate::Score>) -> FitSet {
+    FitSet {
+        nominal: scores(&role.data, &of(&role.nominal)),
+        calibrated: scores(&role.data, &of(&role.calibrated)),
+        improved: scores(&role.data, &of(&role.improved)),
+    }
+}
+
+fn fit(d: &Diagnosis) -> Fit {
+    let mut recordings: Ordered<RecordingFit> = Ordered::new();
+    for (r, name) in d.train.data.recordings.iter().enumerate() {
+        recordings.entry(name.clone()).or_default().train =
+            Some(fit_set(&d.train, |run| run.by_recording[r].clone()));
+    }
+    for (r, name) in d.holdout.data.recordings.iter().enumerate() {
+        recordings.entry(name.clone()).or_default().holdout =
+            Some(fit_set(&d.holdout, |run| run.by_recording[r].clone()));
+    }
+    Fit {
+        train: fit_set(&d.train, |run| run.scores.clone()),
+        holdout: fit_set(&d.holdout, |run| run.scores.clone()),
+        window_s: Some(d.window),
+        holdout_source: d.holdout_source.clone(),
+        recordings,
+    }
+}
+
+fn findings(d: &Diagnosis, sources: &Sources<'_>) -> Vec<Finding> {
+    let mut out = Vec::new();
+    for (i, (given, best)) in d.holds.iter().enumerate() {
+        if given != best {
+            let name = &d.nominal.inputs[i].name;
+            out.push(Finding {
+                severity: Severity::Warning,
+                code: "hold".to_string(),
+                recording: None,
+                channel: Some(d.nominal.inputs[i].channel.clone()),
+                message: format!(
+                    "input `{name}` behaves as hold = \"{}\" between its samples, not \"{}\"",
+                    best.name(),
+                    given.name()
+                ),
+                mend: Some(format!("state `hold = \"{}\"` for input `{name}`, as improved.toml does", best.name())),
+            });
+        }
+    }
+    let inputs: Vec<&str> = d.nominal.inputs.iter().map(|i| i.channel.as_str()).collect();
+    let outputs: Vec<&str> = d.nominal.measurements.iter().map(|m| m.channel.as_str()).collect();
+    for recording in sources.train.iter().chain(sources.holdout) {
+        for f in health::check(recording, &inputs, &outputs) {
+            let used = f.channel.as_deref().is_none_or(|c| inputs.contains(&c) || outputs.contains(&c));
+            if used {
+                out.push(Finding {
+                    severity: match f.severity {
+                        Level::Info => Severity::Info,
+                        Level::Warning => Severity::Warning,
+                        Level::Problem => Severity::Error,
+                    },
+                    code: f.code.to_string(),
+                    recording: Some(recording.name.clone()),
+                    channel: f.channel,
+                    message: f.message,
+                    mend: f.mend,
+                });
+            }
+        }
+    }
+    out
+}
+
+/// The improved model in the model language, with the user's comments kept and each new parameter
+/// explained.
+pub fn improved_toml(diagnosis: &Diagnosis, original: &str) -> String {
+    let mut comments = Vec::new();
+    for m in &diagnosis.mechanisms {
+        for (name, _, e) in &m.parameters {
+            let kind = crate::format::kind(&m.kind);
+            let width = e.ci95.map_or_else(String::new, |(lo, hi)| {
+                format!(", 95 % interval {} to {}", crate::format::significant(lo, 4), crate::format::significant(hi, 4))
+            });
+            comments.push((name.clone(), format!("{kind}, found by greybox{width}")));
+        }
+    }
+    diagnosis.improved.to_toml(&WriteOptions { original: Some(original), comments: &comments })
+}
+
+/// The page: the report and what its plots show.
+pub fn page(diagnosis: &Diagnosis, report: Report, sources: &Sources<'_>) -> Page {
+    let d = diagnosis;
+    Page {
+        title: if d.nominal.name.is_empty() { sources.model_file.to_string() } else { d.nominal.name.clone() },
+        recordings: recordings(&d.train, &d.nominal, page::Role::Train)
+            .into_iter()
+            .chain(recordings(&d.holdout, &d.nominal, page::Role::Holdout))
+            .collect(),
+        residuals: residuals(d),
+        mechanism_plots: plots(d),
+        models: ModelTexts {
+            nominal: sources.model_text.to_string(),
+            improved: improved_toml(d, sources.model_text),
+        },
+        report,
+    }
+}
+
+/// Concatenates the pieces of one recording with a missing sample between them.
+fn joined(data: &Data, recording: usize, of: impl Fn(usize) -> Vec<f64>) -> Vec<f64> {
+    let mut out: Vec<f64> = Vec::new();
+    for (i, piece) in data.pieces.iter().enumerate() {
+        if piece.recording == recording {
+            if !out.is_empty() {
+                out.push(f64::NAN);
+            }
+            out.extend(of(i));
+        }
+    }
+    out
+}
+
+fn times(data: &Data, recording: usize) -> Vec<f64> {
+    let mut out: Vec<f64> = Vec::new();
+    for piece in data.pieces.iter().filter(|p| p.recording == recording) {
+        if let Some(last) = out.last().copied() {
+            out.push(0.5 * (last + piece.start));
+        }
+        out.extend((0..piece.len).map(|k| piece.start + k as f64 * piece.dt));
+    }
+    out
+}
+
+fn output(data: &Data, run: &Run, recording: usize, c: usize, factor: f64) -> Vec<f64> {
+    joined(data, recording, |i| {
+        let n = data.pieces[i].len;
+        run.run.y[i][c * n..(c + 1) * n].iter().map(|v| v / factor).collect()
+    })
+}
+
+fn recordings(role: &RoleRuns, model: &Model, kind: page::Role) -> Vec<page::Recording> {
+    let data = &role.data;
+    (0..data.recordings.len())
+        .map(|r| page::Recording {
+            name: data.recordings[r].clone(),
+            role: kind,
+            t: times(data, r),
+            holdout_from: None,
+            channels: data
+                .channels
+                .iter()
+                .enumerate()
+                .map(|(c, info)| page::Channel {
+                    name: info.name.clone(),
+                    unit: info.unit.clone(),
+                    measured: joined(data, r, |i| {
+                        data.pieces[i].measured[c].iter().map(|v| v / info.factor).collect()
+                    }),
+                    nominal: output(data, &role.nominal, r, c, info.factor),
+                    calibrated: output(data, &role.calibrated, r, c, info.factor),
+                    improved: output(data, &role.improved, r, c, info.factor),
+                })
+                .collect(),
+            inputs: model
+                .inputs
+                .iter()
+                .enumerate()
+                .map(|(u, input)| page::Input {
+                    name: input.name.clone(),
+                    unit: input.unit.text.clone(),
+                    values: joined(data, r, |i| {
+                        data.pieces[i].inputs[u].iter().map(|v| v / input.unit.factor).collect()
+                    }),
+                })
+                .collect(),
+        })
+        .collect()
+}
+
+/// Residuals of the free runs on the training recordings, per channel.
+fn residuals(d: &Diagnosis) -> Vec<Residual> {
+    let data = &d.train.data;
+    let mut out = Vec::new();
+    for r in 0..data.recordings.len() {
+        for (c, info) in data.channels.iter().enumerate() {
+            let difference = |run: &Run| {
+                joined(data, r, |i| {
+                    let n = data.pieces[i].len;
+                    data.pieces[i].measured[c]
+                        .iter()
+                        .zip(&run.run.y[i][c * n..(c + 1) * n])
+                        .map(|(m, y)| (m - y) / info.factor)
+                        .collect()
+                })
+            };
+            let (before, after) = (difference(&d.train.calibrated), difference(&d.train.improved));
+            let windows = d
+                .mechanisms
+                .first()
+                .map(|m| {
+                    m.location
+                        .windows
+                        .iter()
+                        .filter(|(file, _)| *file == data.recordings[r])
+                        .flat_map(|(_, w)| w.iter().map(|(a, b)| Interval { low: *a, high: *b }))
+                        .collect()
+                })
+                .unwrap_or_default();
+            let sigma = data.sigma[c] / info.factor;
+            out.push(Residual {
+                recording: data.recordings[r].clone(),
+                channel: info.name.clone(),
+                unit: info.unit.clone(),
+                t: times(data, r),
+                noise_sigma: sigma,
+                windows,
+                spectrum: spectra(data, r, &before, &after, sigma),
+                map: state_map(d, r, c, &after),
+                before,
+                after,
+            });
+        }
+    }
+    out
+}
+
+fn spectra(data: &Data, recording: usize, before: &[f64], after: &[f64], sigma: f64) -> Option<Spectrum> {
+    let piece = data.pieces.iter().filter(|p| p.recording == recording).max_by_key(|p| p.len)?;
+    let filled = |x: &[f64]| greybox_recording::interpolate::fill_missing(x);
+    let (freq, b) = spectrum(&filled(before), piece.dt);
+    let (_, a) = spectrum(&filled(after), piece.dt);
+    if freq.len() < 8 {
+        return None;
+    }
+    let level = 2.0 * sigma * sigma * piece.dt;
+    Some(Spectrum { noise: vec![level; freq.len()], freq, before: b, after: a })
+}
+
+/// Size of the calibrated model's residual over the state plane of the first coordinate.
+fn state_map(d: &Diagnosis, recording: usize, channel: usize, _after: &[f64]) -> Option<StateMap> {
+    let state = d.nominal.states.first()?;
+    if state.order < 2 {
+        return None;
+    }
+    let data = &d.train.data;
+    let info = &data.channels[channel];
+    let (mut x, mut y, mut value) = (Vec::new(), Vec::new(), Vec::new());
+    for (i, piece) in data.pieces.iter().enumerate() {
+        if piece.recording != recording {
+            continue;
+        }
+        let n = piece.len;
+        let keep = n.div_ceil(4000).max(1);
+        for k in (0..n).step_by(keep) {
+            let e = piece.measured[channel][k] - d.train.calibrated.run.y[i][channel * n + k];
+            x.push(d.train.improved.run.x[i][k] / state.unit.factor);
+            y.push(d.train.improved.run.x[i][n + k] / state.unit.factor);
+            value.push(e.abs() / info.factor);
+        }
+    }
+    let unit = &state.unit.text;
+    let label = |name: &str, unit: String| {
+        if unit.is_empty() || unit == "1" { name.to_string() } else { format!("{name} [{unit}]") }
+    };
+    Some(StateMap {
+        x_label: label(&state.name, unit.clone()),
+        y_label: label(&format!("{}'", state.name), format!("{unit}/s")),
+        value_label: label(&format!("|residual of {}|", info.name), info.unit.clone()),
+        x,
+        y,
+        value,
+    })
+}
+
+fn plots(d: &Diagnosis) -> Vec<MechanismPlot> {
+    d.mechanisms
+        .iter()
+        .enumerate()
+        .filter_map(|(i, m)| {
+            let curve = m.curve.as_ref()?;
+            let equation = m.equations.first().cloned().unwrap_or_default();
+            Some(MechanismPlot {
+                mechanism: Some(i),
+                title: format!("{} in equation {equation}", crate::format::kind(&m.kind)),
+                x_label: curve.variable.clone(),
+                y_label: format!("force in equation {equation} (SI)"),
+                points: curve.points.iter().map(|(a, b)| [*a, *b]).collect(),
+                curve: curve.law.iter().map(|(a, b)| [*a, *b]).collect(),
+            })
+        })
+        .collect()
+}
