@@ -169,11 +169,9 @@ impl<'a> Checker<'a> {
 
     /// The dimension of a name, without primes.
     fn symbol(&self, name: &str) -> Option<Quantity> {
-        let of = |which: Unstated, unit: Option<&Unit>| {
-            match self.unstated.iter().position(|u| *u == which) {
-                Some(i) => self.unknown(i),
-                None => self.known(unit.map_or(Dimension::NONE, |u| u.dimension)),
-            }
+        let of = |which: Unstated, unit: Option<&Unit>| match self.unstated.iter().position(|u| *u == which) {
+            Some(i) => self.unknown(i),
+            None => self.known(unit.map_or(Dimension::NONE, |u| u.dimension)),
         };
         if let Some(i) = self.model.parameter(name) {
             return Some(of(Unstated::Parameter(i), self.model.parameters[i].unit.as_ref()));
@@ -218,7 +216,7 @@ impl<'a> Checker<'a> {
                 }
             }
             Expr::Bin(BinOp::Pow, a, b) => self.power(e, a, b, place),
-            Expr::Call(f, args) => self.call(*f, args, place),
+            Expr::Call(f, args) => self.call(e, *f, args, place),
         }
     }
 
@@ -227,7 +225,7 @@ impl<'a> Checker<'a> {
         if let Some(exponent) = b.constant() {
             return Ok(Dim::Is(base.pow(exponent)));
         }
-        self.need(b, Dimension::NONE, &format!("the exponent of `{e}`"), place)?;
+        self.need(e, b, Dimension::NONE, &format!("the exponent of `{e}`"), place)?;
         self.demand_none(&base).map_err(|dimension| {
             let problem = Problem::Exponent { place: place.clone(), term: e.to_string(), dimension };
             let help = format!("divide `{a}` by a reference value of the same unit, or write a number");
@@ -236,11 +234,11 @@ impl<'a> Checker<'a> {
         Ok(Dim::Is(self.known(Dimension::NONE)))
     }
 
-    fn call(&mut self, f: Func, args: &[Expr], place: &Place) -> Result<Dim, Fault> {
+    fn call(&mut self, e: &Expr, f: Func, args: &[Expr], place: &Place) -> Result<Dim, Fault> {
         let none = Dim::Is(self.known(Dimension::NONE));
         match (f, args) {
             (Func::Sin | Func::Cos | Func::Tan | Func::Exp | Func::Ln | Func::Tanh, [a]) => {
-                self.need(a, Dimension::NONE, &format!("the argument of `{}`", f.name()), place)?;
+                self.need(e, a, Dimension::NONE, &format!("the argument of `{}`", f.name()), place)?;
                 Ok(none)
             }
             (Func::Sign, [a]) => {
@@ -254,12 +252,12 @@ impl<'a> Checker<'a> {
             }),
             (Func::Min | Func::Max | Func::Deadzone | Func::Saturate, [a, b]) => self.shared(&[a, b], place),
             (Func::Delay, [a, tau]) => {
-                self.need(tau, Dimension::TIME, "the delay of `delay`", place)?;
+                self.need(e, tau, Dimension::TIME, "the delay of `delay`", place)?;
                 self.dimension(a, place)
             }
             (Func::Step, [t, t0]) => {
-                self.need(t, Dimension::TIME, "the first argument of `step`", place)?;
-                self.need(t0, Dimension::TIME, "the second argument of `step`", place)?;
+                self.need(e, t, Dimension::TIME, "the first argument of `step`", place)?;
+                self.need(e, t0, Dimension::TIME, "the second argument of `step`", place)?;
                 Ok(none)
             }
             // The parser lets no other number of arguments through.
@@ -267,8 +265,15 @@ impl<'a> Checker<'a> {
         }
     }
 
-    /// Demands that `e` is in `expected`.
-    fn need(&mut self, e: &Expr, expected: Dimension, role: &str, place: &Place) -> Result<(), Fault> {
+    /// Demands that `e`, a part of `whole`, is in `expected`.
+    fn need(
+        &mut self,
+        whole: &Expr,
+        e: &Expr,
+        expected: Dimension,
+        role: &str,
+        place: &Place,
+    ) -> Result<(), Fault> {
         let Dim::Is(q) = self.dimension(e, place)? else { return Ok(()) };
         let ratio = q.combine(&self.known(expected), -1.0);
         self.demand_none(&ratio).map_err(|leftover| {
@@ -280,7 +285,7 @@ impl<'a> Checker<'a> {
                 dimension,
                 expected,
             };
-            (ModelError::new(problem).with_help(self.mend(e, dimension, expected)), e.clone())
+            (ModelError::new(problem).with_help(self.mend(e, dimension, expected)), whole.clone())
         })
     }
 
@@ -380,7 +385,11 @@ impl<'a> Checker<'a> {
             .filter_map(|(name, _)| Some((name, self.reduce(&self.symbol(name)?).known)))
             .map(|(name, d)| format!("`{name}` is in {d}"))
             .collect();
-        if named.is_empty() { "check the units".into() } else { format!("check the units: {}", named.join(", ")) }
+        if named.is_empty() {
+            "check the units".into()
+        } else {
+            format!("check the units: {}", named.join(", "))
+        }
     }
 }
 

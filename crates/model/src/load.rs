@@ -88,9 +88,8 @@ fn entries<'a, 'i>(table: &'a DeTable<'i>) -> impl Iterator<Item = Entry<'a, 'i>
 }
 
 fn load(text: &str) -> Result<Model, Located> {
-    let document = DeTable::parse(text).map_err(|e| {
-        (ModelError::new(Problem::Toml { message: e.message().to_owned() }), e.span())
-    })?;
+    let document = DeTable::parse(text)
+        .map_err(|e| (ModelError::new(Problem::Toml { message: e.message().to_owned() }), e.span()))?;
     let root = document.get_ref();
     check_keys(root, &TABLES, "the model")?;
 
@@ -162,7 +161,8 @@ fn load(text: &str) -> Result<Model, Located> {
         };
         let decoded = string(expression, &item)?;
         let source = Source::new(text, expression.span(), decoded);
-        let parsed = parse(decoded).map_err(|e| syntax(Place::Measurement(channel.to_owned()), &source, e))?;
+        let parsed =
+            parse(decoded).map_err(|e| syntax(Place::Measurement(channel.to_owned()), &source, e))?;
         let measurement = Measurement {
             channel: channel.to_owned(),
             expr: parsed.expr.clone(),
@@ -279,7 +279,12 @@ fn check_keys(table: &DeTable<'_>, known: &[&str], place: &str) -> Result<(), Lo
 fn string<'a>(value: &'a Spanned<DeValue<'_>>, item: &str) -> Result<&'a str, Located> {
     match value.get_ref() {
         DeValue::String(s) => Ok(s.as_ref()),
-        other => Err(bad(item, format!("expected a string, found {}", kind(other)), value.span(), "put it in quotes")),
+        other => Err(bad(
+            item,
+            format!("expected a string, found {}", kind(other)),
+            value.span(),
+            "put it in quotes",
+        )),
     }
 }
 
@@ -318,7 +323,14 @@ fn read_unit(table: &DeTable<'_>, item: &str) -> Result<Option<Unit>, Located> {
     let text = string(value, item)?;
     Unit::parse(text).map(Some).map_err(|e| {
         let problem = Problem::Unit { item: item.to_owned(), text: text.to_owned(), message: e.message };
-        let inner = value.span().start + 1 + e.span.start..value.span().start + 1 + e.span.end;
+        // Without escapes the string is its text between two quotes.
+        let plain = value.span().len() == text.len() + 2;
+        let inner = if plain {
+            let start = value.span().start + 1;
+            start + e.span.start..start + e.span.end
+        } else {
+            value.span()
+        };
         fault(problem, inner, e.help.unwrap_or_else(|| "write units like `N m/V`".into()))
     })
 }
@@ -364,7 +376,8 @@ fn declare(
     if !starts || !letters.all(|c| c.is_alphabetic() || c.is_ascii_digit() || c == '_') {
         let clean: String = name.chars().map(|c| if c.is_alphanumeric() { c } else { '_' }).collect();
         let mend = if starts { clean } else { format!("x{clean}") };
-        let help = format!("write `{mend}` in the equations, and `channel = \"{name}\"` if a channel is called so");
+        let help =
+            format!("write `{mend}` in the equations, and `channel = \"{name}\"` if a channel is called so");
         return reject("a name is a letter, then letters, digits and `_`", help);
     }
     if let Some((_, first)) = declared.iter().find(|(n, _)| n == name) {
@@ -383,7 +396,8 @@ fn declare(
 
 fn read_input(name: &str, value: &Spanned<DeValue<'_>>) -> Result<(Input, bool), Located> {
     let item = format!("input `{name}`");
-    let table = table_of(value, &["unit", "hold", "channel"], &item, &format!("{name} = {{ unit = \"V\" }}"))?;
+    let table =
+        table_of(value, &["unit", "hold", "channel"], &item, &format!("{name} = {{ unit = \"V\" }}"))?;
     let unit = read_unit(table, &item)?;
     let hold = match table.get("hold") {
         None => Hold::default(),
@@ -527,32 +541,37 @@ fn check_arguments(model: &Model, place: &Place, source: &Source, parsed: &Parse
     parsed.expr.walk(&mut |e| {
         let Expr::Call(f @ (Func::Step | Func::Delay), args) = e else { return };
         let [first, second] = args.as_slice() else { return };
-        let mut reject = |at: &Expr, reason: &str, help: String| {
+        let mut reject = |reason: &str, help: String| {
             let problem =
                 Problem::Argument { place: place.clone(), call: e.to_string(), reason: reason.to_owned() };
-            found.get_or_insert(fault(problem, source.span(parsed.span_of(at)), help));
+            found.get_or_insert(fault(problem, source.span(parsed.span_of(e)), help));
         };
         if *f == Func::Step && *first != Expr::var("t") {
-            reject(first, "the first argument of `step` must be the time `t`", format!("write `step(t, {second})`"));
+            reject("the first argument of `step` must be the time `t`", format!("write `step(t, {second})`"));
         }
-        let moving = second.variables().into_iter().find(|(n, _)| &**n != "pi" && model.parameter(n).is_none());
+        let moving =
+            second.variables().into_iter().find(|(n, _)| &**n != "pi" && model.parameter(n).is_none());
         if let Some((name, _)) = moving {
             let what = if *f == Func::Delay { "the delay" } else { "the switching time" };
             reject(
-                second,
                 &format!("{what} must consist of parameters and numbers, found `{name}`"),
                 format!("make {what} a parameter"),
             );
         }
         let value = |name: &str, _| model.parameter(name).map(|i| model.parameters[i].value);
         if *f == Func::Delay && second.eval(&value).is_some_and(|tau| tau < 0.0 || tau.is_nan()) {
-            reject(second, "the delay is negative", "a delay is zero or positive".into());
+            reject("the delay is negative", "a delay is zero or positive".into());
         }
     });
     found.map_or(Ok(()), Err)
 }
 
-fn check_measured_order(model: &Model, place: &Place, source: &Source, parsed: &Parsed) -> Result<(), Located> {
+fn check_measured_order(
+    model: &Model,
+    place: &Place,
+    source: &Source,
+    parsed: &Parsed,
+) -> Result<(), Located> {
     for (name, primes, span) in &parsed.names {
         if let Some(i) = model.state(name)
             && usize::from(*primes) > model.states[i].order
@@ -593,7 +612,8 @@ fn check_states(model: &Model, spans: &[Range<usize>], root: &DeTable<'_>) -> Re
         }
         if state.initial.len() > state.order {
             let item = format!("state `{name}`");
-            let message = format!("`initial` has {} values, its order is {}", state.initial.len(), state.order);
+            let message =
+                format!("`initial` has {} values, its order is {}", state.initial.len(), state.order);
             let meant: Vec<String> = (0..state.order).map(|p| format!("{name}{}", "'".repeat(p))).collect();
             return Err(bad(&item, message, span.clone(), format!("give at most [{}]", meant.join(", "))));
         }
@@ -610,7 +630,10 @@ fn check_counts(model: &Model, root: &DeTable<'_>, spans: &[Range<usize>]) -> Re
     let help = if equations < states {
         format!("write one equation per state ({}), or make a state an input", list.join(", "))
     } else {
-        format!("write one equation per state ({}): join equations, or declare the missing state", list.join(", "))
+        format!(
+            "write one equation per state ({}): join equations, or declare the missing state",
+            list.join(", ")
+        )
     };
     let at = match spans.get(states) {
         Some(surplus) => surplus.clone(),
@@ -620,13 +643,14 @@ fn check_counts(model: &Model, root: &DeTable<'_>, spans: &[Range<usize>]) -> Re
 }
 
 /// The equations are affine in the highest derivatives, and each can be given one of its own.
-fn check_solvable(model: &Model, equations: &[(Source, ParsedEquation, Range<usize>)]) -> Result<(), Located> {
-    let highest: Vec<(&str, u8)> = model
-        .states
-        .iter()
-        .map(|s| (s.name.as_str(), u8::try_from(s.order).unwrap_or(u8::MAX)))
-        .collect();
-    let shown: Vec<String> = highest.iter().map(|(n, p)| format!("{n}{}", "'".repeat(usize::from(*p)))).collect();
+fn check_solvable(
+    model: &Model,
+    equations: &[(Source, ParsedEquation, Range<usize>)],
+) -> Result<(), Located> {
+    let highest: Vec<(&str, u8)> =
+        model.states.iter().map(|s| (s.name.as_str(), u8::try_from(s.order).unwrap_or(u8::MAX))).collect();
+    let shown: Vec<String> =
+        highest.iter().map(|(n, p)| format!("{n}{}", "'".repeat(usize::from(*p)))).collect();
     let mut contains: Vec<Vec<bool>> = Vec::new();
     for (equation, (source, parsed, _)) in model.equations.iter().zip(equations) {
         let place = Place::Equation(equation.name.clone());
@@ -649,7 +673,11 @@ fn check_solvable(model: &Model, equations: &[(Source, ParsedEquation, Range<usi
     let own: Vec<usize> = (0..shown.len()).filter(|&i| contains[left][i]).collect();
     let reason = if own.is_empty() {
         let list: Vec<String> = (0..shown.len()).map(quote).collect();
-        format!("it contains no highest derivative ({}); no equation is left for {}", list.join(", "), quote(state))
+        format!(
+            "it contains no highest derivative ({}); no equation is left for {}",
+            list.join(", "),
+            quote(state)
+        )
     } else {
         let list: Vec<String> = own.iter().map(|&i| quote(i)).collect();
         let taken: Vec<String> = own
@@ -676,7 +704,13 @@ fn check_solvable(model: &Model, equations: &[(Source, ParsedEquation, Range<usi
     Err(fault(problem, equations[left].0.value.clone(), help))
 }
 
-fn not_affine(place: Place, span: Range<usize>, term: &Expr, highest: &[(&str, u8)], shown: &[String]) -> Located {
+fn not_affine(
+    place: Place,
+    span: Range<usize>,
+    term: &Expr,
+    highest: &[(&str, u8)],
+    shown: &[String],
+) -> Located {
     let which = highest.iter().position(|(n, p)| term.contains(n, *p)).unwrap_or(0);
     let (name, primes) = highest[which];
     let mut function = None;
@@ -777,9 +811,16 @@ fn set_measurement_units(
         let unit = match stated {
             Some((_, Some(unit), span)) if !unit.dimension.same(&default.dimension) => {
                 let item = format!("measurement \"{}\"", measurement.channel);
-                let message =
-                    format!("its unit is {}, but `{}` is in {}", unit.text, measurement.expr, default.dimension);
-                return Err(bad(&item, message, span.clone(), format!("write `unit = \"{}\"`", default.text)));
+                let message = format!(
+                    "its unit is {}, but `{}` is in {}",
+                    unit.text, measurement.expr, default.dimension
+                );
+                return Err(bad(
+                    &item,
+                    message,
+                    span.clone(),
+                    format!("write `unit = \"{}\"`", default.text),
+                ));
             }
             Some((_, Some(unit), _)) => unit.clone(),
             _ => default,

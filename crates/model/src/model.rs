@@ -7,7 +7,7 @@ use crate::units::Unit;
 ///
 /// All numbers are SI; [`Unit`] keeps how the user wrote the unit and the factor to SI.
 /// Names are unique over inputs, states and parameters.
-#[derive(Debug, Clone)]
+#[derive(Debug, Clone, PartialEq)]
 pub struct Model {
     /// Free text.
     pub name: String,
@@ -37,7 +37,7 @@ pub enum Hold {
 }
 
 /// An exogenous signal.
-#[derive(Debug, Clone)]
+#[derive(Debug, Clone, PartialEq)]
 pub struct Input {
     /// Name in the equations.
     pub name: String,
@@ -50,7 +50,7 @@ pub struct Input {
 }
 
 /// A coordinate (or any other state) with its time derivatives up to `order - 1`.
-#[derive(Debug, Clone)]
+#[derive(Debug, Clone, PartialEq)]
 pub struct State {
     /// Name in the equations.
     pub name: String,
@@ -65,7 +65,7 @@ pub struct State {
 }
 
 /// A constant of the model.
-#[derive(Debug, Clone)]
+#[derive(Debug, Clone, PartialEq)]
 pub struct Parameter {
     /// Name in the equations.
     pub name: String,
@@ -81,7 +81,7 @@ pub struct Parameter {
 }
 
 /// `lhs = rhs`
-#[derive(Debug, Clone)]
+#[derive(Debug, Clone, PartialEq)]
 pub struct Equation {
     /// Name in the file.
     pub name: String,
@@ -99,7 +99,7 @@ impl Equation {
 }
 
 /// A channel of the recording as an expression of states, inputs and parameters.
-#[derive(Debug, Clone)]
+#[derive(Debug, Clone, PartialEq)]
 pub struct Measurement {
     /// The recording's channel.
     pub channel: String,

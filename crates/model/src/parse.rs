@@ -247,7 +247,8 @@ fn lex(text: &str) -> Result<Vec<Token>, SyntaxError> {
 /// Length in bytes of the number that `rest` starts with; an `e` counts only with digits after it.
 fn number_length(rest: &str) -> usize {
     let bytes = rest.as_bytes();
-    let digits = |from: usize| bytes[from.min(bytes.len())..].iter().take_while(|b| b.is_ascii_digit()).count();
+    let digits =
+        |from: usize| bytes[from.min(bytes.len())..].iter().take_while(|b| b.is_ascii_digit()).count();
     let mut length = digits(0);
     if bytes.get(length) == Some(&b'.') {
         length += 1 + digits(length + 1);
@@ -278,7 +279,8 @@ fn stray(c: char, start: usize, rest: &str, text: &str, last: Option<&Token>) ->
                     span,
                     format!("found `{primes}` after `)`, expected an operator"),
                     Some(
-                        "only names have primes: write the derivative out, as in `(x' + y')` for `(x + y)'`".into(),
+                        "only names have primes: write the derivative out, as in `(x' + y')` for `(x + y)'`"
+                            .into(),
                     ),
                 ),
                 _ => error(
@@ -288,7 +290,9 @@ fn stray(c: char, start: usize, rest: &str, text: &str, last: Option<&Token>) ->
                 ),
             };
         }
-        '\u{2212}' | '\u{2013}' | '\u{2014}' | '\u{2010}' | '\u{2011}' => "write the minus sign `-` of the keyboard",
+        '\u{2212}' | '\u{2013}' | '\u{2014}' | '\u{2010}' | '\u{2011}' => {
+            "write the minus sign `-` of the keyboard"
+        }
         '\u{b7}' | '\u{d7}' | '\u{22c5}' | '\u{2217}' | '\u{2219}' => "write `*`",
         '\u{f7}' | '\u{2215}' | '\u{2044}' => "write `/`",
         '\u{2032}' | '\u{2019}' | '\u{b4}' | '`' => "write the prime as `'`",
@@ -298,12 +302,18 @@ fn stray(c: char, start: usize, rest: &str, text: &str, last: Option<&Token>) ->
         '[' | '{' => "write `(`",
         ']' | '}' => "write `)`",
         ';' => "arguments are separated by `,`; equations stand one per key",
-        '<' | '>' | '!' | '&' | '?' => "the language has no conditions; use `max`, `min`, `sign`, `deadzone` or `step`",
+        '<' | '>' | '!' | '&' | '?' => {
+            "the language has no conditions; use `max`, `min`, `sign`, `deadzone` or `step`"
+        }
         '|' => "write `abs(x)` for the absolute value",
         '%' => "write the fraction as a number",
         _ => "operators are `+ - * / ^`",
     };
-    error(start..start + c.len_utf8(), format!("found `{c}`, which is no part of the language"), Some(help.into()))
+    error(
+        start..start + c.len_utf8(),
+        format!("found `{c}`, which is no part of the language"),
+        Some(help.into()),
+    )
 }
 
 /// Binding powers: a left-associative operator parses its right operand one above its own.
@@ -435,14 +445,16 @@ impl<'a> Parser<'a> {
                 }
                 Ok(Node { span, ..inner })
             }
-            Kind::Close if self.position >= 2 && self.tokens[self.position - 2].kind == Kind::Open => Err(error(
-                token.span.clone(),
-                "found `)`, expected an expression inside the parentheses",
-                None,
-            )),
+            Kind::Close if self.position >= 2 && self.tokens[self.position - 2].kind == Kind::Open => Err(
+                error(token.span.clone(), "found `)`, expected an expression inside the parentheses", None),
+            ),
             _ => {
                 let found = self.shown(token);
-                Err(error(token.span.clone(), format!("found {found}, expected a number, a name or `(`"), None))
+                Err(error(
+                    token.span.clone(),
+                    format!("found {found}, expected a number, a name or `(`"),
+                    None,
+                ))
             }
         }
     }
@@ -518,15 +530,16 @@ impl<'a> Parser<'a> {
     /// The error for `next` where the parenthesis `open` should close after `inner`.
     fn unclosed(&mut self, open: &Token, next: &Token, inner: &Node) -> SyntaxError {
         match next.kind {
-            Kind::End => error(
-                open.span.clone(),
-                "this `(` is never closed",
-                Some("add the missing `)`".into()),
-            ),
+            Kind::End => {
+                error(open.span.clone(), "this `(` is never closed", Some("add the missing `)`".into()))
+            }
             Kind::Comma => error(
                 next.span.clone(),
                 "found `,`, expected `)`",
-                Some("a comma only separates the arguments of a function; decimals are written with `.`".into()),
+                Some(
+                    "a comma only separates the arguments of a function; decimals are written with `.`"
+                        .into(),
+                ),
             ),
             _ => {
                 self.position -= 1;

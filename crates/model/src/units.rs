@@ -190,15 +190,28 @@ impl Unit {
     pub fn parse(text: &str) -> Result<Unit, UnitError> {
         let mut parser = UnitParser { text, position: 0 };
         if text.trim().is_empty() {
-            return Err(unit_error(0..text.len(), "the unit is empty", Some("write `1` for a dimensionless value")));
+            return Err(unit_error(
+                0..text.len(),
+                "the unit is empty",
+                Some("write `1` for a dimensionless value"),
+            ));
         }
         let (factor, dimension) = parser.product(0)?;
         if let Some(c) = parser.next_char() {
-            let help = if c == ')' { "remove it, or add the missing `(`" } else { "write units like `N m/(rad/s)`" };
-            return Err(unit_error(parser.position..parser.position + c.len_utf8(), format!("found `{c}`"), Some(help)));
+            let help =
+                if c == ')' { "remove it, or add the missing `(`" } else { "write units like `N m/(rad/s)`" };
+            return Err(unit_error(
+                parser.position..parser.position + c.len_utf8(),
+                format!("found `{c}`"),
+                Some(help),
+            ));
         }
         if !(factor.is_finite() && factor > 0.0) {
-            return Err(unit_error(0..text.len(), "the unit's factor to SI overflows", Some("use a smaller exponent")));
+            return Err(unit_error(
+                0..text.len(),
+                "the unit's factor to SI overflows",
+                Some("use a smaller exponent"),
+            ));
         }
         Ok(Unit { text: text.trim().to_owned(), factor, dimension })
     }
@@ -251,7 +264,8 @@ impl UnitParser<'_> {
                 Some(_) => false,
             };
             let (f, d) = self.power(nesting)?;
-            (factor, dimension) = if divide { (factor / f, dimension / d) } else { (factor * f, dimension * d) };
+            (factor, dimension) =
+                if divide { (factor / f, dimension / d) } else { (factor * f, dimension * d) };
         }
     }
 
@@ -264,7 +278,11 @@ impl UnitParser<'_> {
     fn factor(&mut self, nesting: usize) -> Result<(f64, Dimension), UnitError> {
         let Some(c) = self.next_char() else {
             let end = self.text.len();
-            return Err(unit_error(end..end, "found the end, expected a unit", Some("write a unit after the operator")));
+            return Err(unit_error(
+                end..end,
+                "found the end, expected a unit",
+                Some("write a unit after the operator"),
+            ));
         };
         let start = self.position;
         if c == '(' {
@@ -274,7 +292,11 @@ impl UnitParser<'_> {
             self.position += 1;
             let inner = self.product(nesting + 1)?;
             if self.next_char() != Some(')') {
-                return Err(unit_error(start..start + 1, "this `(` is never closed", Some("add the missing `)`")));
+                return Err(unit_error(
+                    start..start + 1,
+                    "this `(` is never closed",
+                    Some("add the missing `)`"),
+                ));
             }
             self.position += 1;
             return Ok(inner);
@@ -286,7 +308,11 @@ impl UnitParser<'_> {
                 return Ok((1.0, Dimension::NONE));
             }
             let message = format!("found the number `{number}` in a unit");
-            return Err(unit_error(span, message, Some("put it into the value, or use an SI prefix such as `mm`")));
+            return Err(unit_error(
+                span,
+                message,
+                Some("put it into the value, or use an SI prefix such as `mm`"),
+            ));
         }
         let is_letter = |c: char| c.is_alphabetic() || matches!(c, '%' | '\u{b0}' | '_');
         let span = self.take(is_letter);
@@ -320,7 +346,11 @@ impl UnitParser<'_> {
 
     /// `^2`, `^-1`, `^0.5`, `^(1/2)`, `²`; 1 if there is none.
     fn exponent(&mut self) -> Result<f64, UnitError> {
-        let superscript = |c: char| "\u{2070}\u{b9}\u{b2}\u{b3}\u{2074}\u{2075}\u{2076}\u{2077}\u{2078}\u{2079}".chars().position(|s| s == c);
+        let superscript = |c: char| {
+            "\u{2070}\u{b9}\u{b2}\u{b3}\u{2074}\u{2075}\u{2076}\u{2077}\u{2078}\u{2079}"
+                .chars()
+                .position(|s| s == c)
+        };
         let raised = self.take(|c| c == '\u{207b}' || superscript(c).is_some());
         if !raised.is_empty() {
             let plain: String = self.text[raised.clone()]
@@ -341,15 +371,25 @@ impl UnitParser<'_> {
         let span = if parenthesised { self.take(inside) } else { self.take(number) };
         let text = &self.text[span.clone()];
         let value = match text.split_once('/') {
-            Some((a, b)) => checked_exponent(a.trim(), span.clone())? / checked_exponent(b.trim(), span.clone())?,
+            Some((a, b)) => {
+                checked_exponent(a.trim(), span.clone())? / checked_exponent(b.trim(), span.clone())?
+            }
             None => checked_exponent(text.trim(), span.clone())?,
         };
         if !(value.is_finite() && value.abs() <= MAX_EXPONENT) {
-            return Err(unit_error(span, format!("the exponent `{text}` is not usable"), Some("write `m^2` or `V^0.5`")));
+            return Err(unit_error(
+                span,
+                format!("the exponent `{text}` is not usable"),
+                Some("write `m^2` or `V^0.5`"),
+            ));
         }
         if parenthesised {
             if self.next_char() != Some(')') {
-                return Err(unit_error(start - 1..start, "this `(` is never closed", Some("add the missing `)`")));
+                return Err(unit_error(
+                    start - 1..start,
+                    "this `(` is never closed",
+                    Some("add the missing `)`"),
+                ));
             }
             self.position += 1;
         }
@@ -383,7 +423,8 @@ fn lookup(symbol: &str) -> Option<(f64, Dimension)> {
 /// What may have been meant by an unknown symbol.
 fn suggestion(symbol: &str) -> String {
     // `ohms` is a plural, not `ohm s`.
-    if let Some(singular) = symbol.strip_suffix('s').filter(|s| s.chars().count() > 1 && lookup(s).is_some()) {
+    if let Some(singular) = symbol.strip_suffix('s').filter(|s| s.chars().count() > 1 && lookup(s).is_some())
+    {
         return format!("did you mean `{singular}`?");
     }
     let splits = symbol.char_indices().skip(1).map(|(i, _)| symbol.split_at(i));
@@ -429,10 +470,8 @@ fn si_text(dimension: Dimension) -> String {
         return (*text).into();
     }
     let exponents = [1.0, -1.0, 0.5, -0.5, 2.0, -2.0, 1.5, -1.5, 3.0, -3.0];
-    let powers: Vec<(&str, f64, Dimension)> = DERIVED
-        .iter()
-        .flat_map(|(symbol, d)| exponents.map(|e| (*symbol, e, d.pow(e))))
-        .collect();
+    let powers: Vec<(&str, f64, Dimension)> =
+        DERIVED.iter().flat_map(|(symbol, d)| exponents.map(|e| (*symbol, e, d.pow(e)))).collect();
     let mut candidates: Vec<Vec<(&str, f64, Dimension)>> = vec![Vec::new()];
     candidates.extend(powers.iter().map(|p| vec![*p]));
     for (i, first) in powers.iter().enumerate() {
@@ -449,7 +488,10 @@ fn si_text(dimension: Dimension) -> String {
             }
         }
         // A factor costs one, each further power half, and a text without numerator a little.
-        let mut cost: f64 = factors.iter().map(|(_, e)| 1.0 + 0.5 * f64::from(u8::from(e.abs() != 1.0)) * e.abs().max(1.0)).sum();
+        let mut cost: f64 = factors
+            .iter()
+            .map(|(_, e)| 1.0 + 0.5 * f64::from(u8::from(e.abs() != 1.0)) * e.abs().max(1.0))
+            .sum();
         cost += if factors.iter().all(|(_, e)| *e < 0.0) { 0.1 } else { 0.0 };
         // Kinematics stay kinematics: `m/s^2`, not `N/kg`.
         cost -= if derived.is_empty() && dimension.0[1] == 0.0 && dimension.0[3] == 0.0 { 1.0 } else { 0.0 };
@@ -458,7 +500,8 @@ fn si_text(dimension: Dimension) -> String {
         }
     }
     let factors = best.map(|(_, factors)| factors).unwrap_or_default();
-    let power = |(symbol, e): &(&str, f64)| if *e == 1.0 { (*symbol).to_owned() } else { format!("{symbol}^{e}") };
+    let power =
+        |(symbol, e): &(&str, f64)| if *e == 1.0 { (*symbol).to_owned() } else { format!("{symbol}^{e}") };
     // Mass before length, as in `kg m^2`; derived units come first anyway.
     let rank = |symbol: &str| if symbol == "kg" { 0 } else { 1 };
     let side = |positive: bool| {

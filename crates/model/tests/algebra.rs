@@ -6,7 +6,8 @@ use proptest::prelude::*;
 /// Any tree of the language with finite numbers and no sign directly over a number.
 fn any_expr() -> impl Strategy<Value = Expr> {
     let leaf = prop_oneof![
-        prop_oneof![Just(0.0), Just(1.0), Just(2.0), Just(5.3e-6), -1e3..1e3, -1e20..1e20f64].prop_map(Expr::Num),
+        prop_oneof![Just(0.0), Just(1.0), Just(2.0), Just(5.3e-6), -1e3..1e3, -1e20..1e20f64]
+            .prop_map(Expr::Num),
         (prop::sample::select(vec!["x", "theta", "k_1"]), 0u8..3).prop_map(|(n, p)| Expr::prime(n, p)),
     ];
     leaf.prop_recursive(6, 40, 2, |inner| {
@@ -18,9 +19,8 @@ fn any_expr() -> impl Strategy<Value = Expr> {
                 a => -a,
             }),
             (op, inner.clone(), inner.clone()).prop_map(|(op, a, b)| Expr::Bin(op, Box::new(a), Box::new(b))),
-            (function, inner.clone(), inner).prop_map(|(f, a, b)| {
-                Expr::call(f, if f.arity() == 1 { vec![a] } else { vec![a, b] })
-            }),
+            (function, inner.clone(), inner)
+                .prop_map(|(f, a, b)| { Expr::call(f, if f.arity() == 1 { vec![a] } else { vec![a, b] }) }),
         ]
     })
 }
@@ -45,7 +45,10 @@ fn smooth_expr() -> impl Strategy<Value = Expr> {
             pair.clone().prop_map(|(a, b)| {
                 (Expr::Num(1.5) + Expr::call(Func::Tanh, vec![a])).pow(Expr::call(Func::Sin, vec![b]))
             }),
-            (prop::sample::select(vec![Func::Sin, Func::Cos, Func::Tanh, Func::Abs, Func::Sign]), inner.clone())
+            (
+                prop::sample::select(vec![Func::Sin, Func::Cos, Func::Tanh, Func::Abs, Func::Sign]),
+                inner.clone()
+            )
                 .prop_map(|(f, a)| Expr::call(f, vec![a])),
             inner.clone().prop_map(|a| Expr::call(Func::Exp, vec![Expr::call(Func::Sin, vec![a])])),
             inner.clone().prop_map(|a| {
@@ -207,7 +210,10 @@ fn not_affine_is_said() {
         assert_eq!(parse(text).unwrap().expr.affine_in(&[("q", 2)]), None, "{text}");
     }
     let (c, r) = parse("m*(q'' + p'') + k*q - u").unwrap().expr.affine_in(&[("q", 2), ("p", 2)]).unwrap();
-    assert_eq!((c[0].to_string(), c[1].to_string(), r.to_string()), ("m".into(), "m".into(), "k*q - u".into()));
+    assert_eq!(
+        (c[0].to_string(), c[1].to_string(), r.to_string()),
+        ("m".into(), "m".into(), "k*q - u".into())
+    );
 }
 
 #[test]
