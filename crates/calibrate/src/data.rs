@@ -396,9 +396,9 @@ impl Hats {
                         .collect();
                     let all: Vec<f64> =
                         states.iter().filter_map(|s| s[i].as_ref()).flatten().copied().collect();
-                    // Three standard errors (the ends of a window are worse than its middle), and room
-                    // for what the smoothing bends.
-                    3.0 * errors.iter().copied().fold(0.0, f64::max) + 1e-3 * spread(&all)
+                    // Ten standard errors: noise of real sensors is coloured, and the estimate of it from
+                    // fast differences is too small then; and room for what the smoothing bends.
+                    10.0 * errors.iter().copied().fold(0.0, f64::max) + 1e-3 * spread(&all)
                 }
             })
             .collect();

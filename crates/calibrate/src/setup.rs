@@ -173,11 +173,15 @@ impl Setup {
     /// Prior of the state at a sample: where it is measured, the smoothed value; at a recording's
     /// start, the given initial values pin it.
     pub fn start_prior(&self, piece: usize, sample: usize) -> StartPrior {
+        // At the end of a record the smoothing window is one-sided: the standard error of a cubic's
+        // slope there is four times that in the middle.
+        let n = self.data.pieces[piece].len;
+        let end = if sample < 3 || sample + 3 >= n { 4.0 } else { 1.0 };
         let mut prior: StartPrior = self.hats.states[piece]
             .iter()
             .zip(&self.hats.tolerance)
             .map(|(hat, tolerance)| match hat {
-                Some(h) if h[sample].is_finite() => (h[sample], *tolerance),
+                Some(h) if h[sample].is_finite() => (h[sample], end * tolerance),
                 _ => (0.0, f64::INFINITY),
             })
             .collect();

@@ -31,6 +31,10 @@ impl OutputFolder {
             return Err(Failure::file(path, "this is a file, but the results need a folder")
                 .mend("name another folder after `--out`, or move the file away"));
         }
+        if let Some(file) = path.ancestors().skip(1).find(|p| p.is_file()) {
+            return Err(Failure::file(path, format!("`{}` is a file, not a folder", file.display()))
+                .mend("name another path after `--out`"));
+        }
         let stage = folder.stage();
         fs::create_dir(&stage).and_then(|()| fs::remove_dir(&stage)).map_err(|e| folder.refused(&e))?;
         Ok(folder)
@@ -97,17 +101,8 @@ impl OutputFolder {
     }
 
     fn refused(&self, error: &io::Error) -> Failure {
-        refused(&self.path, error)
-    }
-}
-
-fn refused(path: &Path, error: &io::Error) -> Failure {
-    let blocking = path.ancestors().skip(1).find(|p| p.is_file());
-    match blocking {
-        Some(file) => Failure::file(path, format!("`{}` is a file, not a folder", file.display()))
-            .mend("name another path after `--out`"),
-        None => Failure::file(path, format!("the output cannot be written: {error}"))
-            .mend("name a place after `--out` that you may write to, and see that the disk has room"),
+        Failure::file(&self.path, format!("the output cannot be written: {error}"))
+            .mend("name a place after `--out` that you may write to, and see that the disk has room")
     }
 }
 

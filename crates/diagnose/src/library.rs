@@ -108,6 +108,8 @@ pub struct Mechanism {
     pub mirror: bool,
     /// Kinds of which this one is a refinement: at the same place it replaces them.
     pub refines: Vec<String>,
+    /// Expressions in the parameters that must not be negative (fs − fc of Stribeck friction).
+    pub require: Vec<Expr>,
     /// Extra complexity beyond the number of parameters.
     pub surcharge: f64,
     /// Where it acts, for laws with a threshold.
@@ -142,6 +144,8 @@ struct File {
     mirror: bool,
     #[serde(default)]
     refines: Vec<String>,
+    #[serde(default)]
+    require: Vec<String>,
     #[serde(default)]
     surcharge: f64,
     #[serde(default)]
@@ -271,6 +275,7 @@ impl Mechanism {
             inner,
             mirror: raw.mirror,
             refines: raw.refines,
+            require: raw.require.iter().map(|t| expression(t, "require")).collect::<Result<_, _>>()?,
             surcharge: raw.surcharge,
             region,
             about: raw.about,

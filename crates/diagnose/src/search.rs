@@ -258,6 +258,10 @@ impl<'a> Search<'a> {
 
     fn weigh(&self, old: &Fitted, new: &Fitted, scale: &[f64]) -> Evidence {
         let kappa = kappa(&new.setup, &new.level, scale, &new.fit.point);
+        self.weigh_with(old, new, scale, &kappa)
+    }
+
+    fn weigh_with(&self, old: &Fitted, new: &Fitted, scale: &[f64], kappa: &[f64]) -> Evidence {
         let complexity = |f: &Fitted| -> (f64, f64) {
             f.parts.iter().fold((0.0, 0.0), |(p, s), part| {
                 let m = &self.library[part.candidate.mechanism];
@@ -271,7 +275,7 @@ impl<'a> Search<'a> {
             &old.fit.rss,
             &new.fit.rss,
             &new.fit.count,
-            &kappa,
+            kappa,
             p1 - p0,
             s1 - s0,
             &old_folds,
@@ -432,6 +436,27 @@ impl<'a> Search<'a> {
 
     /// Fits a candidate: added, or in place of the relative that it refines.
     fn trial(&self, current: &Fitted, candidate: &Candidate, scored: &Scored, scale: &[f64]) -> Option<Fitted> {
+        let fitted = self.fitted_trial(current, candidate, scored, scale)?;
+        let mechanism = &self.library[candidate.mechanism];
+        let part = fitted.parts.last()?;
+        let value = |n: &str| {
+            let i = mechanism.parameters().position(|p| p == n)?;
+            Some(fitted.fit.point.parameters[fitted.setup.model.parameter(&part.instance.names[i])?])
+        };
+        let admissible = mechanism
+            .require
+            .iter()
+            .all(|e| e.eval(&|n, _| value(n)).is_none_or(|v| v >= 0.0));
+        admissible.then_some(fitted)
+    }
+
+    fn fitted_trial(
+        &self,
+        current: &Fitted,
+        candidate: &Candidate,
+        scored: &Scored,
+        scale: &[f64],
+    ) -> Option<Fitted> {
         let refined = current.parts.iter().position(|p| {
             p.candidate.place == candidate.place
                 && self.library[candidate.mechanism]
@@ -477,10 +502,14 @@ impl<'a> Search<'a> {
         trials: Vec<(usize, Fitted)>,
         scale: &[f64],
     ) -> Option<(Candidate, Fitted, Vec<Rival>, Evidence)> {
+        // One information per sample for all: that of the residual which fits best.
+        let total_rss = |f: &Fitted| f.fit.rss.iter().sum::<f64>();
+        let best = trials.iter().min_by(|a, b| total_rss(&a.1).total_cmp(&total_rss(&b.1)))?;
+        let kappa = kappa(&best.1.setup, &best.1.level, scale, &best.1.fit.point);
         let mut weighed: Vec<(usize, Fitted, Evidence)> = trials
-            .into_iter()
+            .into_par_iter()
             .map(|(c, f)| {
-                let e = self.weigh(current, &f, scale);
+                let e = self.weigh_with(current, &f, scale, &kappa);
                 (c, f, e)
             })
             .collect();

@@ -262,11 +262,13 @@ fn in_words(arguments: &Arguments, report: &Report) -> String {
     let width = report.parameters.keys().map(|name| name.chars().count()).max().unwrap_or(0);
     for (name, p) in &report.parameters {
         let unit = p.unit.as_deref().map_or(String::new(), format::unit);
-        let value = match p.fixed {
-            true => "fixed".to_owned(),
-            false => format!("→ {}", format::with_interval(p.value, p.ci95)),
+        let nominal = format::significant(p.nominal, 4);
+        let line = match p.fixed {
+            true => format!("  {name:width$}  {nominal} {unit} (fixed)"),
+            false => {
+                format!("  {name:width$}  {nominal} → {} {unit}", format::with_interval(p.value, p.ci95))
+            }
         };
-        let line = format!("  {name:width$}  {} {value} {unit}", format::significant(p.nominal, 4));
         let _ = writeln!(text, "{}", line.trim_end());
     }
     for (title, set) in [("training", &report.fit.train), ("held-out", &report.fit.holdout)] {

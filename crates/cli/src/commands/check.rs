@@ -1,7 +1,7 @@
 //! `greybox check`: are these recordings good enough, and do they fit the model?
 
 use std::fmt::Write as _;
-use std::path::PathBuf;
+use std::path::{Path, PathBuf};
 
 use clap::Args;
 use greybox_calibrate::Data;
@@ -63,6 +63,9 @@ pub(crate) fn run(arguments: &Arguments) -> Result<Answer, Failure> {
     if let Some(model) = model {
         Data::new(model, &recordings)?;
     }
+    for recording in &recordings {
+        known(recording, &arguments.inputs)?;
+    }
     let checked: Vec<Health> = recordings
         .iter()
         .map(|recording| match model {
@@ -81,6 +84,16 @@ pub(crate) fn run(arguments: &Arguments) -> Result<Answer, Failure> {
     let text = checked.iter().map(in_words).collect::<Vec<_>>().join("\n");
     let json = json!({ "model": loaded.as_ref().map(|l| &l.model.name), "recordings": checked });
     Ok(Answer::new(text, json))
+}
+
+/// Sees that the recording has every channel named after `--inputs`.
+fn known(recording: &Recording, inputs: &[String]) -> Result<(), Failure> {
+    let Some(unknown) = inputs.iter().find(|name| recording.channel(name).is_none()) else {
+        return Ok(());
+    };
+    let names: Vec<String> = recording.channels.iter().map(|c| format!("`{}`", c.name)).collect();
+    let message = format!("there is no channel `{unknown}`, which `--inputs` names");
+    Err(Failure::file(Path::new(&recording.name), message).mend(format!("name one of {}", names.join(", "))))
 }
 
 /// The health of a recording, its channels in the roles that the model gives them.
