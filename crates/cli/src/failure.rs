@@ -14,8 +14,11 @@ use serde_json::{Map, Value, json};
 use crate::answer::{self, Manner};
 
 /// Why a command did not finish.
-#[derive(Debug, PartialEq)]
-pub(crate) struct Failure {
+#[derive(Debug)]
+pub(crate) struct Failure(Box<Details>);
+
+#[derive(Debug)]
+struct Details {
     cause: Cause,
     /// What is wrong, with the file where that is known.
     message: String,
@@ -35,7 +38,7 @@ enum Cause {
 }
 
 /// The source line that an error points at.
-#[derive(Debug, PartialEq)]
+#[derive(Debug)]
 struct Excerpt {
     /// `file:line:column`.
     place: String,
@@ -47,7 +50,13 @@ struct Excerpt {
 
 impl Failure {
     fn new(cause: Cause, message: impl Into<String>) -> Failure {
-        Failure { cause, message: message.into(), mend: None, place: Map::new(), excerpt: None }
+        Failure(Box::new(Details {
+            cause,
+            message: message.into(),
+            mend: None,
+            place: Map::new(),
+            excerpt: None,
+        }))
     }
 
     /// Bad input.
@@ -75,13 +84,13 @@ impl Failure {
     /// Adds the mend.
     #[must_use]
     pub(crate) fn mend(mut self, mend: impl Into<String>) -> Failure {
-        self.mend = Some(mend.into());
+        self.0.mend = Some(mend.into());
         self
     }
 
     #[must_use]
     fn at(mut self, key: &str, value: impl Into<Value>) -> Failure {
-        self.place.insert(key.to_owned(), value.into());
+        self.0.place.insert(key.to_owned(), value.into());
         self
     }
 
@@ -96,7 +105,7 @@ impl Failure {
             .at("file", file)
             .at("line", line)
             .at("column", column);
-        failure.excerpt = Some(Excerpt::new(text, &span, format!("{file}:{line}:{column}"), line, column));
+        failure.0.excerpt = Some(Excerpt::new(text, &span, format!("{file}:{line}:{column}"), line, column));
         failure
     }
 
@@ -105,7 +114,7 @@ impl Failure {
             Some(file) => Failure::file(Path::new(file), problem),
             None => Failure::input(problem),
         };
-        failure.mend = help.map(str::to_owned);
+        failure.0.mend = help.map(str::to_owned);
         failure
     }
 
@@ -120,7 +129,7 @@ impl Failure {
     }
 
     fn code(&self) -> u8 {
-        match self.cause {
+        match self.0.cause {
             Cause::BadInput => 2,
             Cause::Internal => 1,
         }
@@ -128,15 +137,15 @@ impl Failure {
 
     fn to_json(&self) -> Value {
         let mut error = Map::new();
-        let kind = match self.cause {
+        let kind = match self.0.cause {
             Cause::BadInput => "bad_input",
             Cause::Internal => "internal",
         };
         error.insert("kind".to_owned(), json!(kind));
         error.insert("exit_code".to_owned(), json!(self.code()));
-        error.insert("message".to_owned(), json!(self.message));
-        error.extend(self.place.clone());
-        if let Some(mend) = &self.mend {
+        error.insert("message".to_owned(), json!(self.0.message));
+        error.extend(self.0.place.clone());
+        if let Some(mend) = &self.0.mend {
             error.insert("mend".to_owned(), json!(mend));
         }
         json!({ "error": error })
@@ -146,12 +155,12 @@ impl Failure {
 /// As printed, with a final newline.
 impl std::fmt::Display for Failure {
     fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
-        writeln!(f, "error: {}", self.message)?;
-        let gutter = match &self.excerpt {
+        writeln!(f, "error: {}", self.0.message)?;
+        let gutter = match &self.0.excerpt {
             None => String::from(" "),
             Some(excerpt) => excerpt.write(f)?,
         };
-        match &self.mend {
+        match &self.0.mend {
             Some(mend) => writeln!(f, "{gutter} mend: {mend}"),
             None => Ok(()),
         }
@@ -238,7 +247,8 @@ mod tests {
         let text = "\tab\ncd";
         let excerpt = Excerpt::new(text, &(1..6), "f:1:2".into(), 1, 2);
         assert_eq!(excerpt.marked, 1..3);
-        let failure = Failure { excerpt: Some(excerpt), ..Failure::input("wrong").mend("right") };
+        let mut failure = Failure::input("wrong").mend("right");
+        failure.0.excerpt = Some(excerpt);
         assert_eq!(
             failure.to_string(),
             "error: wrong\n --> f:1:2\n  |\n1 | \tab\n  | \t^^\n  = mend: right\n"

@@ -1,5 +1,8 @@
 //! The `greybox` command as a user meets it: help, results, and one clear error for every bad input.
 
+// Helpers of a test file are tests too; the lint configuration knows only the annotated functions.
+#![allow(clippy::unwrap_used)]
+
 use std::fmt::Write as _;
 use std::fs;
 use std::path::{Path, PathBuf};
@@ -191,7 +194,11 @@ fn check_names_the_gap_and_still_exits_0() {
     bench.write("holed.csv", &holed.join("\n"));
     let outcome = bench.greybox(&["check", "holed.csv"]);
     assert_eq!(outcome.code, 0);
-    assert!(outcome.stdout.contains("60 rows are missing") && outcome.stdout.contains("mend:"), "{}", outcome.stdout);
+    assert!(
+        outcome.stdout.contains("60 rows are missing") && outcome.stdout.contains("mend:"),
+        "{}",
+        outcome.stdout
+    );
 }
 
 #[test]
