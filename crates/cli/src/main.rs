@@ -10,6 +10,7 @@ mod failure;
 mod loading;
 mod output;
 mod progress;
+mod story;
 
 use std::ffi::OsString;
 use std::process::ExitCode;

@@ -1,6 +1,5 @@
 //! `greybox calibrate`: the same equations with refitted parameters.
 
-use std::fmt::Write as _;
 use std::path::PathBuf;
 use std::sync::Arc;
 
@@ -9,7 +8,6 @@ use greybox_calibrate::{Data, Fit, Level, Limits, Point, Score, Setup, free_para
 use greybox_model::{Model, WriteOptions};
 use greybox_recording::{Recording, Severity};
 use greybox_report::contract::{self, FitSet, Interval, ModelId, Ordered, Parameter, Producer};
-use greybox_report::format;
 use serde::Serialize;
 
 use crate::answer::Answer;
@@ -19,6 +17,7 @@ use crate::failure::Failure;
 use crate::loading;
 use crate::output::OutputFolder;
 use crate::progress::Progress;
+use crate::story;
 
 /// Refit the parameters of a model, its equations unchanged, with uncertainties
 #[derive(Debug, Args)]
@@ -258,38 +257,11 @@ fn parameters(model: &Model, refitted: &Refitted) -> Ordered<Parameter> {
 }
 
 fn in_words(arguments: &Arguments, report: &Report) -> String {
-    let mut text = String::from("Parameters (nominal → calibrated, 95 % interval):\n");
-    let width = report.parameters.keys().map(|name| name.chars().count()).max().unwrap_or(0);
-    for (name, p) in &report.parameters {
-        let unit = p.unit.as_deref().map_or(String::new(), format::unit);
-        let nominal = format::significant(p.nominal, 4);
-        let line = match p.fixed {
-            true => format!("  {name:width$}  {nominal} {unit} (fixed)"),
-            false => {
-                format!("  {name:width$}  {nominal} → {} {unit}", format::with_interval(p.value, p.ci95))
-            }
-        };
-        let _ = writeln!(text, "{}", line.trim_end());
-    }
-    for (title, set) in [("training", &report.fit.train), ("held-out", &report.fit.holdout)] {
-        let _ = writeln!(text, "Free-run error on {title} data (nrmse):");
-        for (channel, after) in &set.calibrated {
-            let before = set.nominal.get(channel).map_or(f64::NAN, |s| s.nrmse);
-            let floor = report.noise_floor.get(channel).copied().unwrap_or(f64::NAN);
-            let _ = writeln!(
-                text,
-                "  {channel}: {} → {} (noise {})",
-                format::percent(before),
-                format::percent(after.nrmse),
-                format::percent(floor)
-            );
-        }
-    }
-    let _ = writeln!(text, "Held out: {}.", report.fit.holdout_source);
-    for finding in &report.findings {
-        let place = [finding.recording.as_deref(), finding.channel.as_deref()].into_iter().flatten();
-        let _ = writeln!(text, "Note, {}: {}", place.collect::<Vec<_>>().join(", "), finding.message);
-    }
-    let _ = writeln!(text, "Written: {0}/model.toml, {0}/report.json", arguments.out.display());
-    text
+    format!(
+        "{}{}{}Written: {out}/model.toml, {out}/report.json\n",
+        story::parameter_table(&report.parameters),
+        story::fit_table(&report.fit, &report.noise_floor),
+        story::notes(&report.findings),
+        out = arguments.out.display()
+    )
 }

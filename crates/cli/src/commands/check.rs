@@ -175,7 +175,7 @@ fn in_words(health: &Health) -> String {
         let _ = writeln!(text, "{}", line.trim_end());
     }
     let mut ordered: Vec<&Finding> = health.findings.iter().collect();
-    ordered.sort_by(|a, b| b.severity.cmp(&a.severity));
+    ordered.sort_by_key(|f| std::cmp::Reverse(f.severity));
     for finding in ordered {
         text.push_str(&finding_in_words(finding));
     }
