@@ -7,6 +7,7 @@ use std::path::Path;
 use std::process::ExitCode;
 
 use greybox_calibrate::DataError;
+use greybox_diagnose::DiagnoseError;
 use greybox_model::ModelError;
 use greybox_recording::RecordingError;
 use serde_json::{Map, Value, json};
@@ -221,6 +222,17 @@ impl From<DataError> for Failure {
             | DataError::UnreadableUnit { file, channel, .. }
             | DataError::EmptyChannel { file, channel } => failure.at("file", file).at("channel", channel),
             _ => failure,
+        }
+    }
+}
+
+/// A mechanism of the built-in library that cannot be read is a fault of greybox.
+impl From<DiagnoseError> for Failure {
+    fn from(error: DiagnoseError) -> Failure {
+        match error {
+            DiagnoseError::Data(error) => error.into(),
+            DiagnoseError::Mechanism(error) => Failure::internal(error.to_string()),
+            other => Failure::input(other.to_string()),
         }
     }
 }

@@ -5,6 +5,7 @@ use std::sync::mpsc::{RecvTimeoutError, Sender, channel};
 use std::thread::JoinHandle;
 use std::time::Duration;
 
+use greybox_diagnose::{Observer, Stage};
 use indicatif::{ProgressBar, ProgressDrawTarget, ProgressStyle};
 
 /// How long a command may be silent.
@@ -25,8 +26,7 @@ impl Progress {
         Progress::show("{spinner} [{elapsed}] {bar:24} {msg}", Some(steps))
     }
 
-    /// A spinner, for work of unknown length.
-    #[allow(dead_code, reason = "for diagnose")]
+    /// As many steps as come, for work of unknown length.
     pub(crate) fn open() -> Progress {
         Progress::show("{spinner} [{elapsed}] {msg}", None)
     }
@@ -58,6 +58,23 @@ impl Progress {
     /// One step is done.
     pub(crate) fn advance(&self) {
         self.bar.inc(1);
+    }
+}
+
+impl Observer for Progress {
+    fn stage(&self, stage: Stage) {
+        Progress::stage(
+            self,
+            match stage {
+                Stage::Calibrating => "calibrating the model as it is".to_owned(),
+                Stage::Screening { candidates, found } => {
+                    format!("screening {candidates} candidates ({found} found so far)")
+                }
+                Stage::Fitting { candidates } => format!("fitting the best {candidates}"),
+                Stage::Lengthening { segments } => format!("going on with {segments} longer segments"),
+                Stage::Simulating => "simulating whole recordings".to_owned(),
+            },
+        );
     }
 }
 

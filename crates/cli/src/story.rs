@@ -2,7 +2,9 @@
 
 use std::fmt::Write as _;
 
-use greybox_report::contract::{Finding, Fit, FitSet, Mechanism, Ordered, Parameter, Report, Score};
+use greybox_report::contract::{
+    Finding, Fit, FitSet, Mechanism, Ordered, Parameter, Report, Score, Severity,
+};
 use greybox_report::{expression, format, sentence};
 
 /// The story of a diagnosis: the conclusion, the mechanisms with their rivals, the fit, and what to know.
@@ -61,7 +63,7 @@ pub(crate) fn fit_table(fit: &Fit, noise_floor: &Ordered<f64>) -> String {
     format!(
         "Free-run error (nrmse):\n{}Held out: {}.\n",
         aligned(&rows),
-        fit.holdout_source.trim_end_matches('.')
+        fit.holdout_source.trim_start_matches("recordings held out: ").trim_end_matches('.')
     )
 }
 
@@ -89,10 +91,10 @@ pub(crate) fn parameter_table(parameters: &Ordered<Parameter>) -> String {
     format!("Parameters (± half the 95 % interval):\n{}", aligned(&rows))
 }
 
-/// What a reader must know of the data, one line each.
+/// What a reader must know of the data, one line each; mere facts stay in the report.
 pub(crate) fn notes(findings: &[Finding]) -> String {
     let mut text = String::new();
-    for finding in findings {
+    for finding in findings.iter().filter(|f| f.severity > Severity::Info) {
         let place = [finding.recording.as_deref(), finding.channel.as_deref()];
         let place: Vec<&str> = place.into_iter().flatten().collect();
         let place = if place.is_empty() { String::new() } else { format!("{}: ", place.join(", ")) };

@@ -1,10 +1,11 @@
 //! `greybox calibrate`: the same equations with refitted parameters.
 
 use std::path::PathBuf;
-use std::sync::Arc;
 
 use clap::Args;
-use greybox_calibrate::{Data, Fit, Level, Limits, Point, Score, Setup, free_parameters};
+use greybox_calibrate::{Data, Score};
+use greybox_diagnose::Calibration;
+use greybox_diagnose::diagnosis::ParameterChange;
 use greybox_model::{Model, WriteOptions};
 use greybox_recording::{Recording, Severity};
 use greybox_report::contract::{self, FitSet, Interval, ModelId, Ordered, Parameter, Producer};
@@ -12,9 +13,8 @@ use serde::Serialize;
 
 use crate::answer::Answer;
 use crate::commands::check::check_for_model;
-use crate::commands::simulate::window;
 use crate::failure::Failure;
-use crate::loading;
+use crate::loading::{self, LoadedModel};
 use crate::output::OutputFolder;
 use crate::progress::Progress;
 use crate::story;
@@ -44,12 +44,6 @@ pub(crate) struct Arguments {
     out: PathBuf,
 }
 
-/// Share of each recording that is held out where no recording is.
-const HELD_OUT: f64 = 0.2;
-/// Number of segments of the successive fits: short ones first, whose problem is nearly convex; whole
-/// pieces last, which hold the parameters best.
-const LEVELS: [usize; 4] = [60, 15, 4, 1];
-
 /// `report.json` of a calibration: the keys are those of a diagnosis, without its verdict.
 #[derive(Debug, Serialize)]
 struct Report {
@@ -65,14 +59,9 @@ pub(crate) fn run(arguments: &Arguments) -> Result<Answer, Failure> {
     let loaded = loading::model(&arguments.model)?;
     let (train, holdout) = loading::train_and_holdout(&arguments.train, &arguments.holdout)?;
     let model = &loaded.model;
-    // The whole recordings first, so that a missing channel is not blamed on a part.
     Data::new(model, &train)?;
-    let findings = findings(model, train.iter().chain(&holdout));
-    let (train, holdout, source) = hold_out(train, holdout)?;
-    let train = Arc::new(Data::new(model, &train)?);
-    let holdout = Arc::new(Data::new(model, &holdout)?);
-    let free = free_parameters(model);
-    if free.is_empty() {
+    Data::new(model, &holdout)?;
+    if model.parameters.iter().all(|p| p.fixed) {
         return Err(Failure::file(
             &arguments.model,
             "every parameter is fixed, so there is nothing to calibrate",
@@ -81,50 +70,40 @@ pub(crate) fn run(arguments: &Arguments) -> Result<Answer, Failure> {
     }
     let out = OutputFolder::prepare(&arguments.out)?;
 
-    let compile = |data: &Arc<Data>, free| {
-        Setup::new(model, data.clone(), free).map_err(|e| Failure::file(&arguments.model, e))
-    };
-    let setup = compile(&train, free)?;
-    let held = Setup { method: setup.method, ..compile(&holdout, Vec::new())? };
-    let progress = Progress::steps(LEVELS.len() as u64 + 1);
-    let refitted = refit(&setup, &progress);
-    progress.stage("simulating whole recordings");
-    let nominal = setup.values();
-    let window_s = window(&train);
-    let fit_set = |setup: &Setup| FitSet {
-        nominal: scores(setup, &nominal, &refitted.scale, window_s),
-        calibrated: scores(setup, &refitted.parameters, &refitted.scale, window_s),
-        improved: Ordered::new(),
-    };
-    let report = Report {
-        greybox: Producer { version: env!("CARGO_PKG_VERSION").to_owned(), seed: 0 },
-        model: ModelId { name: model.name.clone(), file: loaded.file.clone() },
-        parameters: parameters(model, &refitted),
-        fit: contract::Fit {
-            train: fit_set(&setup),
-            holdout: fit_set(&held),
-            window_s: Some(window_s),
-            holdout_source: source,
-            recordings: Ordered::new(),
-        },
-        noise_floor: train
-            .channels
-            .iter()
-            .zip(train.sigma.iter().zip(&train.spread))
-            .map(|(c, (sigma, spread))| (c.name.clone(), sigma / spread))
-            .collect(),
-        findings,
-    };
+    let progress = Progress::open();
+    let calibration = greybox_diagnose::calibrate(model, &train, &holdout, &progress)?;
     drop(progress);
-
-    let mut calibrated = model.clone();
-    for (parameter, value) in calibrated.parameters.iter_mut().zip(&refitted.parameters) {
-        parameter.value = *value;
-    }
-    let toml = calibrated.to_toml(&WriteOptions { original: Some(&loaded.text), ..Default::default() });
+    let findings = findings(model, train.iter().chain(&holdout));
+    let report = report(&loaded, &calibration, findings);
+    let options = WriteOptions { original: Some(&loaded.text), ..Default::default() };
+    let toml = calibration.model.to_toml(&options);
     let json = serde_json::to_value(&report).map_err(|e| Failure::internal(format!("report.json: {e}")))?;
     out.write(&[("model.toml", toml.as_bytes()), ("report.json", format!("{json:#}\n").as_bytes())])?;
     Ok(Answer::new(in_words(arguments, &report), json))
+}
+
+fn report(loaded: &LoadedModel, calibration: &Calibration, findings: Vec<contract::Finding>) -> Report {
+    let data = &calibration.data;
+    let fit_set = |(nominal, calibrated): &(Vec<Score>, Vec<Score>)| FitSet {
+        nominal: scores(data, nominal),
+        calibrated: scores(data, calibrated),
+        improved: Ordered::new(),
+    };
+    let floor = data.sigma.iter().zip(&data.spread).map(|(sigma, spread)| sigma / spread);
+    Report {
+        greybox: Producer { version: env!("CARGO_PKG_VERSION").to_owned(), seed: 0 },
+        model: ModelId { name: loaded.model.name.clone(), file: loaded.file.clone() },
+        parameters: parameters(&loaded.model, &calibration.parameters),
+        fit: contract::Fit {
+            train: fit_set(&calibration.train),
+            holdout: fit_set(&calibration.holdout),
+            window_s: Some(calibration.window),
+            holdout_source: calibration.holdout_source.clone(),
+            recordings: Ordered::new(),
+        },
+        noise_floor: data.channels.iter().map(|c| c.name.clone()).zip(floor).collect(),
+        findings,
+    }
 }
 
 /// Health findings of at least a warning.
@@ -150,108 +129,35 @@ fn findings<'a>(model: &Model, recordings: impl Iterator<Item = &'a Recording>) 
         .collect()
 }
 
-/// Training part, held-out part, and where the latter came from.
-fn hold_out(
-    train: Vec<Recording>,
-    holdout: Vec<Recording>,
-) -> Result<(Vec<Recording>, Vec<Recording>, String), Failure> {
-    if !holdout.is_empty() {
-        let names: Vec<&str> = holdout.iter().map(|r| r.name.as_str()).collect();
-        let source = format!("held-out recordings: {}", names.join(", "));
-        return Ok((train, holdout, source));
-    }
-    let (head, tail) = Data::split_tail(&train, HELD_OUT);
-    if head.is_empty() {
-        return Err(Failure::input("the recordings are too short to hold out their last fifth")
-            .mend("record for longer, or name a recording after `--holdout`"));
-    }
-    Ok((head, tail, "the last fifth of each training recording".to_owned()))
-}
-
-/// The result of the fits.
-struct Refitted {
-    parameters: Vec<f64>,
-    /// Residual scale per channel, SI.
-    scale: Vec<f64>,
-}
-
-/// Fits on short segments first and on whole pieces last.
-fn refit(setup: &Setup, progress: &Progress) -> Refitted {
-    let data = &setup.data;
-    let mut scale: Vec<f64> = data.spread.iter().map(|s| s.max(f64::MIN_POSITIVE)).collect();
-    let values = setup.values();
-    let mut best: Option<(f64, Refitted)> = None;
-    let mut last: Option<(Level, Fit)> = None;
-    for count in LEVELS {
-        let level = setup.level(count);
-        progress.stage(format!("fitting {} segments", level.segments.len()));
-        if last.as_ref().is_some_and(|(l, _)| l.segments == level.segments) {
-            progress.advance();
-            continue;
-        }
-        let points = match &last {
-            None => vec![Point { parameters: values.clone(), starts: setup.starts(&level, &values) }],
-            Some((from, fit)) => {
-                let parameters = fit.point.parameters.clone();
-                let starts = setup.starts(&level, &parameters);
-                vec![setup.stitch(from, &fit.point, &level, &scale), Point { parameters, starts }]
-            }
-        };
-        let rough = setup.fit(&level, &scale, &points, Limits::default());
-        scale = residual_scale(&rough, &scale, &data.sigma);
-        let fit = setup.fit(&level, &scale, &[rough.point], Limits::default());
-        let error = free_run_error(setup, &fit.point.parameters, &scale);
-        if best.as_ref().is_none_or(|(least, _)| error <= *least || least.is_nan()) {
-            best = Some((error, Refitted { parameters: fit.point.parameters.clone(), scale: scale.clone() }));
-        }
-        last = Some((level, fit));
-        progress.advance();
-    }
-    best.map_or(Refitted { parameters: values, scale }, |(_, refitted)| refitted)
-}
-
-/// The model's own residual per channel, never below 0.7 of the noise.
-fn residual_scale(fit: &Fit, scale: &[f64], sigma: &[f64]) -> Vec<f64> {
-    let rms = fit.rss.iter().zip(&fit.count).map(|(rss, n)| (rss / (*n).max(1) as f64).sqrt());
-    rms.zip(scale).zip(sigma).map(|((r, scale), sigma)| (r * scale).max(0.7 * sigma)).collect()
-}
-
-/// Σ nrmse² over the channels in free run on the training data.
-fn free_run_error(setup: &Setup, parameters: &[f64], scale: &[f64]) -> f64 {
-    let run = setup.free_run(parameters, scale);
-    setup.scores(&run, parameters, window(&setup.data), None).iter().map(|s| s.nrmse.powi(2)).sum()
-}
-
-fn scores(setup: &Setup, parameters: &[f64], scale: &[f64], window_s: f64) -> Ordered<contract::Score> {
-    let run = setup.free_run(parameters, scale);
-    let scores = setup.scores(&run, parameters, window_s, None);
+/// Scores by channel, in the units of the model.
+fn scores(data: &Data, scores: &[Score]) -> Ordered<contract::Score> {
+    let finite = |v: f64| Some(v).filter(|v| v.is_finite());
     let score = |s: &Score, factor: f64| contract::Score {
         nrmse: s.nrmse,
-        rmse: Some(s.rmse / factor).filter(|v| v.is_finite()),
-        nrmse_windowed: Some(s.nrmse_windowed).filter(|v| v.is_finite()),
-        rmse_windowed: Some(s.rmse_windowed / factor).filter(|v| v.is_finite()),
+        rmse: finite(s.rmse / factor),
+        nrmse_windowed: finite(s.nrmse_windowed),
+        rmse_windowed: finite(s.rmse_windowed / factor),
     };
-    setup.data.channels.iter().zip(&scores).map(|(c, s)| (c.name.clone(), score(s, c.factor))).collect()
+    data.channels.iter().zip(scores).map(|(c, s)| (c.name.clone(), score(s, c.factor))).collect()
 }
 
 /// The parameters before and after, in the units of the model file.
-fn parameters(model: &Model, refitted: &Refitted) -> Ordered<Parameter> {
-    model
-        .parameters
+fn parameters(model: &Model, changes: &[ParameterChange]) -> Ordered<Parameter> {
+    changes
         .iter()
-        .zip(&refitted.parameters)
-        .map(|(p, value)| {
+        .filter_map(|change| {
+            let p = model.parameters.get(change.index)?;
             let factor = p.unit.as_ref().map_or(1.0, |u| u.factor);
             let parameter = Parameter {
-                nominal: p.value / factor,
-                value: value / factor,
-                ci95: None::<Interval>,
+                nominal: change.nominal / factor,
+                value: change.calibrated.value / factor,
+                ci95: change.calibrated.ci95.map(|(low, high)| Interval::new(low / factor, high / factor)),
                 unit: p.unit.as_ref().map(|u| u.text.clone()),
                 fixed: p.fixed,
                 calibrated: None,
                 calibrated_ci95: None,
             };
-            (p.name.clone(), parameter)
+            Some((p.name.clone(), parameter))
         })
         .collect()
 }

@@ -96,7 +96,7 @@ fn score_json(score: &Score) -> serde_json::Value {
 }
 
 /// Length of the windows in which simulations are restarted for `nrmse_windowed`, s.
-pub(crate) fn window(data: &Data) -> f64 {
+fn window(data: &Data) -> f64 {
     let durations: Vec<f64> = data.pieces.iter().map(|p| p.len as f64 * p.dt).collect();
     window_length(&durations, data.pieces.first().map_or(1.0, |p| p.dt))
 }
