@@ -8,6 +8,7 @@ use greybox_model::{Model, Problem};
 use greybox_recording::{Recording, read_csv};
 
 use crate::failure::Failure;
+use crate::output::same_file;
 
 /// A model and the text it was read from.
 #[derive(Debug)]
@@ -78,7 +79,7 @@ fn file_name(path: &Path) -> String {
 pub(crate) fn recordings(paths: &[PathBuf]) -> Result<Vec<Recording>, Failure> {
     let mut read = Vec::with_capacity(paths.len());
     for (i, path) in paths.iter().enumerate() {
-        if let Some(twin) = paths[..i].iter().find(|twin| same_file(twin, path)) {
+        if let Some(twin) = paths[..i].iter().find(|twin| *twin == path || same_file(twin, path)) {
             return Err(Failure::file(
                 path,
                 format!("this recording is named twice (also as {})", twin.display()),
@@ -116,11 +117,4 @@ pub(crate) fn train_and_holdout(
     let mut train_recordings = recordings(&paths)?;
     let held = train_recordings.split_off(train.len());
     Ok((train_recordings, held))
-}
-
-fn same_file(a: &Path, b: &Path) -> bool {
-    match (fs::canonicalize(a), fs::canonicalize(b)) {
-        (Ok(a), Ok(b)) => a == b,
-        _ => a == b,
-    }
 }

@@ -40,12 +40,49 @@ impl OutputFolder {
         Ok(folder)
     }
 
+    /// Sees that writing `names` here would not replace one of `inputs`.
+    ///
+    /// # Errors
+    /// Bad input, naming the file that would be lost.
+    pub(crate) fn spares<'a>(
+        &self,
+        names: &[&str],
+        inputs: impl IntoIterator<Item = &'a PathBuf>,
+    ) -> Result<(), Failure> {
+        for input in inputs {
+            if let Some(name) = names.iter().find(|name| same_file(&self.path.join(name), input)) {
+                return Err(Failure::file(input, format!("the new {name} would overwrite this input"))
+                    .mend("name another folder after `--out`"));
+            }
+        }
+        Ok(())
+    }
+
+    /// Sees that no file of the name is here, other than one of the same content.
+    ///
+    /// # Errors
+    /// Bad input, naming the file that would be lost.
+    pub(crate) fn spares_other(&self, files: &[(&str, &[u8])]) -> Result<(), Failure> {
+        for (name, content) in files {
+            let path = self.path.join(name);
+            if path.exists() && !fs::read(&path).is_ok_and(|old| old == *content) {
+                return Err(Failure::file(&path, "this file is there already, and is not of this demo")
+                    .mend("name another folder after `--out`"));
+            }
+        }
+        Ok(())
+    }
+
     /// Writes `files` (name, content). The folder and those above it are made where they are missing;
     /// files of the same names are replaced, others stay.
     ///
     /// # Errors
-    /// Bad input when the folder cannot be written; then everything is as it was before.
+    /// Bad input when the folder cannot be written, or something else than an ordinary file has the name
+    /// of a result; then everything is as it was before.
     pub(crate) fn write(&self, files: &[(&str, &[u8])]) -> Result<(), Failure> {
+        for (name, _) in files {
+            ordinary(&self.path.join(name))?;
+        }
         let stage = self.stage();
         let result = fs::create_dir(&stage).and_then(|()| {
             for (name, content) in files {
@@ -106,6 +143,24 @@ impl OutputFolder {
     }
 }
 
+/// Whether both paths lead to one existing file.
+pub(crate) fn same_file(a: &Path, b: &Path) -> bool {
+    match (fs::canonicalize(a), fs::canonicalize(b)) {
+        (Ok(a), Ok(b)) => a == b,
+        _ => false,
+    }
+}
+
+/// Sees that what stands at `path`, if anything, may be replaced: a folder or a device may not.
+fn ordinary(path: &Path) -> Result<(), Failure> {
+    if path.exists() && !path.is_file() {
+        let what = if path.is_dir() { "this is a folder" } else { "this is a device, not an ordinary file" };
+        return Err(Failure::file(path, format!("{what}, but the result is one file"))
+            .mend("name another place after `--out`, such as `simulated.csv`"));
+    }
+    Ok(())
+}
+
 /// A single file of results, as [`OutputFolder`] is a folder of them.
 #[derive(Debug)]
 pub(crate) struct OutputFile {
@@ -119,18 +174,14 @@ impl OutputFile {
     /// # Errors
     /// Bad input when `path` is a folder or one of `inputs`, or cannot be written.
     pub(crate) fn prepare(path: &Path, inputs: &[&Path]) -> Result<OutputFile, Failure> {
-        if path.is_dir() {
-            return Err(Failure::file(path, "this is a folder, but the result is one file")
-                .mend("name a file after `--out`, such as `simulated.csv`"));
-        }
-        let same = |input: &&&Path| match (fs::canonicalize(path), fs::canonicalize(input)) {
-            (Ok(a), Ok(b)) => a == b,
-            _ => false,
-        };
-        if let Some(input) = inputs.iter().find(same) {
+        ordinary(path)?;
+        if let Some(input) = inputs.iter().find(|input| same_file(path, input)) {
             return Err(Failure::file(input, "the result would overwrite this input")
                 .mend("name another file after `--out`"));
         }
+        // A link is followed: its target is replaced, the link stays.
+        let resolved = fs::canonicalize(path).unwrap_or_else(|_| path.to_owned());
+        let path = resolved.as_path();
         let Some(name) = path.file_name().and_then(|n| n.to_str()) else {
             return Err(Failure::file(path, "this is not the name of a file")
                 .mend("name a file after `--out`, such as `simulated.csv`"));
@@ -209,6 +260,35 @@ mod tests {
         fs::remove_dir_all(&stage).unwrap();
         assert_eq!(names(top.path()), ["x"]);
         assert_eq!(fs::read(top.path().join("x")).unwrap(), b"old");
+    }
+
+    #[test]
+    fn a_folder_that_has_the_name_of_a_result_is_kept() {
+        let top = tempfile::tempdir().unwrap();
+        fs::create_dir(top.path().join("y")).unwrap();
+        fs::write(top.path().join("y/mine"), "1").unwrap();
+        let folder = OutputFolder::prepare(top.path()).unwrap();
+        let failure = folder.write(&[("x", b"1"), ("y", b"2")]).unwrap_err().to_string();
+        assert!(failure.contains("this is a folder"), "{failure}");
+        assert_eq!(names(top.path()), ["y"]);
+        assert_eq!(fs::read(top.path().join("y/mine")).unwrap(), b"1");
+    }
+
+    /// A rename would put an ordinary file in the place of the device.
+    #[cfg(unix)]
+    #[test]
+    fn devices_and_links_stay_what_they_are() {
+        let top = tempfile::tempdir().unwrap();
+        let socket = top.path().join("socket");
+        let _bound = std::os::unix::net::UnixListener::bind(&socket).unwrap();
+        let failure = OutputFile::prepare(&socket, &[]).unwrap_err().to_string();
+        assert!(failure.contains("this is a device"), "{failure}");
+        let (target, link) = (top.path().join("target"), top.path().join("link"));
+        fs::write(&target, "old").unwrap();
+        std::os::unix::fs::symlink(&target, &link).unwrap();
+        OutputFile::prepare(&link, &[]).unwrap().write(b"new").unwrap();
+        assert!(link.is_symlink());
+        assert_eq!(fs::read(&target).unwrap(), b"new");
     }
 
     #[test]

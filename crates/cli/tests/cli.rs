@@ -398,6 +398,15 @@ fn outputs_that_cannot_be_written() {
     bench.refuses(&simulate("file/under.csv"), &["file", "mend"]);
     bench.refuses(&simulate("."), &["this is a folder", "mend"]);
     bench.refuses(&simulate("run1.csv"), &["run1.csv", "overwrite", "mend"]);
+    // Results never replace what the command reads, nor does the demo replace the user's files.
+    bench.refuses(
+        &["calibrate", "model.toml", "run1.csv", "--out", "."],
+        &["model.toml", "overwrite", "mend"],
+    );
+    bench.write("improved.toml", MODEL);
+    bench.refuses(&["diagnose", "improved.toml", "run1.csv", "--out", "."], &["improved.toml", "overwrite"]);
+    bench.refuses(&["demo", "--out", "."], &["model.toml", "not of this demo", "mend"]);
+    assert_eq!(bench.read("model.toml"), MODEL);
     assert_eq!(bench.read("file"), "mine");
     assert_eq!(bench.read("run1.csv"), recording(1200, 0.0));
 }

@@ -69,6 +69,8 @@ pub(crate) fn run(arguments: &Arguments) -> Result<Answer, Failure> {
         .mend("take `fixed = true` from the parameters that may move"));
     }
     let out = OutputFolder::prepare(&arguments.out)?;
+    let inputs = arguments.train.iter().chain(&arguments.holdout).chain([&arguments.model]);
+    out.spares(&["model.toml", "report.json"], inputs)?;
 
     let progress = Progress::open();
     let calibration = greybox_diagnose::calibrate(model, &train, &holdout, &progress)?;

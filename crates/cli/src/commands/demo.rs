@@ -33,7 +33,12 @@ pub(crate) struct Arguments {
 }
 
 pub(crate) fn run(arguments: &Arguments) -> Result<Answer, Failure> {
+    let embedded: [(&str, &[u8]); 3] =
+        [("model.toml", MODEL.as_bytes()), ("train.csv", TRAIN), ("holdout.csv", HOLDOUT)];
     let out = arguments.out.as_deref().map(OutputFolder::prepare).transpose()?;
+    if let Some(folder) = &out {
+        folder.spares_other(&embedded)?;
+    }
     let model = Model::from_toml(MODEL, "model.toml").map_err(|e| Failure::internal(e.to_string()))?;
     let loaded = LoadedModel { model, text: MODEL.to_owned(), file: "model.toml".to_owned() };
     let train = [parse_csv(TRAIN, "train.csv")?];
@@ -46,10 +51,7 @@ pub(crate) fn run(arguments: &Arguments) -> Result<Answer, Failure> {
     );
     match (&out, &arguments.out) {
         (Some(folder), Some(path)) => {
-            results.write_with(
-                folder,
-                &[("model.toml", MODEL.as_bytes()), ("train.csv", TRAIN), ("holdout.csv", HOLDOUT)],
-            )?;
+            results.write_with(folder, &embedded)?;
             text.push('\n');
             text.push_str(&written(path));
         }

@@ -50,6 +50,8 @@ pub(crate) fn run(arguments: &Arguments) -> Result<Answer, Failure> {
     Data::new(&loaded.model, &train)?;
     Data::new(&loaded.model, &holdout)?;
     let out = OutputFolder::prepare(&arguments.out)?;
+    let inputs = arguments.train.iter().chain(&arguments.holdout).chain([&arguments.model]);
+    out.spares(&["report.json", "report.html", "improved.toml"], inputs)?;
     let results = diagnose(&loaded, &train, &holdout, arguments.seed)?;
     results.write(&out)?;
     let text = format!("{}\n{}", results.story, written(&arguments.out));
