@@ -1,2 +1,40 @@
-//! The `greybox` command.
-fn main() {}
+//! The `greybox` command: reads files, calls the library, writes files and a plain-language summary.
+//!
+//! One file per subcommand in [`commands`]. A command returns its [`answer::Answer`] or one
+//! [`failure::Failure`]; only this file and [`answer`] print.
+
+mod answer;
+mod arguments;
+mod commands;
+mod failure;
+mod loading;
+mod output;
+mod progress;
+mod story;
+
+use std::ffi::OsString;
+use std::process::ExitCode;
+
+use answer::Manner;
+use arguments::Cli;
+use failure::Failure;
+
+fn main() -> ExitCode {
+    let arguments: Vec<OsString> = std::env::args_os().collect();
+    let manner = if arguments.iter().any(|a| a == "--json") { Manner::Json } else { Manner::Text };
+    match std::panic::catch_unwind(|| run(arguments)) {
+        Ok(Ok(answer)) => answer.print(manner),
+        Ok(Err(failure)) => failure.print(manner),
+        // The default hook has said where on standard error.
+        Err(_) => {
+            Failure::internal("greybox met a fault of its own; please report the lines above").print(manner)
+        }
+    }
+}
+
+fn run(arguments: Vec<OsString>) -> Result<answer::Answer, Failure> {
+    match Cli::read(arguments)? {
+        Ok(cli) => cli.command.run(),
+        Err(help) => Ok(help),
+    }
+}

@@ -1,0 +1,48 @@
+//! What a command that finished has to say.
+
+use std::io::{ErrorKind, Write};
+use std::process::ExitCode;
+
+/// For whom a command speaks.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub(crate) enum Manner {
+    /// Plain language.
+    Text,
+    /// One JSON document.
+    Json,
+}
+
+/// The result of a command, in words and for machines.
+#[derive(Debug)]
+pub(crate) struct Answer {
+    text: String,
+    json: Option<serde_json::Value>,
+}
+
+impl Answer {
+    pub(crate) fn new(text: String, json: serde_json::Value) -> Answer {
+        Answer { text, json: Some(json) }
+    }
+
+    /// Help or version: the same words in either manner.
+    pub(crate) fn words(text: String) -> Answer {
+        Answer { text, json: None }
+    }
+
+    /// Prints on standard output; exit 0, or 1 where standard output cannot be written.
+    pub(crate) fn print(&self, manner: Manner) -> ExitCode {
+        match (&self.json, manner) {
+            (Some(json), Manner::Json) => print(&format!("{json:#}\n")),
+            _ => print(&self.text),
+        }
+    }
+}
+
+/// Writes to standard output. A reader that has heard enough (`greybox … | head`) is no failure.
+pub(crate) fn print(text: &str) -> ExitCode {
+    let mut out = std::io::stdout().lock();
+    match out.write_all(text.as_bytes()).and_then(|()| out.flush()) {
+        Err(e) if e.kind() != ErrorKind::BrokenPipe => ExitCode::from(1),
+        _ => ExitCode::SUCCESS,
+    }
+}

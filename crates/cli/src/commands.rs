@@ -1,0 +1,7 @@
+//! The subcommands, one file each.
+
+pub(crate) mod calibrate;
+pub(crate) mod check;
+pub(crate) mod demo;
+pub(crate) mod diagnose;
+pub(crate) mod simulate;

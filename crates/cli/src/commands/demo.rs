@@ -1,0 +1,66 @@
+//! `greybox demo`: the whole story on an embedded recording.
+
+use std::path::PathBuf;
+
+use clap::Args;
+use greybox_model::Model;
+use greybox_recording::parse_csv;
+
+use crate::answer::Answer;
+use crate::commands::diagnose::{diagnose, written};
+use crate::failure::Failure;
+use crate::loading::LoadedModel;
+use crate::output::OutputFolder;
+
+const MODEL: &str = include_str!("../../demo/model.toml");
+const TRAIN: &[u8] = include_bytes!("../../demo/train.csv");
+const HOLDOUT: &[u8] = include_bytes!("../../demo/holdout.csv");
+/// What the embedded files are.
+const ABOUT: &str = include_str!("../../demo/about.txt");
+
+/// Diagnose an embedded recording: the whole story in under a minute
+#[derive(Debug, Args)]
+#[command(after_help = "Examples:
+  greybox demo
+  greybox demo --out demo
+
+With --out, DIR receives the report, the improved model, and the embedded model and recordings, to try the
+other commands on.")]
+pub(crate) struct Arguments {
+    /// Folder for the results; nothing is written without it
+    #[arg(long, value_name = "DIR")]
+    out: Option<PathBuf>,
+}
+
+pub(crate) fn run(arguments: &Arguments) -> Result<Answer, Failure> {
+    let embedded: [(&str, &[u8]); 3] =
+        [("model.toml", MODEL.as_bytes()), ("train.csv", TRAIN), ("holdout.csv", HOLDOUT)];
+    let out = arguments.out.as_deref().map(OutputFolder::prepare).transpose()?;
+    if let Some(folder) = &out {
+        folder.spares_other(&embedded)?;
+    }
+    let model = Model::from_toml(MODEL, "model.toml").map_err(|e| Failure::internal(e.to_string()))?;
+    let loaded = LoadedModel { model, text: MODEL.to_owned(), file: "model.toml".to_owned() };
+    let train = [parse_csv(TRAIN, "train.csv")?];
+    let holdout = [parse_csv(HOLDOUT, "holdout.csv")?];
+    let results = diagnose(&loaded, &train, &holdout, 0)?;
+    let mut text = format!(
+        "{ABOUT}\nThe model, model.toml:\n\n{}\nWhat greybox says:\n\n{}",
+        indented(MODEL),
+        results.story
+    );
+    match (&out, &arguments.out) {
+        (Some(folder), Some(path)) => {
+            results.write_with(folder, &embedded)?;
+            text.push('\n');
+            text.push_str(&written(path));
+        }
+        _ => text
+            .push_str("\nWith `--out DIR` the report, the improved model and the recordings are written.\n"),
+    }
+    Ok(Answer::new(text, results.json))
+}
+
+fn indented(text: &str) -> String {
+    text.lines().map(|line| format!("  {line}").trim_end().to_owned() + "\n").collect()
+}

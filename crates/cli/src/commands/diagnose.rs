@@ -1,0 +1,124 @@
+//! `greybox diagnose`: what physics does the model leave out?
+
+use std::path::{Path, PathBuf};
+
+use clap::Args;
+use greybox_calibrate::Data;
+use greybox_diagnose::Options;
+use greybox_recording::Recording;
+use greybox_report::convert::{self, Sources};
+
+use crate::answer::Answer;
+use crate::failure::Failure;
+use crate::loading::{self, LoadedModel};
+use crate::output::OutputFolder;
+use crate::progress::Progress;
+use crate::story;
+
+/// Find what physics a model leaves out: what, where, how sure, and a model that fits
+#[derive(Debug, Args)]
+#[command(after_help = "Example:
+  greybox diagnose link.toml run1.csv run2.csv --holdout run3.csv --out result
+
+DIR receives report.json, report.html (self-contained, with plots) and improved.toml. With no --holdout, the
+last fifth of each recording is held out. The same seed and inputs give the same results.")]
+pub(crate) struct Arguments {
+    /// Nominal model (TOML)
+    #[arg(value_name = "MODEL.toml")]
+    model: PathBuf,
+
+    /// Recordings to choose and fit with (CSV)
+    #[arg(value_name = "TRAIN.csv", required = true)]
+    train: Vec<PathBuf>,
+
+    /// Recordings that only judge the result
+    #[arg(long, value_name = "TEST.csv", num_args = 1..)]
+    holdout: Vec<PathBuf>,
+
+    /// Folder for the results; made where it is missing
+    #[arg(long, value_name = "DIR")]
+    out: PathBuf,
+
+    /// Seed of every random choice
+    #[arg(long, value_name = "N", default_value_t = 0)]
+    seed: u64,
+}
+
+pub(crate) fn run(arguments: &Arguments) -> Result<Answer, Failure> {
+    let loaded = loading::model(&arguments.model)?;
+    let (train, holdout) = loading::train_and_holdout(&arguments.train, &arguments.holdout)?;
+    Data::new(&loaded.model, &train)?;
+    Data::new(&loaded.model, &holdout)?;
+    let out = OutputFolder::prepare(&arguments.out)?;
+    let inputs = arguments.train.iter().chain(&arguments.holdout).chain([&arguments.model]);
+    out.spares(&["report.json", "report.html", "improved.toml"], inputs)?;
+    let results = diagnose(&loaded, &train, &holdout, arguments.seed)?;
+    results.write(&out)?;
+    let text = format!("{}\n{}", results.story, written(&arguments.out));
+    Ok(Answer::new(text, results.json))
+}
+
+/// Where the results are.
+pub(crate) fn written(out: &Path) -> String {
+    format!("Written: {0}/report.html, {0}/report.json, {0}/improved.toml\n", out.display())
+}
+
+/// A diagnosis as the files and words that users see.
+#[derive(Debug)]
+pub(crate) struct Results {
+    report_json: String,
+    report_html: String,
+    improved_toml: String,
+    /// The diagnosis in plain language.
+    pub(crate) story: String,
+    /// The content of `report.json`.
+    pub(crate) json: serde_json::Value,
+}
+
+impl Results {
+    /// Writes all files, or none.
+    ///
+    /// # Errors
+    /// As [`OutputFolder::write`].
+    pub(crate) fn write(&self, out: &OutputFolder) -> Result<(), Failure> {
+        self.write_with(out, &[])
+    }
+
+    /// Writes all files and `others`, or none.
+    ///
+    /// # Errors
+    /// As [`OutputFolder::write`].
+    pub(crate) fn write_with(&self, out: &OutputFolder, others: &[(&str, &[u8])]) -> Result<(), Failure> {
+        let own: [(&str, &[u8]); 3] = [
+            ("report.json", self.report_json.as_bytes()),
+            ("report.html", self.report_html.as_bytes()),
+            ("improved.toml", self.improved_toml.as_bytes()),
+        ];
+        out.write(&[&own, others].concat())
+    }
+}
+
+/// Diagnoses a model, with a progress bar for those who wait.
+///
+/// # Errors
+/// Bad input where the recordings do not fit the model or hold too little data.
+pub(crate) fn diagnose(
+    loaded: &LoadedModel,
+    train: &[Recording],
+    holdout: &[Recording],
+    seed: u64,
+) -> Result<Results, Failure> {
+    let progress = Progress::open();
+    let options = Options { seed, ..Options::default() };
+    let diagnosis = greybox_diagnose::diagnose(&loaded.model, train, holdout, &options, &progress)?;
+    progress.stage("writing the report");
+    let sources = Sources { model_file: &loaded.file, model_text: &loaded.text, train, holdout };
+    let report = convert::report(&diagnosis, &sources);
+    let unwritten = |e: greybox_report::ReportError| Failure::internal(e.to_string());
+    let report_json = report.to_json().map_err(unwritten)?;
+    let json = serde_json::from_str(&report_json).map_err(|e| unwritten(e.into()))?;
+    let story = story::diagnosis(&report);
+    let report_html = convert::page(&diagnosis, report, &sources).to_html().map_err(unwritten)?;
+    let improved_toml = convert::improved_toml(&diagnosis, &loaded.text);
+    Ok(Results { report_json, report_html, improved_toml, story, json })
+}

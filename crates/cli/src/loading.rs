@@ -1,0 +1,120 @@
+//! Reading models and recordings, with errors for the usual mistakes.
+
+use std::fs;
+use std::io::ErrorKind;
+use std::path::{Path, PathBuf};
+
+use greybox_model::{Model, Problem};
+use greybox_recording::{Recording, read_csv};
+
+use crate::failure::Failure;
+use crate::output::same_file;
+
+/// A model and the text it was read from.
+#[derive(Debug)]
+pub(crate) struct LoadedModel {
+    pub(crate) model: Model,
+    pub(crate) text: String,
+    /// File name without its folder.
+    pub(crate) file: String,
+}
+
+/// Reads the model at `path`.
+///
+/// # Errors
+/// Bad input: no such file, a folder, a recording in its place, or a fault in the model.
+pub(crate) fn model(path: &Path) -> Result<LoadedModel, Failure> {
+    let text = read_text(path)?;
+    let label = path.display().to_string();
+    match Model::from_toml(&text, &label) {
+        Ok(model) => Ok(LoadedModel { model, file: file_name(path), text }),
+        Err(error)
+            if matches!(error.problem(), Problem::Toml { .. }) && looks_like_recording(path, &text) =>
+        {
+            Err(Failure::file(path, "this is a recording (CSV), but a model (TOML) is needed here")
+                .mend("put the model first and the recordings after it: `MODEL.toml TRAIN.csv`"))
+        }
+        Err(_) if text.trim().is_empty() => Err(Failure::file(path, "the model file is empty")
+            .mend("write at least [states], [parameters] and [equations]")),
+        Err(error) => Err(Failure::model(&error, &text)),
+    }
+}
+
+fn read_text(path: &Path) -> Result<String, Failure> {
+    if path.is_dir() {
+        return Err(Failure::file(path, "this is a folder, not a model").mend("name one TOML file inside it"));
+    }
+    let bytes = fs::read(path).map_err(|e| match e.kind() {
+        ErrorKind::NotFound => Failure::file(path, "no such file").mend("check the path and the spelling"),
+        _ => Failure::file(path, format!("the file cannot be read: {e}")).mend("check its permissions"),
+    })?;
+    String::from_utf8(bytes).map_err(|e| {
+        let line = 1 + e.as_bytes()[..e.utf8_error().valid_up_to()].iter().filter(|&&b| b == b'\n').count();
+        Failure::file(path, format!("line {line}: the file is not UTF-8 text")).mend("save it again as UTF-8")
+    })
+}
+
+fn looks_like_recording(path: &Path, text: &str) -> bool {
+    let header = text.lines().next().unwrap_or_default();
+    has_extension(path, "csv") || header.starts_with("t,") || header.starts_with("t [")
+}
+
+fn looks_like_model(path: &Path) -> bool {
+    has_extension(path, "toml")
+        || fs::read_to_string(path).is_ok_and(|text| text.lines().any(|line| line.trim() == "[equations]"))
+}
+
+fn has_extension(path: &Path, wanted: &str) -> bool {
+    path.extension().is_some_and(|e| e.eq_ignore_ascii_case(wanted))
+}
+
+fn file_name(path: &Path) -> String {
+    path.file_name().map_or_else(|| path.display().to_string(), |n| n.to_string_lossy().into_owned())
+}
+
+/// Reads the recordings at `paths`. Recordings that share a file name are called by their paths.
+///
+/// # Errors
+/// Bad input: a file that is missing, a model or a folder in its place, one named twice, or any fault in it.
+pub(crate) fn recordings(paths: &[PathBuf]) -> Result<Vec<Recording>, Failure> {
+    let mut read = Vec::with_capacity(paths.len());
+    for (i, path) in paths.iter().enumerate() {
+        if let Some(twin) = paths[..i].iter().find(|twin| *twin == path || same_file(twin, path)) {
+            return Err(Failure::file(
+                path,
+                format!("this recording is named twice (also as {})", twin.display()),
+            )
+            .mend("name each recording once, either for training or after `--holdout`"));
+        }
+        let mut recording = match read_csv(path) {
+            Ok(recording) => recording,
+            Err(_) if path.is_file() && looks_like_model(path) => {
+                return Err(Failure::file(
+                    path,
+                    "this is a model (TOML), but a recording (CSV) is needed here",
+                )
+                .mend("name the model once, before the recordings"));
+            }
+            Err(error) => return Err(error.into()),
+        };
+        if paths.iter().any(|other| other != path && file_name(other) == recording.name) {
+            recording.name = path.display().to_string();
+        }
+        read.push(recording);
+    }
+    Ok(read)
+}
+
+/// Reads the recordings for training and those held out, and sees that no recording is both.
+///
+/// # Errors
+/// As [`recordings`].
+pub(crate) fn train_and_holdout(
+    train: &[PathBuf],
+    holdout: &[PathBuf],
+) -> Result<(Vec<Recording>, Vec<Recording>), Failure> {
+    let paths: Vec<PathBuf> = train.iter().chain(holdout).cloned().collect();
+    let mut train_recordings = recordings(&paths)?;
+    let held = train_recordings.split_off(train.len());
+    Ok((train_recordings, held))
+}

@@ -1,0 +1,90 @@
+//! A progress bar for those who wait.
+
+use std::io::IsTerminal;
+use std::sync::mpsc::{RecvTimeoutError, Sender, channel};
+use std::thread::JoinHandle;
+use std::time::Duration;
+
+use greybox_diagnose::{Observer, Stage};
+use indicatif::{ProgressBar, ProgressDrawTarget, ProgressStyle};
+
+/// How long a command may be silent.
+const PATIENCE: Duration = Duration::from_secs(2);
+
+/// A bar on standard error that appears after two seconds, and only where standard error is a terminal;
+/// it is gone when dropped.
+#[derive(Debug)]
+pub(crate) struct Progress {
+    bar: ProgressBar,
+    /// Wakes the thread that waits to show the bar; `None` once dropped.
+    waiting: Option<(Sender<()>, JoinHandle<()>)>,
+}
+
+impl Progress {
+    /// A bar over `steps` steps.
+    pub(crate) fn steps(steps: u64) -> Progress {
+        Progress::show("{spinner} [{elapsed}] {bar:24} {msg}", Some(steps))
+    }
+
+    /// As many steps as come, for work of unknown length.
+    pub(crate) fn open() -> Progress {
+        Progress::show("{spinner} [{elapsed}] {msg}", None)
+    }
+
+    fn show(template: &str, steps: Option<u64>) -> Progress {
+        let bar = ProgressBar::with_draw_target(steps, ProgressDrawTarget::hidden());
+        if let Ok(style) = ProgressStyle::with_template(template) {
+            bar.set_style(style);
+        }
+        if !std::io::stderr().is_terminal() {
+            return Progress { bar, waiting: None };
+        }
+        let (stop, stopped) = channel();
+        let shown = bar.clone();
+        let thread = std::thread::spawn(move || {
+            if stopped.recv_timeout(PATIENCE) == Err(RecvTimeoutError::Timeout) {
+                shown.set_draw_target(ProgressDrawTarget::stderr());
+                shown.enable_steady_tick(Duration::from_millis(120));
+            }
+        });
+        Progress { bar, waiting: Some((stop, thread)) }
+    }
+
+    /// Says what is being done now.
+    pub(crate) fn stage(&self, what: impl Into<String>) {
+        self.bar.set_message(what.into());
+    }
+
+    /// One step is done.
+    pub(crate) fn advance(&self) {
+        self.bar.inc(1);
+    }
+}
+
+impl Observer for Progress {
+    fn stage(&self, stage: Stage) {
+        Progress::stage(
+            self,
+            match stage {
+                Stage::Calibrating => "calibrating the model as it is".to_owned(),
+                Stage::Screening { candidates, found } => {
+                    format!("screening {candidates} candidates ({found} found so far)")
+                }
+                Stage::Fitting { candidates } => format!("fitting the best {candidates}"),
+                Stage::Lengthening { segments } => format!("going on with {segments} longer segments"),
+                Stage::Simulating => "simulating whole recordings".to_owned(),
+            },
+        );
+    }
+}
+
+impl Drop for Progress {
+    fn drop(&mut self) {
+        if let Some((stop, thread)) = self.waiting.take() {
+            drop(stop);
+            // The thread only waits and draws; there is nothing to learn from how it ended.
+            let _ = thread.join();
+        }
+        self.bar.finish_and_clear();
+    }
+}

@@ -1,0 +1,161 @@
+//! Reports as plain language for a terminal.
+
+use std::fmt::Write as _;
+
+use greybox_report::contract::{
+    Finding, Fit, FitSet, Mechanism, Ordered, Parameter, Report, Score, Severity,
+};
+use greybox_report::{expression, format, sentence};
+
+/// The story of a diagnosis: the conclusion, the mechanisms with their rivals, the fit, and what to know.
+pub(crate) fn diagnosis(report: &Report) -> String {
+    let mut text = String::new();
+    let written = sentence::summary(report);
+    for line in if report.summary.is_empty() { &written } else { &report.summary } {
+        let _ = writeln!(text, "{line}");
+    }
+    for (number, mechanism) in report.mechanisms.iter().enumerate() {
+        text.push('\n');
+        text.push_str(&mechanism_in_words(number + 1, mechanism));
+    }
+    text.push('\n');
+    text.push_str(&fit_table(&report.fit, &report.noise_floor));
+    text.push_str(&notes(&report.findings));
+    text
+}
+
+fn mechanism_in_words(number: usize, mechanism: &Mechanism) -> String {
+    let mut text = format!(
+        "{number}. {}: {}\n   explains {} of the residual, confidence {}\n",
+        format::kind(&mechanism.kind),
+        expression::text(&mechanism.expression),
+        format::probability(mechanism.share_explained),
+        format::probability(mechanism.confidence)
+    );
+    for other in &mechanism.alternatives {
+        let standing = match other.equivalent {
+            true => "these data cannot tell it apart".to_owned(),
+            false => format!("confidence {}", format::probability(other.confidence)),
+        };
+        let _ = write!(text, "   or {} ({standing})", format::kind_in_sentence(&other.kind));
+        if let Some(separate) = other.separate.as_deref().filter(|s| !s.is_empty()) {
+            let _ = write!(text, "; to tell: {}", separate.trim_end_matches('.'));
+        }
+        text.push('\n');
+    }
+    text
+}
+
+/// Free-run errors of the models there are, one row per role and channel.
+pub(crate) fn fit_table(fit: &Fit, noise_floor: &Ordered<f64>) -> String {
+    let improved = !(fit.train.improved.is_empty() && fit.holdout.improved.is_empty());
+    let mut rows = vec![vec!["".to_owned(), "nominal".to_owned(), "calibrated".to_owned()]];
+    rows[0].extend(improved.then(|| "improved".to_owned()));
+    rows[0].push("noise".to_owned());
+    for (role, set) in [("training", &fit.train), ("held out", &fit.holdout)] {
+        for channel in set.channels() {
+            let mut row = vec![format!("{role}, {}", expression::text(channel))];
+            row.extend(models(set, improved).iter().map(|scores| percent(scores.get(channel))));
+            row.push(format::percent(noise_floor.get(channel).copied().unwrap_or(f64::NAN)));
+            rows.push(row);
+        }
+    }
+    format!(
+        "Free-run error (nrmse):\n{}Held out: {}.\n",
+        aligned(&rows),
+        fit.holdout_source.trim_start_matches("recordings held out: ").trim_end_matches('.')
+    )
+}
+
+fn models(set: &FitSet, improved: bool) -> Vec<&Ordered<Score>> {
+    let mut models = vec![&set.nominal, &set.calibrated];
+    models.extend(improved.then_some(&set.improved));
+    models
+}
+
+fn percent(score: Option<&Score>) -> String {
+    format::percent(score.map_or(f64::NAN, |s| s.nrmse))
+}
+
+/// The parameters before and after.
+pub(crate) fn parameter_table(parameters: &Ordered<Parameter>) -> String {
+    let mut rows = vec![["", "nominal", "calibrated", ""].map(str::to_owned).to_vec()];
+    for (name, p) in parameters {
+        let value = match p.fixed {
+            true => "fixed".to_owned(),
+            false => format::with_interval(p.value, p.ci95),
+        };
+        let unit = p.unit.as_deref().map_or(String::new(), format::unit);
+        rows.push(vec![name.clone(), format::number(p.nominal), value, unit]);
+    }
+    format!("Parameters (± half the 95 % interval):\n{}", aligned(&rows))
+}
+
+/// What a reader must know of the data, one line each; mere facts stay in the report.
+pub(crate) fn notes(findings: &[Finding]) -> String {
+    let mut text = String::new();
+    for finding in findings.iter().filter(|f| f.severity > Severity::Info) {
+        let place = [finding.recording.as_deref(), finding.channel.as_deref()];
+        let place: Vec<&str> = place.into_iter().flatten().collect();
+        let place = if place.is_empty() { String::new() } else { format!("{}: ", place.join(", ")) };
+        let _ = writeln!(text, "Note: {place}{}", finding.message);
+        if let Some(mend) = &finding.mend {
+            let _ = writeln!(text, "      mend: {mend}");
+        }
+    }
+    text
+}
+
+/// Columns two spaces apart, indented by two.
+fn aligned(rows: &[Vec<String>]) -> String {
+    let columns = rows.iter().map(Vec::len).max().unwrap_or(0);
+    let width = |c: usize| rows.iter().filter_map(|r| r.get(c)).map(|s| s.chars().count()).max().unwrap_or(0);
+    let widths: Vec<usize> = (0..columns).map(width).collect();
+    let mut text = String::new();
+    for row in rows {
+        let cells: Vec<String> =
+            row.iter().zip(&widths).map(|(cell, &width)| format!("{cell:width$}")).collect();
+        let _ = writeln!(text, "  {}", cells.join("  ").trim_end());
+    }
+    text
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_diagnosis_tells_what_where_how_sure_and_how_well() {
+        let json = r#"{
+          "verdict": "missing_physics",
+          "mechanisms": [{"kind": "coulomb_friction", "equation": "hub", "expression": "fc*sign(theta')",
+            "parameters": {"fc": {"value": 0.115, "ci95": [0.111, 0.119], "unit": "N m"}},
+            "share_explained": 0.81, "confidence": 0.93,
+            "alternatives": [{"kind": "stribeck_friction", "confidence": 0.06, "separate": "slow sweeps."},
+                             {"kind": "input_dead_zone", "confidence": 0.9, "equivalent": true}],
+            "location": {"region": {"theta'": [-0.2, 0.2]}}}],
+          "remainder": {"significant": false, "location": {}, "share_of_residual": 0.03},
+          "parameters": {},
+          "fit": {"train": {"nominal": {"theta": {"nrmse": 0.31}}, "calibrated": {"theta": {"nrmse": 0.22}},
+                            "improved": {"theta": {"nrmse": 0.02}}},
+                  "holdout": {"nominal": {"theta": {"nrmse": null}}, "calibrated": {"theta": {"nrmse": 0.24}},
+                              "improved": {"theta": {"nrmse": 0.021}}},
+                  "holdout_source": "run3.csv"},
+          "noise_floor": {"theta": 0.015},
+          "findings": [{"severity": "warning", "code": "clipping", "recording": "a.csv", "channel": "v",
+                        "message": "clipped.", "mend": "lower the gain."}]}"#;
+        let text = diagnosis(&Report::from_json(json).unwrap());
+        for part in [
+            "Coulomb friction is missing in the hub equation; fc = 0.115 ± 0.004 N m; it acts when |θ′| < 0.2",
+            "1. Coulomb friction: fc·sign(θ′)\n   explains 81 % of the residual, confidence 93 %\n",
+            "   or Stribeck friction (confidence 6 %); to tell: slow sweeps\n",
+            "   or input dead zone (these data cannot tell it apart)\n",
+            "               nominal  calibrated  improved  noise\n",
+            "  held out, θ  –        24.0 %      2.10 %    1.50 %\n",
+            "Held out: run3.csv.\n",
+            "Note: a.csv, v: clipped.\n      mend: lower the gain.\n",
+        ] {
+            assert!(text.contains(part), "`{part}` is not in:\n{text}");
+        }
+    }
+}

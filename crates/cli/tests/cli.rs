@@ -1,0 +1,509 @@
+//! The `greybox` command as a user meets it: help, results, and one clear error for every bad input.
+
+// Helpers of a test file are tests too; the lint configuration knows only the annotated functions.
+#![allow(clippy::unwrap_used)]
+
+use std::fmt::Write as _;
+use std::fs;
+use std::path::{Path, PathBuf};
+
+use assert_cmd::Command;
+use serde_json::Value;
+use tempfile::TempDir;
+
+const MODEL: &str = r#"name = "Mass on a spring"
+
+[inputs]
+f = { unit = "N" }
+
+[states]
+x = { unit = "m" } # measured in mm
+
+[parameters]
+m = { value = 1.0, unit = "kg", fixed = true }
+b = { value = 0.5, unit = "N s/m" } # a guess
+k = { value = 30.0, unit = "N/m" }
+
+[equations]
+body = "m*x'' + b*x' + k*x = f"
+"#;
+
+/// True damping and stiffness of the recordings.
+const TRUTH: (f64, f64) = (0.8, 25.0);
+
+/// A folder with `model.toml`, `run1.csv` and `run2.csv`.
+struct Bench {
+    folder: TempDir,
+}
+
+/// What a run of the command left.
+struct Outcome {
+    code: i32,
+    stdout: String,
+    stderr: String,
+}
+
+impl Bench {
+    fn new() -> Bench {
+        let bench = Bench { folder: tempfile::tempdir().unwrap() };
+        bench.write("model.toml", MODEL);
+        bench.write("run1.csv", &recording(1200, 0.0));
+        bench.write("run2.csv", &recording(900, 1.0));
+        bench
+    }
+
+    fn path(&self, name: &str) -> PathBuf {
+        self.folder.path().join(name)
+    }
+
+    fn write(&self, name: &str, content: &str) {
+        fs::write(self.path(name), content).unwrap();
+    }
+
+    fn read(&self, name: &str) -> String {
+        fs::read_to_string(self.path(name)).unwrap()
+    }
+
+    fn names(&self) -> Vec<String> {
+        names(self.folder.path())
+    }
+
+    /// Runs `greybox` in the folder.
+    fn greybox(&self, arguments: &[&str]) -> Outcome {
+        self.greybox_with(arguments, &[])
+    }
+
+    fn greybox_with(&self, arguments: &[&str], environment: &[(&str, &str)]) -> Outcome {
+        let mut command = Command::cargo_bin("greybox").unwrap();
+        command.current_dir(self.folder.path()).args(arguments).envs(environment.iter().copied());
+        let output = command.output().unwrap();
+        Outcome {
+            code: output.status.code().unwrap(),
+            stdout: String::from_utf8(output.stdout).unwrap(),
+            stderr: String::from_utf8(output.stderr).unwrap(),
+        }
+    }
+
+    fn json(&self, arguments: &[&str]) -> Value {
+        let outcome = self.greybox(&[arguments, &["--json"]].concat());
+        assert_eq!(outcome.code, 0, "{}", outcome.stderr);
+        serde_json::from_str(&outcome.stdout).unwrap()
+    }
+
+    /// Runs `greybox`, which must refuse with exit 2, one error that holds all of `expected`, and nothing
+    /// written; the same error must come as JSON.
+    #[track_caller]
+    fn refuses(&self, arguments: &[&str], expected: &[&str]) {
+        let before = self.names();
+        let outcome = self.greybox(arguments);
+        let error = outcome.stderr;
+        assert_eq!(outcome.code, 2, "{arguments:?}: {error}");
+        assert_eq!(error.matches("error: ").count(), 1, "{error}");
+        for part in expected {
+            assert!(error.contains(part), "{arguments:?}: `{part}` is not in: {error}");
+        }
+        assert!(outcome.stdout.is_empty(), "{}", outcome.stdout);
+        let outcome = self.greybox(&[arguments, &["--json"]].concat());
+        assert_eq!(outcome.code, 2);
+        let json: Value = serde_json::from_str(&outcome.stdout).unwrap();
+        assert_eq!(json["error"]["exit_code"], 2, "{json}");
+        assert!(json["error"]["message"].is_string(), "{json}");
+        assert_eq!(self.names(), before, "{arguments:?} left something behind");
+    }
+}
+
+fn names(folder: &Path) -> Vec<String> {
+    let mut names: Vec<String> =
+        fs::read_dir(folder).unwrap().map(|e| e.unwrap().file_name().into_string().unwrap()).collect();
+    names.sort();
+    names
+}
+
+/// `t, f [N], x [mm]` of a mass on a spring that starts at rest, simulated finely (semi-implicit Euler), with a
+/// noise of 0.2 mm from a small generator.
+fn recording(rows: usize, phase: f64) -> String {
+    let (b, k) = TRUTH;
+    let force = |t: f64| (2.0 * t + phase).sin() + (5.0 * t).sin();
+    let (mut x, mut v) = (0.0, 0.0);
+    let mut state = 12345u64;
+    let mut text = String::from("t,f [N],x [mm]\n");
+    let (dt, fine) = (0.01, 100);
+    for row in 0..rows {
+        let t = row as f64 * dt;
+        // Twelve uniform numbers make a normal one.
+        let mut noise = -6.0;
+        for _ in 0..12 {
+            state = state.wrapping_mul(6_364_136_223_846_793_005).wrapping_add(1_442_695_040_888_963_407);
+            noise += (state >> 33) as f64 / f64::from(1u32 << 31);
+        }
+        writeln!(text, "{t:.2},{:.6},{:.4}", force(t), 1e3 * x + 0.2 * noise).unwrap();
+        let h = dt / f64::from(fine);
+        for i in 0..fine {
+            v += h * (force(t + f64::from(i) * h) - b * v - k * x);
+            x += h * v;
+        }
+    }
+    text
+}
+
+/// Cells of a column, by position.
+fn column(csv: &str, index: usize) -> Vec<Option<f64>> {
+    csv.lines().skip(1).map(|row| row.split(',').nth(index).unwrap().parse().ok()).collect()
+}
+
+// --- Help --------------------------------------------------------------------------------------------------
+
+#[test]
+fn every_help_has_an_example() {
+    let bench = Bench::new();
+    for command in [&["--help"] as &[&str], &["diagnose", "--help"], &["calibrate", "--help"]]
+        .into_iter()
+        .chain([&["simulate", "--help"] as &[&str], &["check", "--help"], &["demo", "--help"]])
+    {
+        let outcome = bench.greybox(command);
+        assert_eq!(outcome.code, 0);
+        assert!(outcome.stdout.contains("Example"), "{command:?}");
+        assert!(outcome.stdout.contains("\n  greybox "), "{command:?}");
+        assert!(outcome.stderr.is_empty());
+    }
+    assert!(bench.greybox(&["--version"]).stdout.starts_with("greybox "));
+}
+
+// --- Results -----------------------------------------------------------------------------------------------
+
+#[test]
+fn check_says_what_each_channel_feeds() {
+    let bench = Bench::new();
+    let outcome = bench.greybox(&["check", "run1.csv", "--model", "model.toml"]);
+    assert_eq!(outcome.code, 0, "{}", outcome.stderr);
+    assert!(outcome.stdout.starts_with("run1.csv: healthy\n"), "{}", outcome.stdout);
+    assert!(outcome.stdout.contains("input f (N, linear hold)"), "{}", outcome.stdout);
+    assert!(outcome.stdout.contains("measurement of x (mm → m)"), "{}", outcome.stdout);
+    let json = bench.json(&["check", "run1.csv", "--inputs", "f"]);
+    assert_eq!(json["recordings"][0]["dt_s"], 0.01);
+    assert_eq!(json["recordings"][0]["channels"][1]["unit"], "mm");
+    assert!(json["recordings"][0]["findings"].as_array().unwrap().iter().any(|f| f["code"] == "excitation"));
+}
+
+#[test]
+fn check_names_the_gap_and_still_exits_0() {
+    let bench = Bench::new();
+    let whole = recording(600, 0.0);
+    let holed: Vec<&str> =
+        whole.lines().enumerate().filter(|(i, _)| !(200..260).contains(i)).map(|l| l.1).collect();
+    bench.write("holed.csv", &holed.join("\n"));
+    let outcome = bench.greybox(&["check", "holed.csv"]);
+    assert_eq!(outcome.code, 0);
+    assert!(
+        outcome.stdout.contains("60 rows are missing") && outcome.stdout.contains("mend:"),
+        "{}",
+        outcome.stdout
+    );
+}
+
+#[test]
+fn calibrate_finds_the_parameters_and_keeps_comments() {
+    let bench = Bench::new();
+    let json = bench.json(&["calibrate", "model.toml", "run1.csv", "--holdout", "run2.csv", "--out", "a/b"]);
+    assert!((json["parameters"]["k"]["value"].as_f64().unwrap() - TRUTH.1).abs() < 0.1, "{json}");
+    assert!((json["parameters"]["b"]["value"].as_f64().unwrap() - TRUTH.0).abs() < 0.02, "{json}");
+    assert_eq!(json["parameters"]["m"]["value"], 1.0);
+    let holdout = &json["fit"]["holdout"];
+    assert!(holdout["calibrated"]["x"]["nrmse"].as_f64().unwrap() < 0.01, "{holdout}");
+    assert!(holdout["nominal"]["x"]["nrmse"].as_f64().unwrap() > 0.2, "{holdout}");
+    assert_eq!(names(&bench.path("a/b")), ["model.toml", "report.json"]);
+    let written: Value = serde_json::from_str(&bench.read("a/b/report.json")).unwrap();
+    assert_eq!(written, json);
+    let model = bench.read("a/b/model.toml");
+    assert!(model.contains("# a guess") && model.contains("# measured in mm"), "{model}");
+    assert!(!model.contains("value = 0.5,"), "{model}");
+}
+
+#[test]
+fn what_calibrate_writes_simulates_as_well_as_it_says() {
+    let bench = Bench::new();
+    let json = bench.json(&["calibrate", "model.toml", "run1.csv", "--holdout", "run2.csv", "--out", "out"]);
+    let said = json["fit"]["holdout"]["calibrated"]["x"]["nrmse"].as_f64().unwrap();
+    let run = bench.json(&["simulate", "out/model.toml", "run2.csv", "--out", "simulated.csv"]);
+    assert_eq!(run["rows"], 900);
+    let nrmse = run["fit"]["x"]["nrmse"].as_f64().unwrap();
+    assert!((nrmse / said - 1.0).abs() < 0.05, "{nrmse} {said}");
+}
+
+#[test]
+fn without_a_holdout_the_last_fifth_is_held_out() {
+    let bench = Bench::new();
+    let json = bench.json(&["calibrate", "model.toml", "run1.csv", "--out", "out"]);
+    let source = json["fit"]["holdout_source"].as_str().unwrap();
+    assert!(source.starts_with("the last fifth of each"), "{source}");
+    assert!(json["fit"]["holdout"]["calibrated"]["x"]["nrmse"].as_f64().unwrap() < 0.02);
+}
+
+#[test]
+fn simulate_keeps_names_units_and_rows() {
+    let bench = Bench::new();
+    let input = bench.read("run1.csv");
+    let truth = MODEL.replace("0.5", "0.8").replace("30.0", "25.0");
+    bench.write("truth.toml", &truth);
+    let outcome = bench.greybox(&["simulate", "truth.toml", "run1.csv", "--out", "new/simulated.csv"]);
+    assert_eq!(outcome.code, 0, "{}", outcome.stderr);
+    assert!(outcome.stdout.contains("nrmse"), "{}", outcome.stdout);
+    let simulated = bench.read("new/simulated.csv");
+    assert_eq!(simulated.lines().next(), Some("t,x [mm]"));
+    assert_eq!(column(&simulated, 0), column(&input, 0));
+    let pairs = column(&simulated, 1).into_iter().zip(column(&input, 2));
+    let worst = pairs.map(|(s, m)| (s.unwrap() - m.unwrap()).abs()).fold(0.0, f64::max);
+    assert!(worst < 1.5, "mm: {worst}");
+    assert_eq!(names(&bench.path("new")), ["simulated.csv"]);
+}
+
+#[test]
+fn rows_outside_the_pieces_stay_empty() {
+    let bench = Bench::new();
+    let whole = recording(600, 0.0);
+    // Rows 300 … 303 stand alone between two gaps.
+    let keep = |i: usize| i < 201 || (301..305).contains(&i) || i > 400;
+    let holed: Vec<&str> = whole.lines().enumerate().filter(|(i, _)| keep(*i)).map(|l| l.1).collect();
+    bench.write("holed.csv", &holed.join("\n"));
+    let json = bench.json(&["simulate", "model.toml", "holed.csv", "--out", "out.csv"]);
+    assert_eq!(json["empty_rows"], 4);
+    let x = column(&bench.read("out.csv"), 1);
+    assert_eq!(x.len(), 404);
+    let empty: Vec<usize> = (0..x.len()).filter(|&i| x[i].is_none()).collect();
+    assert_eq!(empty, [200, 201, 202, 203]);
+}
+
+#[test]
+fn results_do_not_depend_on_the_number_of_threads() {
+    let bench = Bench::new();
+    let without_damping =
+        MODEL.replace("b*x' + ", "").replace("b = { value = 0.5, unit = \"N s/m\" } # a guess\n", "");
+    bench.write("model.toml", &without_damping);
+    for command in ["calibrate", "diagnose"] {
+        for (threads, out) in [("1", "a"), ("2", "b"), ("2", "c")] {
+            let out = format!("{command}/{out}");
+            let arguments = [command, "model.toml", "run1.csv", "run2.csv", "--out", &out];
+            let outcome = bench.greybox_with(&arguments, &[("RAYON_NUM_THREADS", threads)]);
+            assert_eq!(outcome.code, 0, "{}", outcome.stderr);
+        }
+        for file in names(&bench.path(&format!("{command}/a"))) {
+            let first = bench.read(&format!("{command}/a/{file}"));
+            assert_eq!(first, bench.read(&format!("{command}/b/{file}")), "{file}");
+            assert_eq!(first, bench.read(&format!("{command}/c/{file}")), "{file}");
+        }
+    }
+}
+
+// --- Refusals ----------------------------------------------------------------------------------------------
+
+/// Every command that reads a model and a recording.
+fn with_both<'a>(model: &'a str, recording: &'a str) -> [Vec<&'a str>; 4] {
+    [
+        vec!["diagnose", model, recording, "--out", "out"],
+        vec!["calibrate", model, recording, "--out", "out"],
+        vec!["simulate", model, recording, "--out", "out.csv"],
+        vec!["check", recording, "--model", model],
+    ]
+}
+
+#[test]
+fn a_bad_model_is_shown_with_its_line_and_mend() {
+    let bench = Bench::new();
+    let cases: [(&str, &str, &[&str]); 5] = [
+        (
+            "k*x = f",
+            "kk*x = f",
+            &["equation \"body\"", "`kk` is not defined", "bad.toml:15:", "^^\n", "mend", "`k`"],
+        ),
+        ("b*x' + k*x = f", "b*x' + k*x = m", &["equation \"body\"", "bad.toml:15:", "`m`", "kg"]),
+        ("k*x = f\"\n", "k*x = f\"\nagain = \"x'' = 0\"\n", &["bad.toml:", "2 equations", "1 state"]),
+        ("value = 30.0", "valu = 30.0", &["bad.toml:12:", "`valu`", "mend", "`value`"]),
+        ("[parameters]", "[parameters", &["bad.toml:9:", "TOML"]),
+    ];
+    for (good, bad, expected) in cases {
+        bench.write("bad.toml", &MODEL.replacen(good, bad, 1));
+        for arguments in with_both("bad.toml", "run1.csv") {
+            bench.refuses(&arguments, expected);
+        }
+    }
+}
+
+#[test]
+fn a_bad_recording_is_named_with_line_and_column() {
+    let bench = Bench::new();
+    let good = recording(100, 0.0);
+    let line4: Vec<&str> = good.lines().nth(3).unwrap().split(',').collect();
+    let with_cell =
+        |cell: &str| good.replacen(&line4.join(","), &format!("{},{},{cell}", line4[0], line4[1]), 1);
+    let cases: [(String, &[&str]); 6] = [
+        (with_cell("NaN"), &["bad.csv:4:x (column 3)", "`NaN`", "leave the cell empty"]),
+        (with_cell("broken"), &["bad.csv:4:x (column 3)", "`broken` is not a number"]),
+        (String::new(), &["bad.csv", "the file is empty", "header row"]),
+        (good.replacen("x [mm]", "y [mm]", 1), &["bad.csv", "no channel `x`", "`f`, `y`", "Rename"]),
+        (good.replacen("x [mm]", "x [kg]", 1), &["bad.csv", "`x` is in [kg]", "`m`"]),
+        (good.lines().take(4).collect::<Vec<_>>().join("\n"), &["bad.csv", "3 rows", "8 are needed"]),
+    ];
+    for (content, expected) in cases {
+        bench.write("bad.csv", &content);
+        for arguments in with_both("model.toml", "bad.csv") {
+            bench.refuses(&arguments, expected);
+        }
+    }
+}
+
+#[test]
+fn paths_that_lead_to_the_wrong_thing() {
+    let bench = Bench::new();
+    fs::create_dir(bench.path("folder")).unwrap();
+    for arguments in with_both("model.toml", "nowhere.csv") {
+        bench.refuses(&arguments, &["nowhere.csv", "no such file"]);
+    }
+    for arguments in with_both("nowhere.toml", "run1.csv") {
+        bench.refuses(&arguments, &["nowhere.toml", "no such file", "mend"]);
+    }
+    for arguments in with_both("model.toml", "folder") {
+        bench.refuses(&arguments, &["folder", "this is a folder"]);
+    }
+    for arguments in with_both("folder", "run1.csv") {
+        bench.refuses(&arguments, &["folder", "this is a folder", "mend"]);
+    }
+    for arguments in with_both("run1.csv", "model.toml") {
+        bench.refuses(&arguments, &["run1.csv", "this is a recording", "mend"]);
+    }
+    for arguments in with_both("model.toml", "model.toml") {
+        bench.refuses(&arguments, &["model.toml", "this is a model", "mend"]);
+    }
+    bench.refuses(
+        &["calibrate", "model.toml", "run1.csv", "--holdout", "./run1.csv", "--out", "out"],
+        &["run1.csv", "named twice", "mend"],
+    );
+    bench.refuses(&["check", "run1.csv", "--inputs", "g"], &["run1.csv", "no channel `g`", "`f`, `x`"]);
+}
+
+#[test]
+fn outputs_that_cannot_be_written() {
+    let bench = Bench::new();
+    bench.write("file", "mine");
+    for command in ["diagnose", "calibrate"] {
+        bench.refuses(
+            &[command, "model.toml", "run1.csv", "--out", "file"],
+            &["file", "need a folder", "mend"],
+        );
+        bench.refuses(
+            &[command, "model.toml", "run1.csv", "--out", "file/under"],
+            &["file/under", "`file` is a file", "mend"],
+        );
+    }
+    let simulate = |out| ["simulate", "model.toml", "run1.csv", "--out", out];
+    bench.refuses(&simulate("file/under.csv"), &["file", "mend"]);
+    bench.refuses(&simulate("."), &["this is a folder", "mend"]);
+    bench.refuses(&simulate("run1.csv"), &["run1.csv", "overwrite", "mend"]);
+    // Results never replace what the command reads, nor does the demo replace the user's files.
+    bench.refuses(
+        &["calibrate", "model.toml", "run1.csv", "--out", "."],
+        &["model.toml", "overwrite", "mend"],
+    );
+    bench.write("improved.toml", MODEL);
+    bench.refuses(&["diagnose", "improved.toml", "run1.csv", "--out", "."], &["improved.toml", "overwrite"]);
+    bench.refuses(&["demo", "--out", "."], &["model.toml", "not of this demo", "mend"]);
+    assert_eq!(bench.read("model.toml"), MODEL);
+    assert_eq!(bench.read("file"), "mine");
+    assert_eq!(bench.read("run1.csv"), recording(1200, 0.0));
+}
+
+#[cfg(target_os = "linux")]
+#[test]
+fn a_place_that_nobody_may_write_to() {
+    let bench = Bench::new();
+    bench.refuses(
+        &["calibrate", "model.toml", "run1.csv", "--out", "/proc/greybox"],
+        &["/proc/greybox", "cannot be written", "mend"],
+    );
+}
+
+#[test]
+fn bad_usage() {
+    let bench = Bench::new();
+    bench.refuses(
+        &["diagnose", "model.toml", "run1.csv", "--out", "out", "--sead", "1"],
+        &["--sead", "--seed"],
+    );
+    bench.refuses(&["diagnose", "model.toml", "run1.csv", "--out", "out", "--seed", "x"], &["--seed", "'x'"]);
+    bench.refuses(&["diagnose", "model.toml", "--out", "out"], &["TRAIN.csv"]);
+    bench.refuses(&["calibrate", "model.toml", "run1.csv"], &["--out"]);
+    bench.refuses(&["check"], &["RECORDING.csv"]);
+    bench.refuses(&["chek", "run1.csv"], &["chek", "check"]);
+    bench.refuses(&[], &["no command", "greybox diagnose"]);
+}
+
+#[test]
+fn nothing_free_to_calibrate_is_an_error_with_its_mend() {
+    let bench = Bench::new();
+    let fixed = MODEL
+        .replace("\"N s/m\" }", "\"N s/m\", fixed = true }")
+        .replace("\"N/m\" }", "\"N/m\", fixed = true }");
+    bench.write("fixed.toml", &fixed);
+    bench.refuses(
+        &["calibrate", "fixed.toml", "run1.csv", "--out", "out"],
+        &["every parameter is fixed", "mend"],
+    );
+}
+
+#[test]
+fn a_json_error_has_its_place_in_fields() {
+    let bench = Bench::new();
+    bench.write("bad.toml", &MODEL.replace("k*x = f", "kk*x = f"));
+    let outcome = bench.greybox(&["check", "run1.csv", "--model", "bad.toml", "--json"]);
+    let json: Value = serde_json::from_str(&outcome.stdout).unwrap();
+    let error = &json["error"];
+    assert_eq!((error["file"].as_str(), error["line"].as_u64()), (Some("bad.toml"), Some(15)), "{error}");
+    assert!(error["column"].is_u64() && error["mend"].is_string(), "{error}");
+    assert!(outcome.stderr.starts_with("error: "), "{}", outcome.stderr);
+}
+
+// --- Diagnosis ---------------------------------------------------------------------------------------------
+
+#[test]
+fn demo_tells_the_story_and_writes_what_it_shows() {
+    let bench = Bench::new();
+    let outcome = bench.greybox(&["demo"]);
+    assert_eq!(outcome.code, 0, "{}", outcome.stderr);
+    assert!(
+        outcome.stdout.contains("Coulomb friction is missing in the cart equation"),
+        "{}",
+        outcome.stdout
+    );
+    assert!(outcome.stdout.contains("held out, x"), "{}", outcome.stdout);
+    assert_eq!(bench.names(), ["model.toml", "run1.csv", "run2.csv"], "nothing is written without --out");
+
+    let json = bench.json(&["demo", "--out", "demo"]);
+    assert_eq!(json["verdict"], "missing_physics");
+    assert_eq!(json["mechanisms"][0]["kind"], "coulomb_friction");
+    let files = ["holdout.csv", "improved.toml", "model.toml", "report.html", "report.json", "train.csv"];
+    assert_eq!(names(&bench.path("demo")), files);
+    // The files that it leaves give the same answer.
+    let arguments = ["demo/model.toml", "demo/train.csv", "--holdout", "demo/holdout.csv", "--out", "again"];
+    let again = bench.json(&[&["diagnose"], &arguments as &[&str]].concat());
+    assert_eq!(again, json);
+    for file in ["improved.toml", "report.html", "report.json"] {
+        assert_eq!(bench.read(&format!("again/{file}")), bench.read(&format!("demo/{file}")), "{file}");
+    }
+    // And the improved model simulates as well as the report says.
+    let said = json["fit"]["holdout"]["improved"]["x"]["nrmse"].as_f64().unwrap();
+    let run = bench.json(&["simulate", "demo/improved.toml", "demo/holdout.csv", "--out", "s.csv"]);
+    let nrmse = run["fit"]["x"]["nrmse"].as_f64().unwrap();
+    assert!((nrmse / said - 1.0).abs() < 0.05, "{nrmse} {said}");
+}
+
+#[test]
+fn diagnose_of_a_complete_model_says_that_nothing_is_missing() {
+    let bench = Bench::new();
+    let outcome =
+        bench.greybox(&["diagnose", "model.toml", "run1.csv", "--holdout", "run2.csv", "--out", "out"]);
+    assert_eq!(outcome.code, 0, "{}", outcome.stderr);
+    assert!(outcome.stdout.contains("agrees with the recordings"), "{}", outcome.stdout);
+    assert!(outcome.stdout.contains("Written: out/report.html"), "{}", outcome.stdout);
+    let report: Value = serde_json::from_str(&bench.read("out/report.json")).unwrap();
+    assert_eq!(report["verdict"], "consistent");
+    assert_eq!(report["mechanisms"], serde_json::json!([]));
+}
