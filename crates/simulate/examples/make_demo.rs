@@ -14,9 +14,9 @@ use rand_pcg::Pcg64Mcg;
 type Error = Box<dyn std::error::Error>;
 
 /// The seed of the checked-in recordings: the year of the thesis.
-pub const SEED: u64 = 2021;
+pub(crate) const SEED: u64 = 2021;
 
-const SAMPLING: Sampling = Sampling { dt: 0.004, substeps: 16 };
+const SAMPLING: Sampling = Sampling { dt: 0.005, substeps: 20 };
 const AMPLITUDE: f64 = 30.0 * std::f64::consts::PI / 180.0;
 /// RMS noise of the strain gauge, rad.
 const GAUGE_NOISE: f64 = 1e-3;
@@ -27,9 +27,9 @@ const DITHER_HZ: [f64; 6] = [0.7, 1.3, 2.9, 4.3, 6.1, 8.9];
 ///
 /// # Errors
 /// What the rig or the writer reports; neither happens with the settings above.
-pub fn demo(seed: u64) -> Result<[(&'static str, Vec<u8>); 2], Error> {
+pub(crate) fn demo(seed: u64) -> Result<[(&'static str, Vec<u8>); 2], Error> {
     let mut random = Pcg64Mcg::seed_from_u64(seed);
-    let levels = random_levels(&mut random, 36.0);
+    let levels = random_levels(&mut random, 30.0);
     // The dither opens the loop for identification: without it V = kp (reference - theta) ties the voltage to
     // the angle.
     let dither = DITHER_HZ.map(|frequency| Sine {
@@ -40,7 +40,7 @@ pub fn demo(seed: u64) -> Result<[(&'static str, Vec<u8>); 2], Error> {
     let train = record(&mut random, &levels, |t| multisine(&dither, t))?;
     // The experiment of thesis figure 2.7.
     let square: Vec<f64> =
-        (0..samples(16.0)).map(|k| square_wave(AMPLITUDE, 0.66, k as f64 * SAMPLING.dt)).collect();
+        (0..samples(15.0)).map(|k| square_wave(AMPLITUDE, 0.66, k as f64 * SAMPLING.dt)).collect();
     let test = record(&mut random, &square, |_| 0.0)?;
     Ok([("rotary_link_train.csv", train), ("rotary_link_test.csv", test)])
 }
@@ -72,7 +72,7 @@ fn record(random: &mut Pcg64Mcg, reference: &[f64], dither: impl Fn(f64) -> f64)
         alpha.push(angles[1] + noise.sample(random));
         controller.command(reference[k], encoder, dither(k as f64 * SAMPLING.dt))
     })?;
-    let time: Vec<f64> = (0..reference.len()).map(|k| (4 * k) as f64 / 1000.0).collect();
+    let time: Vec<f64> = (0..reference.len()).map(|k| (5 * k) as f64 / 1000.0).collect();
     let rounded = |values: &[f64], per_unit: f64| -> Vec<f64> {
         // Adding zero makes a negative zero positive.
         values.iter().map(|x| (x * per_unit).round() / per_unit + 0.0).collect()
