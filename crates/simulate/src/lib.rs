@@ -1,5 +1,6 @@
 //! Simulation of greybox models: events, true stick–slip, delays, forward sensitivities.
 mod integrate;
+pub mod rigs;
 mod signal;
 mod small;
 
