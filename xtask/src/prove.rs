@@ -215,7 +215,7 @@ mod tests {
     fn cases_are_selected_by_part_of_their_name() {
         let chosen = select(cases::all(), Some("emps")).unwrap();
         assert_eq!(chosen.iter().map(|c| c.name.as_str()).collect::<Vec<_>>(), ["emps_velocity", "emps_position"]);
-        let error = select(cases::all(), Some("nothing")).unwrap_err().to_string();
+        let error = select(cases::all(), Some("nothing")).err().unwrap().to_string();
         assert!(error.contains("silverbox") && error.contains("`nothing`"), "{error}");
     }
 
