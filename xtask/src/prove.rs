@@ -81,7 +81,9 @@ pub(crate) fn run(root: &Path, arguments: &Arguments) -> Result<Ending> {
     let from_environment = std::env::var_os("GREYBOX_RECORDINGS").map(PathBuf::from);
     let folder = match (&arguments.recordings, from_environment) {
         (Some(given), _) if given.is_dir() => given.clone(),
-        (Some(given), _) => bail!("there is no folder {}; --recordings names the real recordings", given.display()),
+        (Some(given), _) => {
+            bail!("there is no folder {}; --recordings names the real recordings", given.display())
+        }
         (None, Some(named)) if named.is_dir() => named,
         (None, Some(named)) => {
             println!("skipped: no recordings at {}", named.display());
@@ -214,7 +216,10 @@ mod tests {
     #[test]
     fn cases_are_selected_by_part_of_their_name() {
         let chosen = select(cases::all(), Some("emps")).unwrap();
-        assert_eq!(chosen.iter().map(|c| c.name.as_str()).collect::<Vec<_>>(), ["emps_velocity", "emps_position"]);
+        assert_eq!(
+            chosen.iter().map(|c| c.name.as_str()).collect::<Vec<_>>(),
+            ["emps_velocity", "emps_position"]
+        );
         let error = select(cases::all(), Some("nothing")).err().unwrap().to_string();
         assert!(error.contains("silverbox") && error.contains("`nothing`"), "{error}");
     }

@@ -33,13 +33,15 @@ fn files() -> Vec<PathBuf> {
         .current_dir(root())
         .output();
     match listed {
-        Ok(output) if output.status.success() && !output.stdout.is_empty() => String::from_utf8(output.stdout)
-            .unwrap()
-            .split('\0')
-            .filter(|name| !name.is_empty())
-            .map(|name| root().join(name))
-            .filter(|path| path.is_file())
-            .collect(),
+        Ok(output) if output.status.success() && !output.stdout.is_empty() => {
+            String::from_utf8(output.stdout)
+                .unwrap()
+                .split('\0')
+                .filter(|name| !name.is_empty())
+                .map(|name| root().join(name))
+                .filter(|path| path.is_file())
+                .collect()
+        }
         _ => {
             let mut found = Vec::new();
             let mut folders = vec![root()];
@@ -106,8 +108,7 @@ fn dependencies_are_stated_once_and_used() {
 #[test]
 fn no_file_names_a_path_of_one_machine() {
     // Put together here, so that this file does not name them.
-    let paths: Vec<String> =
-        ["work", "tmp/wt", "home", "root"].iter().map(|p| format!("/{p}/")).collect();
+    let paths: Vec<String> = ["work", "tmp/wt", "home", "root"].iter().map(|p| format!("/{p}/")).collect();
     let mut found = Vec::new();
     for file in files() {
         let Ok(text) = std::fs::read_to_string(&file) else { continue };
@@ -162,8 +163,7 @@ fn the_page_of_mechanisms_is_up_to_date() {
 /// Pages of the book.
 fn pages() -> Vec<PathBuf> {
     let folder = root().join("docs").join("src");
-    let mut pages: Vec<PathBuf> =
-        std::fs::read_dir(folder).unwrap().map(|e| e.unwrap().path()).collect();
+    let mut pages: Vec<PathBuf> = std::fs::read_dir(folder).unwrap().map(|e| e.unwrap().path()).collect();
     pages.retain(|p| p.extension().is_some_and(|e| e == "md"));
     pages.sort();
     pages
@@ -220,7 +220,8 @@ fn models_and_mechanisms_in_the_book_load() {
         let (text, name) = (read(&page), page.file_name().unwrap().to_str().unwrap());
         for (line, block) in blocks(&text, "toml") {
             if block.contains("[equations]") {
-                greybox_model::Model::from_toml(&block, name).unwrap_or_else(|e| panic!("{name}, line {line}: {e}"));
+                greybox_model::Model::from_toml(&block, name)
+                    .unwrap_or_else(|e| panic!("{name}, line {line}: {e}"));
                 loaded += 1;
             } else if block.contains("kind ") {
                 greybox_diagnose::Mechanism::from_toml(&block, name)

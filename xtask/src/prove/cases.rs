@@ -141,8 +141,7 @@ fn emps_velocity(report: &Report) -> Vec<Figure> {
 /// The EMPS axis on its position, which integrates: judged on windows of one second.
 fn emps_position(report: &Report) -> Vec<Figure> {
     let window = report.fit.window_s.unwrap_or(f64::NAN);
-    let millimetres =
-        score(&report.fit.holdout, Model::Improved, "q", |s| s.rmse_windowed.map(|v| v * 1e3));
+    let millimetres = score(&report.fit.holdout, Model::Improved, "q", |s| s.rmse_windowed.map(|v| v * 1e3));
     let mut figures = vec![
         plain_verdict(report),
         plain_kinds(report),
@@ -165,13 +164,9 @@ fn silverbox(report: &Report) -> Vec<Figure> {
         verdict(report, Verdict::MissingPhysics),
         kinds(report, "cubic_stiffness", names_any(report, &["cubic_stiffness"])),
     ];
-    for (file, what, goal) in
-        [(SILVERBOX_MULTISINE, "multisine", 0.32), (SILVERBOX_ARROW, "arrow", 0.39)]
-    {
+    for (file, what, goal) in [(SILVERBOX_MULTISINE, "multisine", 0.32), (SILVERBOX_ARROW, "arrow", 0.39)] {
         let set = report.fit.recordings.get(file).and_then(|r| r.holdout.as_ref());
-        let millivolts = |model| {
-            set.map_or(f64::NAN, |s| score(s, model, "y", |s| s.rmse.map(|v| v * 1e3)))
-        };
+        let millivolts = |model| set.map_or(f64::NAN, |s| score(s, model, "y", |s| s.rmse.map(|v| v * 1e3)));
         let (calibrated, improved) = (millivolts(Model::Calibrated), millivolts(Model::Improved));
         figures.push(Figure::plain(
             format!("held-out rms of {what}, calibrated"),
@@ -188,10 +183,8 @@ fn silverbox(report: &Report) -> Vec<Figure> {
 }
 
 fn light_ball(report: &Report) -> Vec<Figure> {
-    let mut figures = vec![
-        verdict(report, Verdict::MissingPhysics),
-        kinds(report, "a drag", names_any(report, &DRAG)),
-    ];
+    let mut figures =
+        vec![verdict(report, Verdict::MissingPhysics), kinds(report, "a drag", names_any(report, &DRAG))];
     figures.extend(errors(report, "z"));
     figures
 }

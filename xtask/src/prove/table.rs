@@ -19,8 +19,7 @@ pub(crate) fn render(outcomes: &[Outcome]) -> String {
     let width = |c: usize| rows.iter().map(|r| r[c].chars().count()).max().unwrap_or(0);
     let widths: Vec<usize> = (0..5).map(width).collect();
     let line = |row: &[String; 5]| {
-        let cells: Vec<String> =
-            row.iter().zip(&widths).map(|(cell, &w)| format!("{cell:<w$}")).collect();
+        let cells: Vec<String> = row.iter().zip(&widths).map(|(cell, &w)| format!("{cell:<w$}")).collect();
         cells.join("  ").trim_end().to_owned() + "\n"
     };
     let rule = widths.iter().map(|&w| "-".repeat(w)).collect::<Vec<_>>().join("  ");
