@@ -8,6 +8,9 @@ use greybox_report::contract::{FitSet, Score, Verdict};
 
 use super::Figure;
 
+/// Figures of a report.
+pub(crate) type Judge = Box<dyn Fn(&Report) -> Vec<Figure>>;
+
 /// One run of `greybox diagnose`.
 pub(crate) struct Case {
     /// Name, also of its folder of results.
@@ -23,7 +26,7 @@ pub(crate) struct Case {
     /// Most seconds it may take.
     pub(crate) seconds: Option<f64>,
     /// Figures of its report.
-    pub(crate) judge: Box<dyn Fn(&Report) -> Vec<Figure>>,
+    pub(crate) judge: Judge,
 }
 
 impl Case {
@@ -49,7 +52,7 @@ pub(crate) fn all() -> Vec<Case> {
                 train: &[&str],
                 holdout: &[&str],
                 seconds: Option<f64>,
-                judge: Box<dyn Fn(&Report) -> Vec<Figure>>| Case {
+                judge: Judge| Case {
         name: name.into(),
         folder: folder.into(),
         model: model.into(),
@@ -81,7 +84,7 @@ pub(crate) fn all() -> Vec<Case> {
         ),
     ];
     for ball in LIGHT.into_iter().chain([HEAVY]).chain(OTHERS) {
-        let judge: Box<dyn Fn(&Report) -> Vec<Figure>> = if LIGHT.contains(&ball) {
+        let judge: Judge = if LIGHT.contains(&ball) {
             Box::new(light_ball)
         } else if ball == HEAVY {
             Box::new(heavy_ball)
