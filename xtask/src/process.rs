@@ -14,8 +14,8 @@ pub(crate) struct Measured {
     pub(crate) status: Option<ExitStatus>,
     /// Wall-clock time, s.
     pub(crate) seconds: f64,
-    /// Largest resident set, bytes: the kernel's high-water mark, read every 10 ms (what is added in the
-    /// last 10 ms goes unseen). `None` where `/proc` does not exist.
+    /// Largest resident set, bytes: the kernel's high-water mark, read every 10 ms, at first every
+    /// 1 ms (what is added after the last reading goes unseen). `None` where `/proc` does not exist.
     pub(crate) peak_bytes: Option<u64>,
 }
 
@@ -47,7 +47,9 @@ pub(crate) fn run(command: &mut Command, logs: &Path, limit: Duration) -> Result
             child.wait()?;
             return Ok(Measured { status: None, seconds: start.elapsed().as_secs_f64(), peak_bytes });
         }
-        std::thread::sleep(Duration::from_millis(10));
+        // A short run is watched more closely.
+        let pause = if start.elapsed().as_millis() < 200 { 1 } else { 10 };
+        std::thread::sleep(Duration::from_millis(pause));
     }
 }
 

@@ -191,7 +191,8 @@ fn measure(binary: &Path, folder: &Path, case: &Case, out: &Path, limit: Duratio
         Some(most) => Figure::judged("time", time, format!("< {most} s"), run.seconds < most),
         None => Figure::plain("time", time),
     });
-    if let Some(bytes) = run.peak_bytes {
+    // Below 1 MiB the reading dates from before the program was loaded.
+    if let Some(bytes) = run.peak_bytes.filter(|&b| b >= 1 << 20) {
         figures.push(Figure::plain("peak memory", format!("{:.0} MiB", bytes as f64 / (1024.0 * 1024.0))));
     }
     Ok(Outcome { case: case.name.clone(), figures })
