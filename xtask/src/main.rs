@@ -1,2 +1,95 @@
-//! Developer commands.
-fn main() {}
+//! Developer commands: `cargo xtask prove | docs | ci`.
+
+// This is a command: its answers go to standard output, its complaints to standard error.
+#![allow(clippy::print_stdout, clippy::print_stderr)]
+
+mod docs;
+mod process;
+mod prove;
+mod readme;
+#[cfg(test)]
+mod tidy;
+
+use std::path::{Path, PathBuf};
+use std::process::ExitCode;
+
+use anyhow::{Context, Result};
+use clap::{Parser, Subcommand};
+
+#[derive(Debug, Parser)]
+#[command(name = "cargo xtask", about = "Developer commands of greybox", disable_help_subcommand = true)]
+struct Arguments {
+    #[command(subcommand)]
+    command: Task,
+}
+
+#[derive(Debug, Subcommand)]
+enum Task {
+    /// Measure greybox against its goals on real recordings
+    Prove(prove::Arguments),
+    /// Write the generated pages of the book
+    Docs {
+        /// Change nothing; exit 1 when a page is stale
+        #[arg(long)]
+        check: bool,
+    },
+    /// Run what the continuous integration runs (.ci/run)
+    Ci,
+    /// Print the commands of the README's block behind `<!-- MARKER -->`
+    ReadmeCommand {
+        /// For example "test command"
+        marker: String,
+    },
+}
+
+/// How a task ended.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+enum Ending {
+    /// All is well.
+    Done,
+    /// The task ran, and its answer is no.
+    Missed,
+    /// It could not run as asked.
+    Refused,
+}
+
+fn main() -> ExitCode {
+    let ending = match Arguments::parse().command {
+        Task::Prove(arguments) => prove::run(&root(), &arguments),
+        Task::Docs { check } => docs::run(&root(), check),
+        Task::Ci => ci(&root()),
+        Task::ReadmeCommand { marker } => print_command(&root(), &marker),
+    };
+    match ending {
+        Ok(Ending::Done) => ExitCode::SUCCESS,
+        Ok(Ending::Missed) => ExitCode::from(1),
+        Ok(Ending::Refused) => ExitCode::from(2),
+        Err(e) => {
+            eprintln!("error: {e:#}");
+            ExitCode::from(2)
+        }
+    }
+}
+
+/// The workspace: this crate's parent.
+fn root() -> PathBuf {
+    let here = Path::new(env!("CARGO_MANIFEST_DIR"));
+    here.parent().unwrap_or(here).to_path_buf()
+}
+
+fn ci(root: &Path) -> Result<Ending> {
+    let script = root.join(".ci").join("run");
+    let status = std::process::Command::new(&script)
+        .current_dir(root)
+        .status()
+        .with_context(|| format!("{} could not be started", script.display()))?;
+    Ok(if status.success() { Ending::Done } else { Ending::Missed })
+}
+
+fn print_command(root: &Path, marker: &str) -> Result<Ending> {
+    let path = root.join("README.md");
+    let text =
+        std::fs::read_to_string(&path).with_context(|| format!("{} cannot be read", path.display()))?;
+    print!("{}", readme::block_after(&text, marker)?);
+    Ok(Ending::Done)
+}

@@ -1,0 +1,267 @@
+//! `cargo xtask prove`: greybox as a user runs it, on real recordings, against goals.
+//!
+//! Each case is one `greybox diagnose` as a process of its own; what it finds is read from its
+//! `report.json`. Nothing here knows how greybox works.
+
+mod cases;
+mod table;
+
+use std::path::{Path, PathBuf};
+use std::process::Command;
+use std::time::Duration;
+
+use anyhow::{Context, Result, bail};
+use greybox_report::Report;
+use serde_json::json;
+
+use crate::{Ending, process};
+use cases::Case;
+
+/// What `prove` takes.
+#[derive(Debug, clap::Args)]
+pub(crate) struct Arguments {
+    /// Folder of the real recordings (else the environment variable GREYBOX_RECORDINGS)
+    #[arg(long, value_name = "DIR")]
+    recordings: Option<PathBuf>,
+    /// Write the figures as JSON
+    #[arg(long, value_name = "FILE")]
+    json: Option<PathBuf>,
+    /// Only the cases whose name contains this
+    #[arg(long, value_name = "NAME")]
+    only: Option<String>,
+    /// Stop a run after this many seconds
+    #[arg(long, value_name = "SECONDS", default_value_t = 900)]
+    timeout: u64,
+}
+
+/// One figure of a case.
+#[derive(Debug, Clone, PartialEq)]
+pub(crate) struct Figure {
+    /// What was measured.
+    pub(crate) name: String,
+    /// As text, with its unit.
+    pub(crate) measured: String,
+    /// As text; empty where there is none.
+    pub(crate) goal: String,
+    /// Whether the goal is met; `None` where there is none.
+    pub(crate) met: Option<bool>,
+}
+
+impl Figure {
+    /// A figure without a goal.
+    pub(crate) fn plain(name: impl Into<String>, measured: impl Into<String>) -> Figure {
+        Figure { name: name.into(), measured: measured.into(), goal: String::new(), met: None }
+    }
+
+    /// A figure with a goal.
+    pub(crate) fn judged(
+        name: impl Into<String>,
+        measured: impl Into<String>,
+        goal: impl Into<String>,
+        met: bool,
+    ) -> Figure {
+        Figure { name: name.into(), measured: measured.into(), goal: goal.into(), met: Some(met) }
+    }
+}
+
+/// A case with its figures.
+#[derive(Debug, Clone)]
+pub(crate) struct Outcome {
+    /// Name of the case.
+    pub(crate) case: String,
+    /// Its figures.
+    pub(crate) figures: Vec<Figure>,
+}
+
+/// Runs `prove`.
+///
+/// # Errors
+/// When a recording is missing, greybox does not build, or a file cannot be written.
+pub(crate) fn run(root: &Path, arguments: &Arguments) -> Result<Ending> {
+    let from_environment = std::env::var_os("GREYBOX_RECORDINGS").map(PathBuf::from);
+    let folder = match (&arguments.recordings, from_environment) {
+        (Some(given), _) if given.is_dir() => given.clone(),
+        (Some(given), _) => {
+            bail!("there is no folder {}; --recordings names the real recordings", given.display())
+        }
+        (None, Some(named)) if named.is_dir() => named,
+        (None, Some(named)) => {
+            println!("skipped: no recordings at {}", named.display());
+            return Ok(Ending::Done);
+        }
+        (None, None) => {
+            eprintln!(
+                "error: the concealed suite is not built yet; `--recordings DIR` measures greybox on real recordings"
+            );
+            return Ok(Ending::Refused);
+        }
+    };
+    let cases = select(cases::all(), arguments.only.as_deref())?;
+    for case in &cases {
+        for file in case.files() {
+            let path = folder.join(&case.folder).join(file);
+            if !path.is_file() {
+                bail!("{}: {} is missing", case.name, path.display());
+            }
+        }
+    }
+    let binary = build(root)?;
+    let mut outcomes = Vec::new();
+    for case in &cases {
+        eprintln!("{} …", case.name);
+        let out = target(root).join("prove").join(&case.name);
+        outcomes.push(measure(&binary, &folder, case, &out, Duration::from_secs(arguments.timeout))?);
+    }
+    print!("{}", table::render(&outcomes));
+    if let Some(path) = &arguments.json {
+        let text = serde_json::to_string_pretty(&to_json(&outcomes))? + "\n";
+        std::fs::write(path, text).with_context(|| format!("{} cannot be written", path.display()))?;
+    }
+    let judged = outcomes.iter().flat_map(|o| &o.figures).filter_map(|f| f.met);
+    let (met, all) = judged.fold((0, 0), |(met, all), m| (met + usize::from(m), all + 1));
+    println!("{met} of {all} goals met.");
+    Ok(if met == all { Ending::Done } else { Ending::Missed })
+}
+
+fn select(cases: Vec<Case>, only: Option<&str>) -> Result<Vec<Case>> {
+    let Some(wanted) = only else { return Ok(cases) };
+    let names: Vec<String> = cases.iter().map(|c| c.name.clone()).collect();
+    let chosen: Vec<Case> = cases.into_iter().filter(|c| c.name.contains(wanted)).collect();
+    if chosen.is_empty() {
+        bail!("no case is called `{wanted}`; there are {}", names.join(", "));
+    }
+    Ok(chosen)
+}
+
+fn target(root: &Path) -> PathBuf {
+    std::env::var_os("CARGO_TARGET_DIR").map_or_else(|| root.join("target"), |d| root.join(d))
+}
+
+fn build(root: &Path) -> Result<PathBuf> {
+    let cargo = std::env::var_os("CARGO").unwrap_or_else(|| "cargo".into());
+    let status = Command::new(cargo)
+        .args(["build", "--release", "--locked", "--package", "greybox-cli"])
+        .current_dir(root)
+        .status()
+        .context("cargo could not be started")?;
+    if !status.success() {
+        bail!("greybox does not build");
+    }
+    let binary = target(root).join("release").join(format!("greybox{}", std::env::consts::EXE_SUFFIX));
+    if !binary.is_file() {
+        bail!("the build left no {}", binary.display());
+    }
+    Ok(binary)
+}
+
+/// Runs one case; a run that fails is a figure like any other.
+fn measure(binary: &Path, folder: &Path, case: &Case, out: &Path, limit: Duration) -> Result<Outcome> {
+    // A report of an earlier run must not be taken for this one's.
+    if out.exists() {
+        std::fs::remove_dir_all(out).with_context(|| format!("{} cannot be emptied", out.display()))?;
+    }
+    std::fs::create_dir_all(out).with_context(|| format!("{} cannot be made", out.display()))?;
+    let folder = folder.join(&case.folder);
+    let mut command = Command::new(binary);
+    command.arg("diagnose").arg(folder.join(&case.model));
+    command.args(case.train.iter().map(|f| folder.join(f)));
+    for file in &case.holdout {
+        command.arg("--holdout").arg(folder.join(file));
+    }
+    command.arg("--out").arg(out);
+    let run = process::run(&mut command, out, limit)?;
+    let mut figures = Vec::new();
+    let report = match run.status {
+        None => Err(format!("stopped after {:.0} s", run.seconds)),
+        Some(status) if !status.success() => {
+            let said = std::fs::read_to_string(out.join("stderr.txt")).unwrap_or_default();
+            let first = said.lines().find(|l| !l.trim().is_empty()).unwrap_or("no message").trim();
+            Err(format!("{status}: {first}"))
+        }
+        Some(_) => std::fs::read_to_string(out.join("report.json"))
+            .map_err(|e| format!("report.json: {e}"))
+            .and_then(|text| Report::from_json(&text).map_err(|e| e.to_string())),
+    };
+    match report {
+        Ok(report) => figures.extend((case.judge)(&report)),
+        Err(why) => figures.push(Figure::judged("run", why, "a report", false)),
+    }
+    let time = format!("{:.1} s", run.seconds);
+    figures.push(match case.seconds {
+        Some(most) => Figure::judged("time", time, format!("< {most} s"), run.seconds < most),
+        None => Figure::plain("time", time),
+    });
+    // Below 1 MiB the reading dates from before the program was loaded.
+    if let Some(bytes) = run.peak_bytes.filter(|&b| b >= 1 << 20) {
+        figures.push(Figure::plain("peak memory", format!("{:.0} MiB", bytes as f64 / (1024.0 * 1024.0))));
+    }
+    Ok(Outcome { case: case.name.clone(), figures })
+}
+
+fn to_json(outcomes: &[Outcome]) -> serde_json::Value {
+    let case = |o: &Outcome| {
+        let figures: Vec<_> = o
+            .figures
+            .iter()
+            .map(|f| json!({"name": f.name, "measured": f.measured, "goal": f.goal, "met": f.met}))
+            .collect();
+        json!({"case": o.case, "figures": figures})
+    };
+    json!({"cases": outcomes.iter().map(case).collect::<Vec<_>>()})
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn cases_are_selected_by_part_of_their_name() {
+        let chosen = select(cases::all(), Some("emps")).unwrap();
+        assert_eq!(
+            chosen.iter().map(|c| c.name.as_str()).collect::<Vec<_>>(),
+            ["emps_velocity", "emps_position"]
+        );
+        let error = select(cases::all(), Some("nothing")).err().unwrap().to_string();
+        assert!(error.contains("silverbox") && error.contains("`nothing`"), "{error}");
+    }
+
+    /// A stand-in for greybox that copies a report, or fails.
+    #[cfg(unix)]
+    #[test]
+    fn a_run_is_judged_by_its_report_and_its_failure_is_a_figure() {
+        use std::os::unix::fs::PermissionsExt;
+        let place = tempfile::tempdir().unwrap();
+        let script = |name: &str, body: &str| {
+            let path = place.path().join(name);
+            std::fs::write(&path, format!("#!/bin/sh\n{body}\n")).unwrap();
+            std::fs::set_permissions(&path, std::fs::Permissions::from_mode(0o755)).unwrap();
+            path
+        };
+        let case = cases::all().into_iter().find(|c| c.name == "ball_bowling_ball").unwrap();
+        let out = place.path().join("out");
+        let go = |binary: PathBuf| {
+            measure(&binary, Path::new("here"), &case, &out, Duration::from_secs(20)).unwrap().figures
+        };
+        let report = cases::tests::report("consistent", &[], "z");
+        std::fs::write(place.path().join("r.json"), report.to_json().unwrap()).unwrap();
+        // The arguments come as a user would write them.
+        let source = place.path().join("r.json");
+        let good = go(script(
+            "good",
+            &format!(
+                "[ \"$*\" = \"diagnose here/falling_balls/nominal.toml here/falling_balls/bowling_ball_drop1.csv \
+                 --holdout here/falling_balls/bowling_ball_drop2.csv --out $7\" ] || exit 9\ncp {} $7/report.json",
+                source.display()
+            ),
+        ));
+        assert!(good.iter().all(|f| f.met != Some(false)), "{good:?}");
+        assert!(good.iter().any(|f| f.met == Some(true)));
+        let bad = go(script("bad", "echo 'error: no such channel' >&2; exit 2"));
+        assert_eq!(bad[0].met, Some(false));
+        assert!(bad[0].measured.contains("no such channel"), "{bad:?}");
+        // The first run's report is gone.
+        let silent = go(script("silent", "exit 0"));
+        assert_eq!(silent[0].met, Some(false));
+        assert!(silent[0].measured.contains("report.json"), "{silent:?}");
+    }
+}

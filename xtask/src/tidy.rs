@@ -1,0 +1,244 @@
+//! What neither the compiler nor clippy checks about the repository.
+
+use std::collections::BTreeSet;
+use std::path::{Path, PathBuf};
+use std::process::Command;
+
+use toml::{Table, Value};
+
+use crate::{docs, readme, root};
+
+fn read(path: &Path) -> String {
+    std::fs::read_to_string(path).unwrap_or_else(|e| panic!("{}: {e}", path.display()))
+}
+
+fn manifest(path: &Path) -> Table {
+    toml::from_str(&read(path)).unwrap_or_else(|e| panic!("{}: {e}", path.display()))
+}
+
+/// The manifests of all packages of the workspace.
+fn packages() -> Vec<(PathBuf, Table)> {
+    let mut paths = vec![root().join("xtask").join("Cargo.toml")];
+    for entry in std::fs::read_dir(root().join("crates")).unwrap() {
+        paths.push(entry.unwrap().path().join("Cargo.toml"));
+    }
+    paths.sort();
+    paths.into_iter().map(|p| (p.clone(), manifest(&p))).collect()
+}
+
+/// Text files under version control (all files outside `target` where git is not at hand).
+fn files() -> Vec<PathBuf> {
+    let listed = Command::new("git")
+        .args(["ls-files", "-z", "--cached", "--others", "--exclude-standard"])
+        .current_dir(root())
+        .output();
+    match listed {
+        Ok(output) if output.status.success() && !output.stdout.is_empty() => {
+            String::from_utf8(output.stdout)
+                .unwrap()
+                .split('\0')
+                .filter(|name| !name.is_empty())
+                .map(|name| root().join(name))
+                .filter(|path| path.is_file())
+                .collect()
+        }
+        _ => {
+            let mut found = Vec::new();
+            let mut folders = vec![root()];
+            while let Some(folder) = folders.pop() {
+                for entry in std::fs::read_dir(folder).unwrap() {
+                    let path = entry.unwrap().path();
+                    if path.is_dir() {
+                        if !path.ends_with("target") && !path.ends_with(".git") {
+                            folders.push(path);
+                        }
+                    } else {
+                        found.push(path);
+                    }
+                }
+            }
+            found
+        }
+    }
+}
+
+#[test]
+fn every_package_is_described_and_linted() {
+    for (path, manifest) in packages() {
+        let package = manifest["package"].as_table().unwrap();
+        let place = path.display();
+        let description = package.get("description").and_then(Value::as_str).unwrap_or("");
+        assert!(description.len() > 10, "{place}: `description` is missing");
+        for key in ["license", "edition", "rust-version", "version"] {
+            let inherited = package.get(key).and_then(|v| v.get("workspace")).and_then(Value::as_bool);
+            assert_eq!(inherited, Some(true), "{place}: write `{key}.workspace = true`");
+        }
+        let lints = manifest.get("lints").and_then(|l| l.get("workspace")).and_then(Value::as_bool);
+        assert_eq!(lints, Some(true), "{place}: write `[lints] workspace = true`");
+    }
+}
+
+/// Names of the dependencies of a package that come from the workspace, and of those that do not.
+fn dependencies(manifest: &Table) -> (BTreeSet<String>, BTreeSet<String>) {
+    let (mut shared, mut own) = (BTreeSet::new(), BTreeSet::new());
+    for key in ["dependencies", "dev-dependencies", "build-dependencies"] {
+        for (name, value) in manifest.get(key).and_then(Value::as_table).into_iter().flatten() {
+            let from_workspace = value.get("workspace").and_then(Value::as_bool) == Some(true);
+            if from_workspace { &mut shared } else { &mut own }.insert(name.clone());
+        }
+    }
+    (shared, own)
+}
+
+#[test]
+fn dependencies_are_stated_once_and_used() {
+    let workspace = manifest(&root().join("Cargo.toml"));
+    let stated: BTreeSet<String> =
+        workspace["workspace"]["dependencies"].as_table().unwrap().keys().cloned().collect();
+    let mut used = BTreeSet::new();
+    for (path, manifest) in packages() {
+        let (shared, own) = dependencies(&manifest);
+        assert!(own.is_empty(), "{}: state {own:?} in the workspace's manifest", path.display());
+        used.extend(shared);
+    }
+    let unused: Vec<&String> = stated.difference(&used).collect();
+    assert!(unused.is_empty(), "Cargo.toml: no package uses {unused:?}; remove them");
+}
+
+#[test]
+fn no_file_names_a_path_of_one_machine() {
+    // Put together here, so that this file does not name them.
+    let paths: Vec<String> = ["work", "tmp/wt", "home", "root"].iter().map(|p| format!("/{p}/")).collect();
+    let mut found = Vec::new();
+    for file in files() {
+        let Ok(text) = std::fs::read_to_string(&file) else { continue };
+        for (k, line) in text.lines().enumerate() {
+            if let Some(path) = paths.iter().find(|p| mentions(line, p)) {
+                found.push(format!("{}:{}: {path}", file.display(), k + 1));
+            }
+        }
+    }
+    assert!(found.is_empty(), "paths of one machine:\n{}", found.join("\n"));
+}
+
+/// Whether a line holds the path as an absolute one (`../work/x` and `a/work/x` are relative).
+fn mentions(line: &str, path: &str) -> bool {
+    line.match_indices(path).any(|(at, _)| {
+        !line[..at].chars().next_back().is_some_and(|c| c.is_alphanumeric() || "._-$}".contains(c))
+    })
+}
+
+#[test]
+fn an_absolute_path_is_told_from_a_relative_one() {
+    assert!(mentions("see \"/x/y\"", "/x/"));
+    assert!(mentions("/x/y", "/x/"));
+    assert!(!mentions("../x/y", "/x/"));
+    assert!(!mentions("a/x/y", "/x/"));
+}
+
+#[test]
+fn the_readme_states_the_commands_that_ci_runs() {
+    let text = read(&root().join("README.md"));
+    let test = readme::block_after(&text, "test command").unwrap();
+    assert_eq!(test, "cargo test --workspace --locked\n");
+    let main = readme::block_after(&text, "main command").unwrap();
+    assert!(main.contains("greybox demo"), "the main command is the demo: {main}");
+    let script = read(&root().join(".ci").join("run"));
+    for marker in ["test command", "main command"] {
+        assert!(script.contains(&format!("\"{marker}\"")), ".ci/run does not run the README's {marker}");
+    }
+}
+
+#[test]
+fn the_page_of_mechanisms_is_up_to_date() {
+    let page = docs::mechanisms_page(&root()).unwrap();
+    let present = read(&docs::page_path(&root())).replace("\r\n", "\n");
+    assert!(present == page, "docs/src/mechanisms.md is stale: run `cargo xtask docs`");
+    for file in docs::mechanism_files(&root()).unwrap() {
+        let kind = file.file_stem().unwrap().to_str().unwrap();
+        assert!(page.contains(&format!("\n### {kind}\n")), "{kind} has no section");
+    }
+}
+
+/// Pages of the book.
+fn pages() -> Vec<PathBuf> {
+    let folder = root().join("docs").join("src");
+    let mut pages: Vec<PathBuf> = std::fs::read_dir(folder).unwrap().map(|e| e.unwrap().path()).collect();
+    pages.retain(|p| p.extension().is_some_and(|e| e == "md"));
+    pages.sort();
+    pages
+}
+
+/// Fenced blocks of a language: (line, text).
+fn blocks(text: &str, language: &str) -> Vec<(usize, String)> {
+    let mut blocks: Vec<(usize, String)> = Vec::new();
+    let mut inside: Option<bool> = None;
+    for (k, line) in text.lines().enumerate() {
+        if let Some(info) = line.strip_prefix("```") {
+            inside = match inside {
+                Some(_) => None,
+                None => {
+                    let wanted = info.trim() == language;
+                    if wanted {
+                        blocks.push((k + 1, String::new()));
+                    }
+                    Some(wanted)
+                }
+            };
+        } else if inside == Some(true)
+            && let Some((_, block)) = blocks.last_mut()
+        {
+            block.push_str(line);
+            block.push('\n');
+        }
+    }
+    blocks
+}
+
+#[test]
+fn the_book_lists_every_page_and_links_to_pages_that_exist() {
+    let folder = root().join("docs").join("src");
+    let summary = read(&folder.join("SUMMARY.md"));
+    for page in pages() {
+        let name = page.file_name().unwrap().to_str().unwrap();
+        assert!(name == "SUMMARY.md" || summary.contains(&format!("({name})")), "SUMMARY.md lacks {name}");
+        for link in read(&page).split("](").skip(1).filter_map(|s| s.split(')').next()) {
+            let file = link.split('#').next().unwrap_or("");
+            if file.ends_with(".md") {
+                assert!(folder.join(file).is_file(), "{name} links to {file}, which does not exist");
+            }
+        }
+    }
+}
+
+/// A block ```` ```toml ```` is a model, a mechanism, or a part of one to be read; models and mechanisms
+/// must load. What must fail is marked ```` ```toml,error ````.
+#[test]
+fn models_and_mechanisms_in_the_book_load() {
+    let mut loaded = 0;
+    for page in pages() {
+        let (text, name) = (read(&page), page.file_name().unwrap().to_str().unwrap());
+        for (line, block) in blocks(&text, "toml") {
+            if block.contains("[equations]") {
+                greybox_model::Model::from_toml(&block, name)
+                    .unwrap_or_else(|e| panic!("{name}, line {line}: {e}"));
+                loaded += 1;
+            } else if block.contains("kind ") {
+                greybox_diagnose::Mechanism::from_toml(&block, name)
+                    .unwrap_or_else(|e| panic!("{name}, line {line}: {e}"));
+                loaded += 1;
+            }
+        }
+        for (line, block) in blocks(&text, "toml,error") {
+            let error = greybox_model::Model::from_toml(&block, name)
+                .err()
+                .unwrap_or_else(|| panic!("{name}, line {line}: the model loads, though it should not"))
+                .to_string();
+            // The message of the page is the message of the program.
+            let (_, message) = error.split_once(": ").unwrap();
+            assert!(text.contains(message), "{name}, line {line}: the page does not quote `{message}`");
+            loaded += 1;
+        }
+    }
+    assert!(loaded >= 5, "only {loaded} examples were found");
+}
