@@ -54,7 +54,9 @@ pub enum DataError {
         message: String,
     },
     /// A channel without a single value.
-    #[error("{file}: channel `{channel}` has no value at all; fill the column, or take the channel out of the model")]
+    #[error(
+        "{file}: channel `{channel}` has no value at all; fill the column, or take the channel out of the model"
+    )]
     EmptyChannel {
         /// File.
         file: String,
@@ -131,7 +133,12 @@ impl Data {
             };
             let mut inputs = Vec::new();
             for input in &model.inputs {
-                inputs.push(find(&input.channel, format!("input `{}`", input.name), &input.name, &input.unit)?);
+                inputs.push(find(
+                    &input.channel,
+                    format!("input `{}`", input.name),
+                    &input.name,
+                    &input.unit,
+                )?);
             }
             let mut measured = Vec::new();
             for m in &model.measurements {
@@ -180,8 +187,11 @@ impl Data {
             .collect();
         let spread: Vec<f64> = (0..channels.len())
             .map(|c| {
-                let values: Vec<f64> =
-                    pieces.iter().flat_map(|p| p.measured[c].iter().copied()).filter(|v| !v.is_nan()).collect();
+                let values: Vec<f64> = pieces
+                    .iter()
+                    .flat_map(|p| p.measured[c].iter().copied())
+                    .filter(|v| !v.is_nan())
+                    .collect();
                 spread(&values)
             })
             .collect();
@@ -402,8 +412,7 @@ impl Hats {
                 }
             })
             .collect();
-        let highest =
-            data.pieces.iter().map(|p| highest.iter().map(|s| pick(p, s)).collect()).collect();
+        let highest = data.pieces.iter().map(|p| highest.iter().map(|s| pick(p, s)).collect()).collect();
         Hats { states, tolerance, highest }
     }
 }

@@ -47,8 +47,7 @@ impl Setup {
                 let n = self.data.pieces[i].len;
                 let environment = &self.environments[i];
                 let seeds = Seeds::default();
-                let run =
-                    integrate(&self.system, environment, parameters, &x0, 0..n, self.method, &seeds);
+                let run = integrate(&self.system, environment, parameters, &x0, 0..n, self.method, &seeds);
                 (x0, run)
             })
             .collect();
@@ -85,10 +84,8 @@ impl Setup {
         }
         horizons.push(most);
         for horizon in horizons {
-            let level = Level {
-                segments: vec![Segment { piece, range: 0..horizon }],
-                priors: vec![prior.clone()],
-            };
+            let level =
+                Level { segments: vec![Segment { piece, range: 0..horizon }], priors: vec![prior.clone()] };
             let point = Point { parameters: parameters.to_vec(), starts: vec![x0.clone()] };
             let fit = fixed
                 .with_problem(&level, scale, |p| p.fit(point, Limits { iterations: 12, tolerance: 1e-6 }));
@@ -101,7 +98,13 @@ impl Setup {
 
     /// Scores per channel of a free run, over all pieces or those of one recording. Windows of
     /// `window` seconds restart from the smoothed measurements (unmeasured states from the run).
-    pub fn scores(&self, run: &FreeRun, parameters: &[f64], window: f64, recording: Option<usize>) -> Vec<Score> {
+    pub fn scores(
+        &self,
+        run: &FreeRun,
+        parameters: &[f64],
+        window: f64,
+        recording: Option<usize>,
+    ) -> Vec<Score> {
         let chosen: Vec<usize> = (0..self.data.pieces.len())
             .filter(|&i| recording.is_none_or(|r| self.data.pieces[i].recording == r))
             .collect();
@@ -143,8 +146,7 @@ impl Setup {
         let mut a = 0;
         while a < n {
             let b = (a + length).min(n);
-            let mut x0: Vec<f64> =
-                (0..self.system.nx).map(|i| run.x[piece][i * n + a]).collect();
+            let mut x0: Vec<f64> = (0..self.system.nx).map(|i| run.x[piece][i * n + a]).collect();
             for (x, hat) in x0.iter_mut().zip(&self.hats.states[piece]) {
                 if let Some(hat) = hat
                     && hat[a].is_finite()

@@ -303,14 +303,10 @@ impl Problem<'_> {
                 let Some(step) = self.step(&global, np, lambda, &point.parameters) else { break };
                 let mut trial = point.clone();
                 for (f, d) in self.free.iter().zip(&step) {
-                    trial.parameters[f.index] =
-                        (trial.parameters[f.index] + d).clamp(f.lower, f.upper);
+                    trial.parameters[f.index] = (trial.parameters[f.index] + d).clamp(f.lower, f.upper);
                 }
-                let moved: Vec<f64> = self
-                    .free
-                    .iter()
-                    .map(|f| trial.parameters[f.index] - point.parameters[f.index])
-                    .collect();
+                let moved: Vec<f64> =
+                    self.free.iter().map(|f| trial.parameters[f.index] - point.parameters[f.index]).collect();
                 for (i, red) in reduced.iter().enumerate() {
                     let rhs: Vec<f64> = (0..nx)
                         .map(|a| {

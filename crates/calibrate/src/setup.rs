@@ -103,8 +103,7 @@ impl Setup {
     /// twentieth of the noise and 10⁻⁶ of the signal) over a stretch of the data, judged against
     /// Dormand–Prince with tight tolerances.
     pub fn choose_method(&mut self, tolerance: &[f64]) {
-        let Some((piece, data)) =
-            self.data.pieces.iter().enumerate().max_by_key(|(_, p)| p.len.min(1500))
+        let Some((piece, data)) = self.data.pieces.iter().enumerate().max_by_key(|(_, p)| p.len.min(1500))
         else {
             return;
         };
@@ -129,12 +128,8 @@ impl Setup {
         for method in ladder {
             let trial = run(method);
             let accurate = (0..self.system.ny).all(|c| {
-                let limit = tolerance[c]
-                    .max(0.05 * self.data.sigma[c])
-                    .max(1e-6 * self.data.spread[c]);
-                (0..good).all(|k| {
-                    (trial.y[c * n + k] - reference.y[c * n + k]).abs() <= limit
-                })
+                let limit = tolerance[c].max(0.05 * self.data.sigma[c]).max(1e-6 * self.data.spread[c]);
+                (0..good).all(|k| (trial.y[c * n + k] - reference.y[c * n + k]).abs() <= limit)
             });
             if accurate {
                 self.method = method;
@@ -260,8 +255,7 @@ impl Setup {
         scale: &[f64],
         f: impl FnOnce(&Problem<'_>) -> R,
     ) -> R {
-        let measured: Vec<&[Vec<f64>]> =
-            self.data.pieces.iter().map(|p| p.measured.as_slice()).collect();
+        let measured: Vec<&[Vec<f64>]> = self.data.pieces.iter().map(|p| p.measured.as_slice()).collect();
         f(&Problem {
             system: &self.system,
             environments,

@@ -60,7 +60,10 @@ fn main() -> Result<(), Box<dyn std::error::Error>> {
     for a in &found.accepted {
         println!("{} {:?} {:?}", library[a.candidate.mechanism].kind, a.candidate.place, a.evidence);
         for r in &a.rivals {
-            println!("    {} score {:.1} equivalent {}", library[r.candidate.mechanism].kind, r.evidence.score, r.equivalent);
+            println!(
+                "    {} score {:.1} equivalent {}",
+                library[r.candidate.mechanism].kind, r.evidence.score, r.equivalent
+            );
         }
     }
     println!("{:7.2} done", talk.0.elapsed().as_secs_f64());

@@ -1,8 +1,8 @@
 //! Expressions of the model evaluated along given states, sample by sample.
 
 use greybox_calibrate::{Level, Point, Setup};
-use greybox_model::{Expr, Func};
 use greybox_model::tape::{Column, LeafKind, Tape};
+use greybox_model::{Expr, Func};
 
 /// States of every piece at every sample, from the measurements where there are any.
 pub struct Along<'a> {
@@ -89,7 +89,8 @@ impl<'a> Along<'a> {
                 return (primes == 0).then_some(base + i);
             }
             if let Some(j) = model.state(name) {
-                return ((primes as usize) < system.orders[j]).then(|| 1 + system.offsets[j] + primes as usize);
+                return ((primes as usize) < system.orders[j])
+                    .then(|| 1 + system.offsets[j] + primes as usize);
             }
             if primes > 0 {
                 return None;
@@ -134,9 +135,7 @@ impl<'a> Along<'a> {
                 } else if leaf < system.parameters() {
                     Column::Series(&piece.inputs[leaf - system.inputs()])
                 } else if leaf < base {
-                    Column::Value(
-                        self.parameters.get(leaf - system.parameters()).copied().unwrap_or(0.0),
-                    )
+                    Column::Value(self.parameters.get(leaf - system.parameters()).copied().unwrap_or(0.0))
                 } else if leaf < base + extra.len() {
                     Column::Value(extra[leaf - base].1)
                 } else {

@@ -106,9 +106,8 @@ impl Candidate {
     pub fn insert(&self, model: &mut Model, mechanism: &Mechanism, values: &[f64]) -> Instance {
         let names = self.names(model, mechanism);
         let plain: Vec<String> = mechanism.parameters().map(str::to_string).collect();
-        let rename = |n: &str| {
-            plain.iter().position(|p| p == n).map_or_else(|| n.to_string(), |i| names[i].clone())
-        };
+        let rename =
+            |n: &str| plain.iter().position(|p| p == n).map_or_else(|| n.to_string(), |i| names[i].clone());
         let mut law = self.translate(model, &mechanism.law, &rename).simplify();
         match &self.place {
             Place::Motion(motion) => {
@@ -154,13 +153,7 @@ impl Candidate {
         let mut out = Vec::new();
         for (i, name) in mechanism.linear.iter().enumerate() {
             let lower = if positive(name) { 0.0 } else { f64::NEG_INFINITY };
-            out.push(Free {
-                index: first + i,
-                mean: 0.0,
-                std: f64::INFINITY,
-                lower,
-                upper: f64::INFINITY,
-            });
+            out.push(Free { index: first + i, mean: 0.0, std: f64::INFINITY, lower, upper: f64::INFINITY });
         }
         for (i, inner) in mechanism.inner.iter().enumerate() {
             let scale = scales[i].abs().max(1e-300);

@@ -2,9 +2,11 @@
 
 use std::sync::Arc;
 
-use greybox_calibrate::{Data, DataError, FreeRun, Limits, Point, Score, Setup, free_parameters, qr, window_length};
-use greybox_model::{Hold, Model};
+use greybox_calibrate::{
+    Data, DataError, FreeRun, Limits, Point, Score, Setup, free_parameters, qr, window_length,
+};
 use greybox_model::system::CompileError;
+use greybox_model::{Hold, Model};
 use greybox_recording::Recording;
 
 use crate::along::Along;
@@ -271,7 +273,8 @@ pub fn layout(model: &Model, train: &[Recording], holdout: &[Recording]) -> Resu
     }
     // The whole recordings first: errors name them as they are.
     let whole = Data::new(model, train)?;
-    let needed = 4 * model.states.iter().map(|s| s.order).sum::<usize>() + 4 * model.parameters.len().min(8) + 8;
+    let needed =
+        4 * model.states.iter().map(|s| s.order).sum::<usize>() + 4 * model.parameters.len().min(8) + 8;
     let found: usize = whole.pieces.iter().map(|p| p.len).sum();
     if found < needed {
         return Err(DiagnoseError::TooShort { file: whole.recordings.join(", "), found, needed });
@@ -306,8 +309,7 @@ fn conclude(
     observer: &dyn Observer,
 ) -> Result<Diagnosis, DiagnoseError> {
     let train = nominal.data.clone();
-    let durations: Vec<f64> =
-        train.pieces.iter().map(|p| (p.len.saturating_sub(1)) as f64 * p.dt).collect();
+    let durations: Vec<f64> = train.pieces.iter().map(|p| (p.len.saturating_sub(1)) as f64 * p.dt).collect();
     let dt = train.pieces.iter().map(|p| p.dt).fold(0.0, f64::max);
     let window = window_length(&durations, dt);
     observer.stage(Stage::Simulating);
@@ -358,9 +360,8 @@ fn conclude(
             };
             let run = setup.free_run(parameters, scale);
             let scores = setup.scores(&run, parameters, window, None);
-            let by_recording = (0..data.recordings.len())
-                .map(|r| setup.scores(&run, parameters, window, Some(r)))
-                .collect();
+            let by_recording =
+                (0..data.recordings.len()).map(|r| setup.scores(&run, parameters, window, Some(r))).collect();
             Ok(Run { run, scores, by_recording })
         };
         let nominal_scale: Vec<f64> = data.spread.iter().map(|s| s.max(1e-300)).collect();
@@ -376,11 +377,8 @@ fn conclude(
 
     // Mechanisms, remainder, verdict.
     let surface = surface(&improved, &scale);
-    let misfit = rms(&improved.fit, &found.scale)
-        .iter()
-        .zip(&train.sigma)
-        .map(|(r, s)| r / s)
-        .fold(0.0, f64::max);
+    let misfit =
+        rms(&improved.fit, &found.scale).iter().zip(&train.sigma).map(|(r, s)| r / s).fold(0.0, f64::max);
     let fired = |gain: f64, ratio: f64| {
         surface.as_ref().is_some_and(|s| s.gain > gain && s.t > 2.5) && misfit > ratio
     };
@@ -402,8 +400,7 @@ fn conclude(
     };
     mechanisms.sort_by(|a, b| b.share_explained.total_cmp(&a.share_explained));
     let remainder = remainder(&improved, surface, significant, full / base.max(1e-300));
-    let noise_floor =
-        train.sigma.iter().zip(&train.spread).map(|(s, d)| s / d.max(1e-300)).collect();
+    let noise_floor = train.sigma.iter().zip(&train.spread).map(|(s, d)| s / d.max(1e-300)).collect();
     let holds = nominal.holds.iter().copied().zip(improved.setup.holds.iter().copied()).collect();
     let unexplained = verdict != Verdict::MissingPhysics && !improved.parts.is_empty();
     Ok(Diagnosis {
@@ -426,11 +423,7 @@ fn conclude(
 }
 
 fn residual_scale(fitted: &Fitted, scale: &[f64]) -> Vec<f64> {
-    rms(&fitted.fit, scale)
-        .iter()
-        .zip(&fitted.setup.data.sigma)
-        .map(|(r, s)| r.max(0.7 * s))
-        .collect()
+    rms(&fitted.fit, scale).iter().zip(&fitted.setup.data.sigma).map(|(r, s)| r.max(0.7 * s)).collect()
 }
 
 /// The baseline refitted on whole pieces, from the segments' parameters and from the nominal ones: the
@@ -446,10 +439,8 @@ fn polish_baseline(fitted: &Fitted, nominal: &[f64], scale: &[f64]) -> Fitted {
     };
     let mut best = (free_run(&fitted.fit.point.parameters), None);
     let stitched = setup.stitch(&fitted.level, &fitted.fit.point, &level, &own);
-    for mut start in [
-        stitched,
-        Point { parameters: nominal.to_vec(), starts: setup.starts(&level, nominal) },
-    ] {
+    for mut start in [stitched, Point { parameters: nominal.to_vec(), starts: setup.starts(&level, nominal) }]
+    {
         for (s, prior) in start.starts.iter_mut().zip(&level.priors) {
             for (x, (mean, std)) in s.iter_mut().zip(prior) {
                 if std.is_finite() {
@@ -611,8 +602,7 @@ fn findings(
             // Posterior weights of the explanations tried; equivalent ones share their weight.
             let rivals = accepted.map_or(&[][..], |a| &a.rivals[..]);
             let weight = |score: f64| (0.5 * (score - evidence.score)).clamp(-60.0, 0.0).exp();
-            let others: f64 =
-                rivals.iter().filter(|r| !r.equivalent).map(|r| weight(r.evidence.score)).sum();
+            let others: f64 = rivals.iter().filter(|r| !r.equivalent).map(|r| weight(r.evidence.score)).sum();
             let nothing = weight(0.0);
             let confidence = (1.0 / (1.0 + others + nothing)).clamp(0.01, 0.99);
             let mut alternatives: Vec<Alternative> = rivals
@@ -635,9 +625,8 @@ fn findings(
                 .filter(|a| a.equivalent || a.confidence > 0.001)
                 .collect();
             twins(&mut alternatives, mechanism, part.candidate.clone(), &setup, confidence);
-            alternatives.sort_by(|a, b| {
-                b.equivalent.cmp(&a.equivalent).then(b.confidence.total_cmp(&a.confidence))
-            });
+            alternatives
+                .sort_by(|a, b| b.equivalent.cmp(&a.equivalent).then(b.confidence.total_cmp(&a.confidence)));
             let parameters = part
                 .instance
                 .names
@@ -684,7 +673,10 @@ fn twins(
     confidence: f64,
 ) {
     let (twin, separate) = match mechanism.kind.as_str() {
-        "constant_offset" => ("input_offset", "another gain of the amplifier: an input offset scales with it, a constant force does not"),
+        "constant_offset" => (
+            "input_offset",
+            "another gain of the amplifier: an input offset scales with it, a constant force does not",
+        ),
         "input_offset" => ("constant_offset", "the input switched off with the machine free to move"),
         _ => return,
     };
@@ -792,9 +784,7 @@ fn remainder(improved: &Fitted, surface: Option<Surface>, significant: bool, lef
     let mut location = Location::default();
     let mut shape = None;
     let share = surface.as_ref().map_or(0.0, |s| s.gain.clamp(0.0, 1.0) * left.min(1.0));
-    if significant
-        && let Some(Surface { variable: Some((variable, _)), .. }) = &surface
-    {
+    if significant && let Some(Surface { variable: Some((variable, _)), .. }) = &surface {
         let (motion, text) = match variable {
             Variable::Position(m) => (m, m.position.as_ref().map(|e| format!("a force that depends on {e}"))),
             Variable::Rate(m) => (m, m.rate.as_ref().map(|e| format!("a force that depends on {e}"))),
@@ -850,8 +840,7 @@ pub fn calibrate(
     let mut search = Search::new(nominal.clone(), &[], observer);
     search.keep_holds = true; // it changes parameters and nothing else
     let found = search.run();
-    let durations: Vec<f64> =
-        train.pieces.iter().map(|p| (p.len.saturating_sub(1)) as f64 * p.dt).collect();
+    let durations: Vec<f64> = train.pieces.iter().map(|p| (p.len.saturating_sub(1)) as f64 * p.dt).collect();
     let window = window_length(&durations, train.pieces.iter().map(|p| p.dt).fold(0.0, f64::max));
     let fitted = polish_baseline(&found.calibrated, &nominal.values(), &found.scale);
     let scale = residual_scale(&fitted, &found.scale);

@@ -136,14 +136,12 @@ pub fn folds(setup: &Setup, level: &Level, scale: &[f64], point: &Point) -> Fold
                 return rr;
             }
             // Damped: a fold may hold the only activity of a parameter.
-            let mut left: Vec<f64> =
-                (0..np * np).map(|i| (h[i] - jj[i]) / (d[i / np] * d[i % np])).collect();
+            let mut left: Vec<f64> = (0..np * np).map(|i| (h[i] - jj[i]) / (d[i / np] * d[i % np])).collect();
             for i in 0..np {
                 left[i * np + i] += 0.01;
             }
             let rhs: Vec<f64> = jr.iter().zip(&d).map(|(s, d)| -s / d).collect();
-            let delta: Vec<f64> =
-                qr::solve_spd(&left, np, &rhs).iter().zip(&d).map(|(x, d)| x / d).collect();
+            let delta: Vec<f64> = qr::solve_spd(&left, np, &rhs).iter().zip(&d).map(|(x, d)| x / d).collect();
             let mut sse = rr - 2.0 * qr::dot(&delta, &jr);
             for i in 0..np {
                 sse += delta[i] * qr::dot(&jj[i * np..(i + 1) * np], &delta);

@@ -10,9 +10,7 @@ pub mod screen;
 pub mod search;
 pub mod surface;
 
-pub use diagnosis::{
-    Calibration, DiagnoseError, Diagnosis, Estimate, Options, Verdict, calibrate, diagnose,
-};
+pub use diagnosis::{Calibration, DiagnoseError, Diagnosis, Estimate, Options, Verdict, calibrate, diagnose};
 pub use library::{Mechanism, MechanismError, built_in};
 
 /// Where the diagnosis is, for progress bars and logs.

@@ -199,8 +199,9 @@ impl Mechanism {
         };
         let mut inner = Vec::new();
         for (name, value) in raw.inner {
-            let entry: InnerFile =
-                value.try_into().map_err(|e: toml::de::Error| fail(format!("[inner] {name}: {}", e.message())))?;
+            let entry: InnerFile = value
+                .try_into()
+                .map_err(|e: toml::de::Error| fail(format!("[inner] {name}: {}", e.message())))?;
             if entry.grid.is_empty() || !entry.grid.iter().all(|v| v.is_finite()) {
                 return Err(fail(format!("[inner] {name}: `grid` must list finite first values")));
             }
@@ -239,8 +240,9 @@ impl Mechanism {
         };
         let mut equals = Vec::new();
         for (kind, value) in raw.equals {
-            let table: std::collections::BTreeMap<String, String> =
-                value.try_into().map_err(|e: toml::de::Error| fail(format!("[equals] {kind}: {}", e.message())))?;
+            let table: std::collections::BTreeMap<String, String> = value
+                .try_into()
+                .map_err(|e: toml::de::Error| fail(format!("[equals] {kind}: {}", e.message())))?;
             for (parameter, text) in table {
                 equals.push((kind.clone(), parameter, expression(&text, "equals")?));
             }
@@ -253,7 +255,9 @@ impl Mechanism {
             On::Measurement => &["y", "t", "pi"],
         };
         let known = |n: &str| {
-            placeholders.contains(&n) || raw.linear.iter().any(|l| l == n) || inner.iter().any(|i| i.name == n)
+            placeholders.contains(&n)
+                || raw.linear.iter().any(|l| l == n)
+                || inner.iter().any(|i| i.name == n)
         };
         let mut unknown = None;
         law.walk(&mut |e| {
@@ -271,7 +275,9 @@ impl Mechanism {
         }
         for name in &raw.positive {
             if !raw.linear.contains(name) && !inner.iter().any(|i| &i.name == name) {
-                return Err(fail(format!("`positive` names `{name}`, which is no parameter of this mechanism")));
+                return Err(fail(format!(
+                    "`positive` names `{name}`, which is no parameter of this mechanism"
+                )));
             }
         }
         for name in &raw.linear {
@@ -335,7 +341,8 @@ mod tests {
     #[test]
     fn wrong_files_are_refused_with_the_mend() {
         let base = "kind = \"k\"\nfamily = \"f\"\non = \"motion\"\n";
-        let error = |rest: &str| Mechanism::from_toml(&format!("{base}{rest}"), "x.toml").unwrap_err().to_string();
+        let error =
+            |rest: &str| Mechanism::from_toml(&format!("{base}{rest}"), "x.toml").unwrap_err().to_string();
         assert!(error("force = \"fc*sign(d')\"").contains("uses `fc`"));
         assert!(error("replace = \"d\"").contains("has `force`"));
         assert!(error("force = \"fc*sign(d'\"\nlinear = [\"fc\"]").contains("force"));

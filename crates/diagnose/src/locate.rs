@@ -34,19 +34,18 @@ const MOST_WINDOWS: usize = 200;
 pub fn locate(setup: &Setup, along: &Along<'_>, mechanism: &Mechanism, instance: &Instance) -> Location {
     let candidate = &instance.candidate;
     let names: Vec<String> = mechanism.parameters().map(str::to_string).collect();
-    let rename =
-        |n: &str| names.iter().position(|p| p == n).map_or_else(|| n.to_string(), |i| instance.names[i].clone());
+    let rename = |n: &str| {
+        names.iter().position(|p| p == n).map_or_else(|| n.to_string(), |i| instance.names[i].clone())
+    };
     let mut location = Location { equations: candidate.place.equations(&setup.model), ..Location::default() };
     // Bounds may use the RMS of the motion's rate, for laws that show around reversals.
     let rate = match &candidate.place {
-        Place::Motion(m) => m
-            .rate
-            .as_ref()
-            .and_then(|e| along.eval(std::slice::from_ref(e), &[])?.pop())
-            .map(|s| {
+        Place::Motion(m) => {
+            m.rate.as_ref().and_then(|e| along.eval(std::slice::from_ref(e), &[])?.pop()).map(|s| {
                 let n = s.iter().map(Vec::len).sum::<usize>().max(1) as f64;
                 (s.iter().flatten().map(|v| v * v).sum::<f64>() / n).sqrt()
-            }),
+            })
+        }
         _ => None,
     };
     let value = |e: &Expr| {
@@ -140,9 +139,7 @@ pub fn force(
     instance: &Instance,
 ) -> Option<Vec<Vec<f64>>> {
     let e = match (mechanism.on, &instance.candidate.place) {
-        (On::Input, Place::Input(i)) => {
-            instance.expression.clone() - Expr::var(&setup.model.inputs[*i].name)
-        }
+        (On::Input, Place::Input(i)) => instance.expression.clone() - Expr::var(&setup.model.inputs[*i].name),
         _ => instance.expression.clone(),
     };
     along.eval(&[e], &[])?.pop()
@@ -254,8 +251,7 @@ fn runs(active: &[bool], start: f64, dt: f64) -> Vec<(f64, f64)> {
 
 /// Band that holds the middle 90 % of the force's power (mean removed).
 fn band(setup: &Setup, force: &[Vec<f64>]) -> Option<(f64, f64)> {
-    let (piece, f) =
-        setup.data.pieces.iter().zip(force).max_by_key(|(p, _)| p.len)?;
+    let (piece, f) = setup.data.pieces.iter().zip(force).max_by_key(|(p, _)| p.len)?;
     let (freq, power) = spectrum(f, piece.dt);
     let total: f64 = power.iter().sum();
     if total <= 0.0 {
@@ -323,7 +319,8 @@ mod tests {
     #[test]
     fn spectrum_holds_the_power_of_a_sine_at_its_frequency() {
         let dt = 0.01;
-        let x: Vec<f64> = (0..2000).map(|k| 3.0 * (2.0 * std::f64::consts::PI * 7.0 * k as f64 * dt).sin()).collect();
+        let x: Vec<f64> =
+            (0..2000).map(|k| 3.0 * (2.0 * std::f64::consts::PI * 7.0 * k as f64 * dt).sin()).collect();
         let (f, p) = spectrum(&x, dt);
         let peak = (0..p.len()).max_by(|a, b| p[*a].total_cmp(&p[*b])).unwrap();
         assert!((f[peak] - 7.0).abs() < 0.06);

@@ -53,7 +53,12 @@ impl Place {
             Place::Equation(e) => vec![model.equations[*e].name.clone()],
             Place::Input(i) => {
                 let name = &model.inputs[*i].name;
-                model.equations.iter().filter(|e| e.residual().mentions(name)).map(|e| e.name.clone()).collect()
+                model
+                    .equations
+                    .iter()
+                    .filter(|e| e.residual().mentions(name))
+                    .map(|e| e.name.clone())
+                    .collect()
             }
             Place::Measurement(c) => {
                 let expr = &model.measurements[*c].expr;
@@ -85,7 +90,13 @@ pub fn own_coordinates(model: &Model) -> Vec<Option<usize>> {
         }
     }
     // n is small: the best assignment by depth-first search, the first best one counts.
-    fn search(likes: &[Vec<u8>], e: usize, used: &mut Vec<Option<usize>>, best: &mut (u32, Vec<Option<usize>>), score: u32) {
+    fn search(
+        likes: &[Vec<u8>],
+        e: usize,
+        used: &mut Vec<Option<usize>>,
+        best: &mut (u32, Vec<Option<usize>>),
+        score: u32,
+    ) {
         if e == likes.len() {
             if score > best.0 || best.1.is_empty() {
                 *best = (score, used.clone());

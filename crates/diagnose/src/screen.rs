@@ -15,7 +15,7 @@
 
 use std::ops::Range;
 
-use greybox_calibrate::{Level, Point, Setup, SegmentRows, qr};
+use greybox_calibrate::{Level, Point, SegmentRows, Setup, qr};
 use greybox_simulate::SignalLanes;
 use rayon::prelude::*;
 
@@ -114,9 +114,10 @@ pub fn lanes(setup: &Setup, library: &[Mechanism], candidates: &[Candidate], alo
         for grid in grid(mechanism) {
             let inner: Vec<f64> = grid.iter().zip(&scales).map(|(g, s)| g * s).collect();
             let mut extra: Vec<(&str, f64)> = Vec::new();
-            for (name, value) in mechanism.parameters().zip(
-                std::iter::repeat_n(0.0, mechanism.linear.len()).chain(inner.iter().copied()),
-            ) {
+            for (name, value) in mechanism
+                .parameters()
+                .zip(std::iter::repeat_n(0.0, mechanism.linear.len()).chain(inner.iter().copied()))
+            {
                 extra.push((name, value));
             }
             // The file's own parameter names may also be names of the model: mark them.
@@ -164,9 +165,7 @@ pub fn lanes(setup: &Setup, library: &[Mechanism], candidates: &[Candidate], alo
                         };
                         let Some(series) = change(&inner) else { continue };
                         let tiny: Vec<f64> = inner.iter().map(|v| v * 1e-6).collect();
-                        let size = |s: &[Vec<f64>]| {
-                            s.iter().flatten().fold(0.0f64, |m, v| m.max(v.abs()))
-                        };
+                        let size = |s: &[Vec<f64>]| s.iter().flatten().fold(0.0f64, |m, v| m.max(v.abs()));
                         let vanishes = change(&tiny).is_some_and(|s| size(&s) < 1e-3 * size(&series));
                         secant = Some(vanishes && inner.len() == 1);
                         if size(&series) == 0.0 {
@@ -436,8 +435,8 @@ impl Gram {
         let mut gr = vec![0.0; n];
         for a in 0..n {
             for b in 0..n {
-                gg[a * n + b] = self.gg[index][a * n + b]
-                    - (0..np).map(|i| jg(i, a) * columns[b][i]).sum::<f64>();
+                gg[a * n + b] =
+                    self.gg[index][a * n + b] - (0..np).map(|i| jg(i, a) * columns[b][i]).sum::<f64>();
             }
             gr[a] = self.gr[block.start + a] - (0..np).map(|i| jg(i, a) * base[i]).sum::<f64>();
         }

@@ -2,8 +2,8 @@
 //! ones later.
 
 use greybox_calibrate::{Fit, Free, Level, Limits, Point, Setup, free_parameters};
-use greybox_model::{Hold, Model};
 use greybox_model::system::CompileError;
+use greybox_model::{Hold, Model};
 use rayon::prelude::*;
 
 use crate::candidate::{Candidate, Instance, candidates};
@@ -102,12 +102,7 @@ fn limits(iterations: usize) -> Limits {
 
 /// Residual RMS per channel in SI.
 pub fn rms(fit: &Fit, scale: &[f64]) -> Vec<f64> {
-    fit.rss
-        .iter()
-        .zip(&fit.count)
-        .zip(scale)
-        .map(|((r, n), s)| s * (r / (*n).max(1) as f64).sqrt())
-        .collect()
+    fit.rss.iter().zip(&fit.count).zip(scale).map(|((r, n), s)| s * (r / (*n).max(1) as f64).sqrt()).collect()
 }
 
 /// The scale for the next comparison: the model's own residual, never below 0.7 of the noise.
@@ -285,16 +280,7 @@ impl<'a> Search<'a> {
         let ((p0, s0), (p1, s1)) = (complexity(old), complexity(new));
         let old_folds = folds(&old.setup, &old.level, scale, &old.fit.point);
         let new_folds = folds(&new.setup, &new.level, scale, &new.fit.point);
-        weigh(
-            &old.fit.rss,
-            &new.fit.rss,
-            &new.fit.count,
-            kappa,
-            p1 - p0,
-            s1 - s0,
-            &old_folds,
-            &new_folds,
-        )
+        weigh(&old.fit.rss, &new.fit.rss, &new.fit.count, kappa, p1 - p0, s1 - s0, &old_folds, &new_folds)
     }
 
     /// Whether the improvement is to be believed.
@@ -382,14 +368,9 @@ impl<'a> Search<'a> {
         sigma: &[f64],
     ) {
         while current.parts.len() < MOST_MECHANISMS {
-            let misfit = rms(&current.fit, scale)
-                .iter()
-                .zip(sigma)
-                .map(|(r, s)| r / s)
-                .fold(0.0, f64::max);
-            let coloured = kappa(&current.setup, &current.level, scale, &current.fit.point)
-                .iter()
-                .any(|k| *k < 0.8);
+            let misfit = rms(&current.fit, scale).iter().zip(sigma).map(|(r, s)| r / s).fold(0.0, f64::max);
+            let coloured =
+                kappa(&current.setup, &current.level, scale, &current.fit.point).iter().any(|k| *k < 0.8);
             if misfit < 1.03 && !coloured {
                 break;
             }
@@ -404,14 +385,8 @@ impl<'a> Search<'a> {
             };
             let open: Vec<Candidate> = self.all.iter().filter(|c| !taken(c)).cloned().collect();
             self.observer.stage(Stage::Screening { candidates: open.len(), found: current.parts.len() });
-            let scored = screen(
-                &current.setup,
-                self.library,
-                &open,
-                &current.level,
-                scale,
-                &current.fit.point,
-            );
+            let scored =
+                screen(&current.setup, self.library, &open, &current.level, scale, &current.fit.point);
             let mut short: Vec<&Scored> = Vec::new();
             for s in &scored {
                 let kind = open[s.candidate].mechanism;
@@ -449,8 +424,8 @@ impl<'a> Search<'a> {
                 evidence
             };
             let total: f64 = calibrated_rss(calibrated, scale);
-            let share =
-                (current.fit.rss.iter().sum::<f64>() - chosen.fit.rss.iter().sum::<f64>()) / total.max(1e-300);
+            let share = (current.fit.rss.iter().sum::<f64>() - chosen.fit.rss.iter().sum::<f64>())
+                / total.max(1e-300);
             self.observer.weighed(&self.library[winner.mechanism].kind, &evidence, share);
             if !self.believable(&evidence, self.all.len(), share, current.parts.is_empty()) {
                 break;
@@ -498,7 +473,13 @@ impl<'a> Search<'a> {
     }
 
     /// Fits a candidate: added, or in place of the relative that it refines.
-    fn trial(&self, current: &Fitted, candidate: &Candidate, scored: &Scored, scale: &[f64]) -> Option<Fitted> {
+    fn trial(
+        &self,
+        current: &Fitted,
+        candidate: &Candidate,
+        scored: &Scored,
+        scale: &[f64],
+    ) -> Option<Fitted> {
         let fitted = self.fitted_trial(current, candidate, scored, scale)?;
         let mechanism = &self.library[candidate.mechanism];
         let part = fitted.parts.last()?;
@@ -506,10 +487,7 @@ impl<'a> Search<'a> {
             let i = mechanism.parameters().position(|p| p == n)?;
             Some(fitted.fit.point.parameters[fitted.setup.model.parameter(&part.instance.names[i])?])
         };
-        let admissible = mechanism
-            .require
-            .iter()
-            .all(|e| e.eval(&|n, _| value(n)).is_none_or(|v| v >= 0.0));
+        let admissible = mechanism.require.iter().all(|e| e.eval(&|n, _| value(n)).is_none_or(|v| v >= 0.0));
         admissible.then_some(fitted)
     }
 
@@ -621,15 +599,14 @@ impl<'a> Search<'a> {
         let mut best = 0;
         for i in 1..weighed.len() {
             let (a, b) = (&weighed[best], &weighed[i]);
-            let near = |slack: f64| {
-                a.1.fit.rss.iter().zip(&b.1.fit.rss).all(|(x, y)| {
-                    *y < (1.0 + slack) * x || (slack > 0.01 && (y - x) < LEAST_SHARE * total)
-                })
-            };
+            let near =
+                |slack: f64| {
+                    a.1.fit.rss.iter().zip(&b.1.fit.rss).all(|(x, y)| {
+                        *y < (1.0 + slack) * x || (slack > 0.01 && (y - x) < LEAST_SHARE * total)
+                    })
+                };
             let simpler = complexity(&b.1) < complexity(&a.1) && near(0.02);
-            let tie = complexity(&b.1) == complexity(&a.1)
-                && near(0.005)
-                && priority(b.0) < priority(a.0);
+            let tie = complexity(&b.1) == complexity(&a.1) && near(0.005) && priority(b.0) < priority(a.0);
             if simpler || tie {
                 best = i;
             }
@@ -678,4 +655,3 @@ fn calibrated_rss(calibrated: &Fitted, scale: &[f64]) -> f64 {
         .with_problem(&calibrated.level, scale, |p| p.rows(&calibrated.fit.point, false, None));
     calibrated.setup.with_problem(&calibrated.level, scale, |p| p.rss(&rows)).0.iter().sum()
 }
-

@@ -116,10 +116,8 @@ pub fn test(setup: &Setup, level: &Level, scale: &[f64], point: &Point) -> Optio
             let series: Vec<Vec<f64>> = pieces.iter().map(|p| p.inputs[u].clone()).collect();
             push(Variable::Input(u, motion.clone()), shapes(&series, 7));
         }
-        let times: Vec<Vec<f64>> = pieces
-            .iter()
-            .map(|p| (0..p.len).map(|k| p.start + k as f64 * p.dt).collect())
-            .collect();
+        let times: Vec<Vec<f64>> =
+            pieces.iter().map(|p| (0..p.len).map(|k| p.start + k as f64 * p.dt).collect()).collect();
         let mut slow = Vec::new();
         for shape in shapes(&times, 6) {
             for factor in [None, d.as_ref(), v.as_ref()] {

@@ -132,10 +132,10 @@ impl System {
                 .map_err(unknown(format!("equation \"{}\"", equation.name)))?;
         }
         let exprs: Vec<Expr> = mass.into_iter().chain(force).collect();
-        let rhs =
-            Tape::compile(&exprs, kinds.clone(), &resolve).map_err(unknown("equations".to_string()))?;
+        let rhs = Tape::compile(&exprs, kinds.clone(), &resolve).map_err(unknown("equations".to_string()))?;
         let measured: Vec<Expr> = model.measurements.iter().map(|m| m.expr.clone()).collect();
-        let output = Tape::compile(&measured, kinds, &resolve).map_err(unknown("measurements".to_string()))?;
+        let output =
+            Tape::compile(&measured, kinds, &resolve).map_err(unknown("measurements".to_string()))?;
         let output_needs_z = model.measurements.iter().any(|m| {
             let mut found = false;
             m.expr.walk(&mut |e| {

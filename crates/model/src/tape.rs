@@ -379,12 +379,7 @@ impl<'a> Compiler<'a> {
                 let leaf = self.kinds.len() as Reg;
                 let kind = if self.flags(ra).1 { LeafKind::Input } else { LeafKind::Varying };
                 self.kinds.push(kind);
-                self.delays.push(Delay {
-                    arg: ra,
-                    tau: rt,
-                    leaf,
-                    arg_leaf: (ra < CONSTANT).then_some(ra),
-                });
+                self.delays.push(Delay { arg: ra, tau: rt, leaf, arg_leaf: (ra < CONSTANT).then_some(ra) });
                 self.delay_exprs.push((arg, tau));
                 leaf
             }

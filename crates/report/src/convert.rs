@@ -217,7 +217,10 @@ fn findings(d: &Diagnosis, sources: &Sources<'_>) -> Vec<Finding> {
                     best.name(),
                     given.name()
                 ),
-                mend: Some(format!("state `hold = \"{}\"` for input `{name}`, as improved.toml does", best.name())),
+                mend: Some(format!(
+                    "state `hold = \"{}\"` for input `{name}`, as improved.toml does",
+                    best.name()
+                )),
             });
         }
     }
@@ -253,7 +256,11 @@ pub fn improved_toml(diagnosis: &Diagnosis, original: &str) -> String {
         for (name, _, e) in &m.parameters {
             let kind = crate::format::kind(&m.kind);
             let width = e.ci95.map_or_else(String::new, |(lo, hi)| {
-                format!(", 95 % interval {} to {}", crate::format::significant(lo, 4), crate::format::significant(hi, 4))
+                format!(
+                    ", 95 % interval {} to {}",
+                    crate::format::significant(lo, 4),
+                    crate::format::significant(hi, 4)
+                )
             });
             comments.push((name.clone(), format!("{kind}, found by greybox{width}")));
         }
@@ -265,7 +272,11 @@ pub fn improved_toml(diagnosis: &Diagnosis, original: &str) -> String {
 pub fn page(diagnosis: &Diagnosis, report: Report, sources: &Sources<'_>) -> Page {
     let d = diagnosis;
     Page {
-        title: if d.nominal.name.is_empty() { sources.model_file.to_string() } else { d.nominal.name.clone() },
+        title: if d.nominal.name.is_empty() {
+            sources.model_file.to_string()
+        } else {
+            d.nominal.name.clone()
+        },
         recordings: recordings(&d.train, &d.nominal, page::Role::Train)
             .into_iter()
             .chain(recordings(&d.holdout, &d.nominal, page::Role::Holdout))

@@ -41,7 +41,7 @@ fn a_report_satisfies_the_schema_and_comes_back_unchanged() {
     assert_eq!(json["verdict"], "missing_physics");
     assert_eq!(json["mechanisms"][0]["equation"], "hub");
     assert_eq!(json["mechanisms"][0]["parameters"]["fc"]["ci95"].as_array().unwrap().len(), 2);
-    assert_eq!(json["remainder"]["location"], serde_json::json!({}));
+    assert_eq!(json["remainder"]["location"], serde_json::json!({ "windows_s": {}, "region": {} }));
     assert!(json["fit"]["holdout"]["improved"]["theta"]["nrmse"].as_f64().unwrap() < 0.1);
     // Shortest round-trip formatting of numbers: what is read back is what was written.
     assert_eq!(Report::from_json(&report.to_json().unwrap()).unwrap(), report);

@@ -156,15 +156,7 @@ static DP5: Tableau = Tableau {
     ],
     b: &[35.0 / 384.0, 0.0, 500.0 / 1113.0, 125.0 / 192.0, -2187.0 / 6784.0, 11.0 / 84.0],
     c: &[0.0, 0.2, 0.3, 0.8, 8.0 / 9.0, 1.0],
-    e: &[
-        71.0 / 57600.0,
-        0.0,
-        -71.0 / 16695.0,
-        71.0 / 1920.0,
-        -17253.0 / 339200.0,
-        22.0 / 525.0,
-        -1.0 / 40.0,
-    ],
+    e: &[71.0 / 57600.0, 0.0, -71.0 / 16695.0, 71.0 / 1920.0, -17253.0 / 339200.0, 22.0 / 525.0, -1.0 / 40.0],
 };
 
 /// One evaluation of the right-hand side, kept for the tangent pass.
@@ -229,8 +221,7 @@ impl History {
         }
         let h = self.s[i + 1] - self.s[i];
         let w = (s - self.s[i]) / h;
-        let (y0, y1, d0, d1) =
-            (self.value[i], self.value[i + 1], self.slope[i] * h, self.slope[i + 1] * h);
+        let (y0, y1, d0, d1) = (self.value[i], self.value[i + 1], self.slope[i] * h, self.slope[i + 1] * h);
         if w > 1.0 {
             // A delay shorter than the step: straight on from the newest value.
             return (y1 + (w - 1.0) * d1, d1 / h, i + 1, 0.0);
@@ -865,8 +856,7 @@ impl<'a> Core<'a> {
                 let sw = self.system.rhs.switches[k];
                 if self.slack(0, k) < 0.0 {
                     let sticking = sw.kind == SwitchKind::Sign && self.modes[k] == 0;
-                    let (a, b) =
-                        (self.stages[0].regs[sw.a as usize], self.stages[0].regs[sw.b as usize]);
+                    let (a, b) = (self.stages[0].regs[sw.a as usize], self.stages[0].regs[sw.b as usize]);
                     self.modes[k] = if sticking {
                         if self.stages[0].lambda[k] > 0.0 { 1 } else { -1 }
                     } else {
@@ -898,8 +888,7 @@ impl<'a> Core<'a> {
         let nx = self.system.nx;
         let mut sum = 0.0;
         for r in 0..nx {
-            let e: f64 =
-                self.tableau.e.iter().zip(&self.stages).map(|(w, st)| w * st.f[r]).sum::<f64>() * h;
+            let e: f64 = self.tableau.e.iter().zip(&self.stages).map(|(w, st)| w * st.f[r]).sum::<f64>() * h;
             let size = self.x[r].abs().max(self.x1[r].abs());
             let floor = self.reach[r].max(size).max(f64::MIN_POSITIVE);
             let e = e / (atol * floor + rtol * size);
@@ -992,8 +981,7 @@ impl<'a> Core<'a> {
             return;
         }
         let tape = &self.system.rhs;
-        let needed =
-            (0..tape.delays.len()).any(|i| self.delayed_input(tape.delays[i].arg_leaf).is_none());
+        let needed = (0..tape.delays.len()).any(|i| self.delayed_input(tape.delays[i].arg_leaf).is_none());
         if !needed {
             return;
         }
@@ -1176,8 +1164,8 @@ impl<'a> Core<'a> {
                 self.dx = dx;
                 dte = (0..lanes)
                     .map(|l| {
-                        let g = side * self.d[ra * lanes + l]
-                            - if two { self.d[rb * lanes + l] } else { 0.0 };
+                        let g =
+                            side * self.d[ra * lanes + l] - if two { self.d[rb * lanes + l] } else { 0.0 };
                         -g / rate
                     })
                     .collect();

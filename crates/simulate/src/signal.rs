@@ -88,9 +88,8 @@ mod tests {
         assert_eq!(linear.at(9.0, 9.0), (2.0, 0.0));
         // A cubic on the dense grid is reproduced exactly, value and slope.
         let cubic = |t: f64| 1.0 - t + 2.0 * t * t - 0.5 * t * t * t;
-        let fine = Signal::new(Hold::BandLimited, 0.5, &u, |_| {
-            (0..=16).map(|i| cubic(i as f64 * 0.0625)).collect()
-        });
+        let fine =
+            Signal::new(Hold::BandLimited, 0.5, &u, |_| (0..=16).map(|i| cubic(i as f64 * 0.0625)).collect());
         let (v, slope) = fine.at(0.3, 0.3);
         assert!((v - cubic(0.3)).abs() < 1e-13);
         assert!((slope - (-1.0 + 4.0 * 0.3 - 1.5 * 0.09)).abs() < 1e-11);

@@ -104,11 +104,7 @@ fn a_delayed_state_follows_the_method_of_steps() {
     let t = run(&m, &free(n, 0.01), &[1.0], Method::Rk4 { substeps: 1 });
     for k in 0..n {
         let time = k as f64 * 0.01;
-        let exact = if time <= 1.0 {
-            1.0 - time
-        } else {
-            1.0 - time + (time - 1.0) * (time - 1.0) / 2.0
-        };
+        let exact = if time <= 1.0 { 1.0 - time } else { 1.0 - time + (time - 1.0) * (time - 1.0) / 2.0 };
         assert!((t.y[k] - exact).abs() < 1e-8, "{time}: {}", t.y[k] - exact);
     }
 }
@@ -131,9 +127,12 @@ fn delayed_inputs_of_either_hold() {
         let exact = staircase(k as f64 * dt - 0.23) - staircase(-0.23);
         assert!((t.y[k] - exact).abs() < 1e-12, "{k}: {} {exact}", t.y[k]);
     }
-    assert!(sensitivity_error(&m, &driven(Hold::Zero, dt, &u), &[0.0], Method::Rk4 { substeps: 1 }, 1e-5) < 1e-8);
     assert!(
-        sensitivity_error(&m, &driven(Hold::Linear, dt, &u), &[0.0], Method::Rk4 { substeps: 40 }, 1e-4) < 2e-3
+        sensitivity_error(&m, &driven(Hold::Zero, dt, &u), &[0.0], Method::Rk4 { substeps: 1 }, 1e-5) < 1e-8
+    );
+    assert!(
+        sensitivity_error(&m, &driven(Hold::Linear, dt, &u), &[0.0], Method::Rk4 { substeps: 40 }, 1e-4)
+            < 2e-3
     );
 }
 
@@ -167,8 +166,13 @@ fn coupled_mass_matrix_and_accelerometer() {
         assert!((t.y[400 + k] + 16.0 * t.x[800 + k]).abs() < 1e-12);
     }
     assert!(
-        sensitivity_error(&m, &driven(Hold::Linear, 0.01, &u), &[0.1, 0.0, -0.05, 0.2], Method::Rk4 { substeps: 1 }, 1e-5)
-            < 1e-7
+        sensitivity_error(
+            &m,
+            &driven(Hold::Linear, 0.01, &u),
+            &[0.1, 0.0, -0.05, 0.2],
+            Method::Rk4 { substeps: 1 },
+            1e-5
+        ) < 1e-7
     );
 }
 
@@ -221,7 +225,17 @@ fn two_frictions_stick_together() {
     );
     let dt = 0.01;
     // f < f2: nothing moves. Then f = 2: both move together (a'' = 1/3 < 0.5). Then f = 4: slip.
-    let u: Vec<f64> = (0..300).map(|k| if k < 100 { 0.9 } else if k < 200 { 2.0 } else { 4.0 }).collect();
+    let u: Vec<f64> = (0..300)
+        .map(|k| {
+            if k < 100 {
+                0.9
+            } else if k < 200 {
+                2.0
+            } else {
+                4.0
+            }
+        })
+        .collect();
     let t = run(&m, &driven(Hold::Zero, dt, &u), &[0.0; 4], Method::Rk4 { substeps: 1 });
     for k in 0..300 {
         let time = k as f64 * dt;

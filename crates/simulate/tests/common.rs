@@ -2,7 +2,8 @@
 #![allow(dead_code, missing_docs, unreachable_pub)]
 
 use greybox_model::{
-    Dimension, Equation, Hold, Input, Measurement, Model, Parameter, State, System, Unit, parse, parse_equation,
+    Dimension, Equation, Hold, Input, Measurement, Model, Parameter, State, System, Unit, parse,
+    parse_equation,
 };
 use greybox_simulate::{Environment, Method, Seeds, Signal, Trajectory, integrate};
 
@@ -54,7 +55,11 @@ pub fn model(
             .collect(),
         measurements: measured
             .iter()
-            .map(|text| Measurement { channel: text.to_string(), expr: parse(text).unwrap().expr, unit: unit() })
+            .map(|text| Measurement {
+                channel: text.to_string(),
+                expr: parse(text).unwrap().expr,
+                unit: unit(),
+            })
             .collect(),
     }
 }
@@ -68,9 +73,7 @@ pub fn driven(hold: Hold, dt: f64, u: &[f64]) -> Environment {
         start: 0.0,
         dt,
         len: u.len(),
-        inputs: vec![Signal::new(hold, dt, u, |u| {
-            greybox_recording_like_upsampling(u)
-        })],
+        inputs: vec![Signal::new(hold, dt, u, |u| greybox_recording_like_upsampling(u))],
         forces: vec![],
     }
 }
@@ -90,11 +93,8 @@ pub fn run(model: &Model, env: &Environment, x0: &[f64], method: Method) -> Traj
 pub fn sensitivity_error(model: &Model, env: &Environment, x0: &[f64], method: Method, h: f64) -> f64 {
     let system = System::compile(model).unwrap();
     let p: Vec<f64> = model.parameters.iter().map(|p| p.value).collect();
-    let seeds = Seeds {
-        parameters: (0..p.len()).collect(),
-        initial: (0..x0.len()).collect(),
-        ..Seeds::default()
-    };
+    let seeds =
+        Seeds { parameters: (0..p.len()).collect(), initial: (0..x0.len()).collect(), ..Seeds::default() };
     let base = integrate(&system, env, &p, x0, 0..env.len, method, &seeds);
     let n = base.y.len();
     let mut worst: f64 = 0.0;
@@ -117,7 +117,6 @@ pub fn sensitivity_error(model: &Model, env: &Environment, x0: &[f64], method: M
         for (a, b) in base.dy[lane * n..(lane + 1) * n].iter().zip(&numeric) {
             worst = worst.max((a - b).abs() / size);
         }
-
     }
     worst
 }
