@@ -405,7 +405,8 @@ fn outputs_that_cannot_be_written() {
     );
     bench.write("improved.toml", MODEL);
     bench.refuses(&["diagnose", "improved.toml", "run1.csv", "--out", "."], &["improved.toml", "overwrite"]);
-    bench.refuses(&["demo", "--out", "."], &["model.toml", "not of this demo", "mend"]);
+    bench.write("rotary_link.toml", MODEL);
+    bench.refuses(&["demo", "--out", "."], &["rotary_link.toml", "not of this demo", "mend"]);
     assert_eq!(bench.read("model.toml"), MODEL);
     assert_eq!(bench.read("file"), "mine");
     assert_eq!(bench.read("run1.csv"), recording(1200, 0.0));
@@ -468,31 +469,44 @@ fn demo_tells_the_story_and_writes_what_it_shows() {
     let bench = Bench::new();
     let outcome = bench.greybox(&["demo"]);
     assert_eq!(outcome.code, 0, "{}", outcome.stderr);
-    assert!(
-        outcome.stdout.contains("Coulomb friction is missing in the cart equation"),
-        "{}",
-        outcome.stdout
-    );
-    assert!(outcome.stdout.contains("held out, x"), "{}", outcome.stdout);
+    assert!(outcome.stdout.contains("Coulomb friction is missing in the hub equation"), "{}", outcome.stdout);
+    assert!(outcome.stdout.contains("held out, θ"), "{}", outcome.stdout);
     assert_eq!(bench.names(), ["model.toml", "run1.csv", "run2.csv"], "nothing is written without --out");
 
     let json = bench.json(&["demo", "--out", "demo"]);
     assert_eq!(json["verdict"], "missing_physics");
     assert_eq!(json["mechanisms"][0]["kind"], "coulomb_friction");
-    let files = ["holdout.csv", "improved.toml", "model.toml", "report.html", "report.json", "train.csv"];
+    let files = [
+        "improved.toml",
+        "report.html",
+        "report.json",
+        "rotary_link.toml",
+        "rotary_link_test.csv",
+        "rotary_link_train.csv",
+    ];
     assert_eq!(names(&bench.path("demo")), files);
     // The files that it leaves give the same answer.
-    let arguments = ["demo/model.toml", "demo/train.csv", "--holdout", "demo/holdout.csv", "--out", "again"];
+    let arguments = [
+        "demo/rotary_link.toml",
+        "demo/rotary_link_train.csv",
+        "--holdout",
+        "demo/rotary_link_test.csv",
+        "--out",
+        "again",
+    ];
     let again = bench.json(&[&["diagnose"], &arguments as &[&str]].concat());
     assert_eq!(again, json);
     for file in ["improved.toml", "report.html", "report.json"] {
         assert_eq!(bench.read(&format!("again/{file}")), bench.read(&format!("demo/{file}")), "{file}");
     }
     // And the improved model simulates as well as the report says.
-    let said = json["fit"]["holdout"]["improved"]["x"]["nrmse"].as_f64().unwrap();
-    let run = bench.json(&["simulate", "demo/improved.toml", "demo/holdout.csv", "--out", "s.csv"]);
-    let nrmse = run["fit"]["x"]["nrmse"].as_f64().unwrap();
+    let said = json["fit"]["holdout"]["improved"]["theta"]["nrmse"].as_f64().unwrap();
+    let run = bench.json(&["simulate", "demo/improved.toml", "demo/rotary_link_test.csv", "--out", "s.csv"]);
+    let nrmse = run["fit"]["theta"]["nrmse"].as_f64().unwrap();
     assert!((nrmse / said - 1.0).abs() < 0.05, "{nrmse} {said}");
+    // The friction level is the rig's within 15 % (other physics stays unmodelled).
+    let fc = json["mechanisms"][0]["parameters"]["fc"]["value"].as_f64().unwrap();
+    assert!((fc / 0.0148 - 1.0).abs() < 0.15, "{fc}");
 }
 
 #[test]

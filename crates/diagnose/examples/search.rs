@@ -1,4 +1,6 @@
 //! Developer's view of a search: `search MODEL.toml TRAIN.csv … -- TEST.csv …`
+#![allow(clippy::print_stdout)]
+
 use std::sync::Arc;
 
 use greybox_calibrate::{Data, Setup, free_parameters};

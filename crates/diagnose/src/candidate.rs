@@ -157,13 +157,14 @@ impl Candidate {
         }
         for (i, inner) in mechanism.inner.iter().enumerate() {
             let scale = scales[i].abs().max(1e-300);
-            let lower = if positive(&inner.name) { 0.0 } else { 1e-3 * scale };
+            // A positive parameter may run down to zero unless the file says otherwise.
+            let free_to_zero = positive(&inner.name) && inner.low <= 1e-3;
             out.push(Free {
                 index: first + mechanism.linear.len() + i,
                 mean: 0.0,
                 std: f64::INFINITY,
-                lower,
-                upper: 1e3 * scale,
+                lower: if free_to_zero { 0.0 } else { inner.low * scale },
+                upper: inner.high * scale,
             });
         }
         out

@@ -45,6 +45,10 @@ pub struct Inner {
     pub grid: Vec<f64>,
     /// The scale.
     pub scale: Scale,
+    /// Smallest admissible value, in units of the scale.
+    pub low: f64,
+    /// Largest admissible value, in units of the scale.
+    pub high: f64,
 }
 
 /// A size read off the data.
@@ -175,6 +179,8 @@ struct InnerFile {
     grid: Vec<f64>,
     #[serde(default)]
     scale: Option<String>,
+    low: Option<f64>,
+    high: Option<f64>,
 }
 
 impl Mechanism {
@@ -228,7 +234,15 @@ impl Mechanism {
                     }
                 }
             };
-            inner.push(Inner { name, grid: entry.grid, scale });
+            let (low, high) = (entry.low.unwrap_or(1e-3), entry.high.unwrap_or(1e3));
+            if low >= high
+                || low.is_nan()
+                || high.is_nan()
+                || entry.grid.iter().any(|g| *g < low || *g > high)
+            {
+                return Err(fail(format!("[inner] {name}: `low` and `high` must enclose the grid")));
+            }
+            inner.push(Inner { name, grid: entry.grid, scale, low, high });
         }
         let region = match raw.location {
             None => None,

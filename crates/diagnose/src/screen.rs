@@ -161,7 +161,7 @@ pub fn lanes(setup: &Setup, library: &[Mechanism], candidates: &[Candidate], alo
                         let change = |values: &[f64]| {
                             let extra: Vec<(&str, f64)> =
                                 marked.iter().map(String::as_str).zip(values.iter().copied()).collect();
-                            Some(along.eval(&[law.clone() - u.clone()], &extra)?.pop()?)
+                            along.eval(&[law.clone() - u.clone()], &extra)?.pop()
                         };
                         let Some(series) = change(&inner) else { continue };
                         let tiny: Vec<f64> = inner.iter().map(|v| v * 1e-6).collect();
@@ -517,7 +517,7 @@ pub fn screen(
                 }
             }
         };
-        if !(gain > 0.0) {
+        if gain <= 0.0 || gain.is_nan() {
             continue;
         }
         let slot = &mut best[variant.candidate];

@@ -19,6 +19,10 @@ pub const LEVELS: [usize; 3] = [60, 15, 4];
 const MOST_MECHANISMS: usize = 5;
 /// Most candidates that are fitted per round.
 const SHORT_LIST: usize = 9;
+/// Log-likelihood gain that another hold must bring.
+const HOLD_GAIN: f64 = 10.0;
+/// A simpler model wins when its score is no further behind than this.
+const PARSIMONY: f64 = 4.0;
 /// Least share of the calibrated model's misfit that a second or later mechanism must explain.
 const LEAST_SHARE: f64 = 7e-4;
 
@@ -258,7 +262,18 @@ impl<'a> Search<'a> {
                 let trial = Fitted { setup: best.setup.with_holds(holds), ..best.clone() };
                 let trial = self.refit(&trial, scale, 4);
                 if trial.fit.cost < best.fit.cost * (1.0 - margin) {
-                    best = trial;
+                    // Significant for the information that a correlated residual holds, or else the
+                    // hold would follow the misfit of a model that lacks something.
+                    let kappa = kappa(&trial.setup, &trial.level, scale, &trial.fit.point);
+                    let gain: f64 = (0..kappa.len())
+                        .filter(|&c| trial.fit.rss[c] > 0.0 && best.fit.rss[c] > 0.0)
+                        .map(|c| {
+                            trial.fit.count[c] as f64 * kappa[c] * (best.fit.rss[c] / trial.fit.rss[c]).ln()
+                        })
+                        .sum();
+                    if gain > HOLD_GAIN {
+                        best = trial;
+                    }
                 }
             }
         }
@@ -431,6 +446,7 @@ impl<'a> Search<'a> {
                 break;
             }
             // A refinement has replaced its simpler relative.
+            let before = accepted.clone();
             accepted.retain(|a| chosen.parts.iter().any(|p| p.candidate == a.candidate));
             match self.split(&chosen, scale) {
                 Some(split) => {
@@ -441,8 +457,22 @@ impl<'a> Search<'a> {
                         equivalent: true,
                     };
                     for part in &split.parts[chosen.parts.len() - 1..] {
+                        // A part that was there before keeps its own evidence.
+                        if let Some(known) = before.iter().find(|a| a.candidate == part.candidate) {
+                            let mut known = known.clone();
+                            known.rivals.retain(|r| r.candidate != winner);
+                            known.rivals.insert(0, whole.clone());
+                            accepted.push(known);
+                            continue;
+                        }
+                        // What was tried beside the whole is no equal of its parts alone.
                         let mut others = vec![whole.clone()];
-                        others.extend(rivals.iter().filter(|r| r.candidate != part.candidate).cloned());
+                        others.extend(
+                            rivals
+                                .iter()
+                                .filter(|r| !split.parts.iter().any(|p| p.candidate == r.candidate))
+                                .map(|r| Rival { equivalent: false, ..r.clone() }),
+                        );
                         accepted.push(Accepted {
                             candidate: part.candidate.clone(),
                             evidence,
@@ -605,7 +635,9 @@ impl<'a> Search<'a> {
                         *y < (1.0 + slack) * x || (slack > 0.01 && (y - x) < LEAST_SHARE * total)
                     })
                 };
-            let simpler = complexity(&b.1) < complexity(&a.1) && near(0.02);
+            // As good in every channel, or within what a likelihood can tell.
+            let simpler =
+                complexity(&b.1) < complexity(&a.1) && (near(0.02) || a.2.score - b.2.score < PARSIMONY);
             let tie = complexity(&b.1) == complexity(&a.1) && near(0.005) && priority(b.0) < priority(a.0);
             if simpler || tie {
                 best = i;

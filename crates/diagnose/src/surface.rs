@@ -13,6 +13,8 @@ use crate::place::{Motion, Place, places};
 use crate::screen::project;
 
 const FOLDS: usize = 10;
+/// Fewest independent samples (N κ) for a test of free shapes.
+const LEAST_INDEPENDENT: f64 = 20.0;
 
 /// What free shapes explain beyond the model.
 #[derive(Debug, Clone, PartialEq)]
@@ -158,7 +160,12 @@ pub fn test(setup: &Setup, level: &Level, scale: &[f64], point: &Point) -> Optio
     let width = np + lanes + 1;
     let rows = setup.with_problem(level, scale, |p| p.rows(point, true, Some(&signals)));
     let total: usize = level.segments.iter().map(|s| s.range.len()).sum();
-    let length = (total / 40).max(1);
+    // Blocks no shorter than the residual's correlation: neighbours must not predict each other.
+    let kappa = crate::evidence::kappa(setup, level, scale, point).into_iter().fold(1.0, f64::min);
+    if (total as f64) * kappa < LEAST_INDEPENDENT {
+        return None; // too little independent data to call anything systematic
+    }
+    let length = (total / 40).max((1.0 / kappa).ceil() as usize).max(1);
     // Gram matrix of [J | G | r] per block.
     let jobs: Vec<_> = rows.into_iter().zip(&level.segments).collect();
     let per_segment: Vec<Vec<Vec<f64>>> = jobs

@@ -275,7 +275,7 @@ impl<'a> Compiler<'a> {
     }
 
     fn constant_value(&self, r: Reg) -> Option<f64> {
-        (r >= CONSTANT && r < OPERATION).then(|| self.constants[(r - CONSTANT) as usize])
+        (CONSTANT..OPERATION).contains(&r).then(|| self.constants[(r - CONSTANT) as usize])
     }
 
     fn flags(&self, r: Reg) -> (bool, bool) {

@@ -25,7 +25,7 @@
 //! # Ok::<(), greybox_report::ReportError>(())
 //! ```
 //!
-//! It depends on no other greybox crate, reads no file and prints nothing.
+//! [`convert`] fills these types from a finished diagnosis; nothing here decides, reads a file or prints.
 
 pub mod contract;
 pub mod convert;

@@ -239,10 +239,10 @@ const LIMIT: f64 = 1e9;
 /// bounces infinitely often in finite time).
 const MOST_EVENTS: usize = 200;
 
-/// Simulates samples `from..to` of `env` from state `x0` at sample `from`.
+/// Simulates samples `range` of `env` from state `x0` at the first of them.
 ///
-/// `x0` has `system.nx` entries, `parameters` `system.np`; `env.inputs` one signal per input. The
-/// caller has checked the shapes ([`crate::simulate`] does for user input).
+/// `x0` has `system.nx` entries (the chains q, q', … in the order of the states), `parameters`
+/// `system.np`, all SI; `env.inputs` holds one signal per input. The caller answers for these lengths.
 pub fn integrate(
     system: &System,
     env: &Environment,
@@ -1149,13 +1149,9 @@ impl<'a> Core<'a> {
             let sw = self.system.rhs.switches[primary];
             let (ra, rb) = (sw.a as usize, sw.b as usize);
             let two = ra != rb;
-            let side = match sw.kind {
-                SwitchKind::Deadzone | SwitchKind::Saturate => {
-                    // g = |a| − b on the side where it happens.
-                    if self.stages[0].regs[ra] < 0.0 { -1.0 } else { 1.0 }
-                }
-                _ => 1.0,
-            };
+            // Dead zone and saturation: g = |a| − b on the side where it happens.
+            let two_sided = matches!(sw.kind, SwitchKind::Deadzone | SwitchKind::Saturate);
+            let side = if two_sided && self.stages[0].regs[ra] < 0.0 { -1.0 } else { 1.0 };
             let rate = side * self.gd[ra] - if two { self.gd[rb] } else { 0.0 };
             let size = before.iter().fold(0.0f64, |m, v| m.max(v.abs()));
             if rate.abs() > 1e-12 * size.max(1e-300) {

@@ -12,9 +12,9 @@ use crate::failure::Failure;
 use crate::loading::LoadedModel;
 use crate::output::OutputFolder;
 
-const MODEL: &str = include_str!("../../demo/model.toml");
-const TRAIN: &[u8] = include_bytes!("../../demo/train.csv");
-const HOLDOUT: &[u8] = include_bytes!("../../demo/holdout.csv");
+const MODEL: &str = include_str!("../../demo/rotary_link.toml");
+const TRAIN: &[u8] = include_bytes!("../../demo/rotary_link_train.csv");
+const HOLDOUT: &[u8] = include_bytes!("../../demo/rotary_link_test.csv");
 /// What the embedded files are.
 const ABOUT: &str = include_str!("../../demo/about.txt");
 
@@ -33,19 +33,22 @@ pub(crate) struct Arguments {
 }
 
 pub(crate) fn run(arguments: &Arguments) -> Result<Answer, Failure> {
-    let embedded: [(&str, &[u8]); 3] =
-        [("model.toml", MODEL.as_bytes()), ("train.csv", TRAIN), ("holdout.csv", HOLDOUT)];
+    let embedded: [(&str, &[u8]); 3] = [
+        ("rotary_link.toml", MODEL.as_bytes()),
+        ("rotary_link_train.csv", TRAIN),
+        ("rotary_link_test.csv", HOLDOUT),
+    ];
     let out = arguments.out.as_deref().map(OutputFolder::prepare).transpose()?;
     if let Some(folder) = &out {
         folder.spares_other(&embedded)?;
     }
-    let model = Model::from_toml(MODEL, "model.toml").map_err(|e| Failure::internal(e.to_string()))?;
-    let loaded = LoadedModel { model, text: MODEL.to_owned(), file: "model.toml".to_owned() };
-    let train = [parse_csv(TRAIN, "train.csv")?];
-    let holdout = [parse_csv(HOLDOUT, "holdout.csv")?];
+    let model = Model::from_toml(MODEL, "rotary_link.toml").map_err(|e| Failure::internal(e.to_string()))?;
+    let loaded = LoadedModel { model, text: MODEL.to_owned(), file: "rotary_link.toml".to_owned() };
+    let train = [parse_csv(TRAIN, "rotary_link_train.csv")?];
+    let holdout = [parse_csv(HOLDOUT, "rotary_link_test.csv")?];
     let results = diagnose(&loaded, &train, &holdout, 0)?;
     let mut text = format!(
-        "{ABOUT}\nThe model, model.toml:\n\n{}\nWhat greybox says:\n\n{}",
+        "{ABOUT}\nThe model, rotary_link.toml:\n\n{}\nWhat greybox says:\n\n{}",
         indented(MODEL),
         results.story
     );

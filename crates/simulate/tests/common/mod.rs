@@ -1,5 +1,5 @@
 //! Small models for the tests, written in the model language.
-#![allow(dead_code, missing_docs, unreachable_pub)]
+#![allow(dead_code, missing_docs, unreachable_pub, clippy::unwrap_used)]
 
 use greybox_model::{
     Dimension, Equation, Hold, Input, Measurement, Model, Parameter, State, System, Unit, parse,
@@ -73,12 +73,12 @@ pub fn driven(hold: Hold, dt: f64, u: &[f64]) -> Environment {
         start: 0.0,
         dt,
         len: u.len(),
-        inputs: vec![Signal::new(hold, dt, u, |u| greybox_recording_like_upsampling(u))],
+        inputs: vec![Signal::new(hold, dt, u, no_upsampling)],
         forces: vec![],
     }
 }
 
-fn greybox_recording_like_upsampling(_: &[f64]) -> Vec<f64> {
+fn no_upsampling(_: &[f64]) -> Vec<f64> {
     unreachable!("tests here use zero or linear hold")
 }
 
