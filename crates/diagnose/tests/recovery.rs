@@ -1,7 +1,7 @@
 //! Recovery over seeds: an effect that was left out is named, and nothing is named where nothing is
 //! missing. The recordings come from an integrator of this file's own (small explicit steps, friction by
 //! clipping the stopping impulse), which shares no code with the crates under test.
-#![allow(missing_docs)]
+#![allow(missing_docs, clippy::unwrap_used)]
 
 use greybox_diagnose::{Diagnosis, Options, Quiet, Verdict, diagnose};
 use greybox_model::Model;
@@ -136,7 +136,14 @@ fn the_answer_does_not_depend_on_the_unit_of_the_file() {
         let time = r.time.iter().map(|t| t + 7.0).collect();
         Recording::from_columns(&r.name, time, channels).unwrap()
     };
-    let a = diagnose(&model, &[train.clone()], &[held.clone()], &Options::default(), &Quiet).unwrap();
+    let a = diagnose(
+        &model,
+        std::slice::from_ref(&train),
+        std::slice::from_ref(&held),
+        &Options::default(),
+        &Quiet,
+    )
+    .unwrap();
     let b = diagnose(&model, &[in_mm(&train)], &[in_mm(&held)], &Options::default(), &Quiet).unwrap();
     assert_eq!(kinds(&a), kinds(&b));
     let (p, q) = (a.mechanisms[0].parameters[0].2.value, b.mechanisms[0].parameters[0].2.value);
