@@ -260,6 +260,11 @@ impl Data {
                 .collect();
             let mut part = Recording::from_columns(&r.name, r.time[range].to_vec(), channels).ok()?;
             part.name = r.name.clone();
+            if !head {
+                // Still on the recording's own clock: `t` and `step` mean the same as before.
+                let offset = r.time[at] - r.time[0];
+                part.pieces.iter_mut().for_each(|p| p.start += offset);
+            }
             Some(part)
         };
         recordings

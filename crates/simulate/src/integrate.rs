@@ -239,6 +239,10 @@ const LIMIT: f64 = 1e9;
 /// bounces infinitely often in finite time).
 const MOST_EVENTS: usize = 200;
 
+/// Steps shorter than this share of the sample interval are taken whatever their error, so that every
+/// simulation ends.
+const SMALLEST_STEP: f64 = 1e-5;
+
 /// Simulates samples `range` of `env` from state `x0` at the first of them.
 ///
 /// `x0` has `system.nx` entries (the chains q, q', … in the order of the states), `parameters`
@@ -668,6 +672,16 @@ impl<'a> Core<'a> {
         }
         evaluate(self);
         let st = &mut self.stages[b];
+        if ok {
+            // A velocity that is held does not change, not even by rounding: relative error control
+            // would chase that noise with ever smaller steps.
+            for &k in &sticking {
+                let leaf = tape.switches[k].a as usize;
+                if (System::STATES..System::STATES + nx).contains(&leaf) {
+                    st.f[leaf - System::STATES] = 0.0;
+                }
+            }
+        }
         st.gradient = gradient;
         st.pull = pull;
         st.b = bm;
@@ -811,7 +825,7 @@ impl<'a> Core<'a> {
             if let Some((rtol, atol)) = self.tolerance {
                 let error = self.error(h, rtol, atol);
                 let grow = (0.9 * error.max(1e-10).powf(-0.2)).clamp(0.2, 5.0);
-                if error > 1.0 && h > 1e-9 * self.env.dt {
+                if error > 1.0 && h > SMALLEST_STEP * self.env.dt {
                     self.h_next = h * grow.min(0.9);
                     continue;
                 }
