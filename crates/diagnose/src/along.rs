@@ -50,12 +50,6 @@ impl<'a> Along<'a> {
         Along { setup, states, parameters: parameters.to_vec() }
     }
 
-    /// The same states with other parameters.
-    pub fn with_parameters(mut self, parameters: &[f64]) -> Along<'a> {
-        self.parameters = parameters.to_vec();
-        self
-    }
-
     /// Values of `exprs` (states, inputs, parameters of the model, `extra` names), as
     /// `[expr][piece][sample]`; `None` when an expression mentions anything else. Every function is
     /// evaluated pointwise, with sign(0) = 0.

@@ -128,17 +128,21 @@ pub fn lanes(setup: &Setup, library: &[Mechanism], candidates: &[Candidate], alo
             let extra: Vec<(&str, f64)> =
                 marked.iter().map(String::as_str).zip(extra.iter().map(|e| e.1)).collect();
             let law = candidate.translate(&setup.model, &mechanism.law, &rename);
+            // The law's derivatives with respect to its linear parameters: one column each.
+            let slopes = || {
+                let slopes: Vec<_> = marked[..mechanism.linear.len()]
+                    .iter()
+                    .map(|n| law.derivative(n, 0).simplify())
+                    .collect();
+                along.eval(&slopes, &extra)
+            };
             let first = columns.len();
             let mut secant = None;
             match (&candidate.place, mechanism.on) {
                 (Place::Motion(motion), On::Motion) => {
                     let sign = if candidate.mirrored { -1.0 } else { 1.0 };
                     let weights: Vec<f64> = motion.weights.iter().map(|w| w * sign).collect();
-                    let slopes: Vec<_> = marked[..mechanism.linear.len()]
-                        .iter()
-                        .map(|n| law.derivative(n, 0).simplify())
-                        .collect();
-                    let Some(series) = along.eval(&slopes, &extra) else { continue };
+                    let Some(series) = slopes() else { continue };
                     for s in series {
                         columns.push(Column::Force(weights.clone(), s));
                     }
@@ -146,11 +150,7 @@ pub fn lanes(setup: &Setup, library: &[Mechanism], candidates: &[Candidate], alo
                 (Place::Equation(e), On::Equation) => {
                     let mut weights = vec![0.0; nz];
                     weights[*e] = 1.0;
-                    let slopes: Vec<_> = marked[..mechanism.linear.len()]
-                        .iter()
-                        .map(|n| law.derivative(n, 0).simplify())
-                        .collect();
-                    let Some(series) = along.eval(&slopes, &extra) else { continue };
+                    let Some(series) = slopes() else { continue };
                     for s in series {
                         columns.push(Column::Force(weights.clone(), s));
                     }
@@ -173,11 +173,7 @@ pub fn lanes(setup: &Setup, library: &[Mechanism], candidates: &[Candidate], alo
                         }
                         columns.push(Column::Input(*i, series));
                     } else {
-                        let slopes: Vec<_> = marked[..mechanism.linear.len()]
-                            .iter()
-                            .map(|n| law.derivative(n, 0).simplify())
-                            .collect();
-                        let Some(series) = along.eval(&slopes, &extra) else { continue };
+                        let Some(series) = slopes() else { continue };
                         for s in series {
                             columns.push(Column::Input(*i, s));
                         }

@@ -400,7 +400,7 @@ fn residuals(d: &Diagnosis) -> Vec<Residual> {
                 noise_sigma: sigma,
                 windows,
                 spectrum: spectra(data, r, &before, &after, sigma),
-                map: state_map(d, r, c, &after),
+                map: state_map(d, r, c),
                 before,
                 after,
             });
@@ -422,7 +422,7 @@ fn spectra(data: &Data, recording: usize, before: &[f64], after: &[f64], sigma: 
 }
 
 /// Size of the calibrated model's residual over the state plane of the first coordinate.
-fn state_map(d: &Diagnosis, recording: usize, channel: usize, _after: &[f64]) -> Option<StateMap> {
+fn state_map(d: &Diagnosis, recording: usize, channel: usize) -> Option<StateMap> {
     let state = d.nominal.states.first()?;
     if state.order < 2 {
         return None;
