@@ -132,8 +132,19 @@ impl Reduced {
     }
 
     /// The best choice found by backward elimination followed by single additions, removals and
-    /// exchanges until none improves the criterion.
+    /// exchanges until none improves the criterion; from all terms and from the odd ones alone.
     fn search(&self, allowed: &[usize], price: &Price<'_>) -> Solution {
+        let odd: Vec<usize> = allowed.iter().copied().filter(|c| !price.even.contains(c)).collect();
+        let all = self.search_from(allowed, allowed, price);
+        if odd.len() == allowed.len() {
+            return all;
+        }
+        let symmetric = self.search_from(&odd, allowed, price);
+        if self.criterion(&symmetric, price) <= self.criterion(&all, price) { symmetric } else { all }
+    }
+
+    /// Backward from `start`, then locally among all `allowed`.
+    fn search_from(&self, start: &[usize], allowed: &[usize], price: &Price<'_>) -> Solution {
         let kept = price.kept;
         let value = |s: &Solution| self.criterion(s, price);
         let with = |columns: &mut Vec<usize>| {
@@ -141,7 +152,7 @@ impl Reduced {
             columns.dedup();
             self.solve(columns)
         };
-        let mut best = with(&mut kept.iter().chain(allowed).copied().collect());
+        let mut best = with(&mut kept.iter().chain(start).copied().collect());
         let mut current = best.clone();
         loop {
             let worst = current

@@ -1,0 +1,201 @@
+//! First estimates: the equation between windowed integrals, by the algebraic method.
+//!
+//! Rows of ∫ w (Σ θⱼ zⱼ − f) dτ = 0 over sliding windows, w(τ) = τⁿ (T − τ)ⁿ (see `greybox-algebraic`): the leading
+//! derivative and the linear terms come from the measured signal alone, integrated by parts; products
+//! are taken of the smoothed states. Errors in these regressors bias the coefficients a little, and the
+//! choice of terms with them: that is why what is found here is only where the output error starts.
+
+use greybox_algebraic::{Column, Hold as Join, Kernel, rows_of_pieces};
+use greybox_calibrate::{Data, Hats, qr};
+use greybox_model::tape::{Column as Lane, LeafKind, Tape};
+use greybox_model::{Expr, Hold, Model};
+
+use crate::choose::Reduced;
+use crate::structure::Structure;
+
+/// Columns of one equation's regression.
+pub(crate) struct Rows {
+    /// One column per candidate of the equation, in the order of the structure's terms.
+    pub columns: Vec<Vec<f64>>,
+    /// The input's column (all zero without input).
+    pub target: Vec<f64>,
+    /// Index of each candidate among the structure's terms.
+    pub terms: Vec<usize>,
+    /// Windows without overlap among the rows.
+    pub independent: f64,
+    /// Rows per window without overlap.
+    pub overlap: usize,
+}
+
+/// Values of all candidate terms along the smoothed states, `[piece][term][sample]`.
+pub(crate) fn evaluate(structure: &Structure, model: &Model, data: &Data, hats: &Hats) -> Option<Vec<Vec<Vec<f64>>>> {
+    let orders: Vec<usize> = model.states.iter().map(|s| s.order).collect();
+    let offsets: Vec<usize> = orders
+        .iter()
+        .scan(0, |sum, o| {
+            let at = *sum;
+            *sum += o;
+            Some(at)
+        })
+        .collect();
+    let nx: usize = orders.iter().sum();
+    let resolve = |name: &str, primes: u8| -> Option<usize> {
+        let primes = primes as usize;
+        if let Some(j) = model.states.iter().position(|s| s.name == name) {
+            return (primes < orders[j]).then(|| offsets[j] + primes);
+        }
+        let input = model.inputs.iter().position(|u| u.name == name)?;
+        (primes == 0).then_some(nx + input)
+    };
+    let exprs: Vec<Expr> = structure
+        .terms
+        .iter()
+        .map(|t| {
+            let text = if t.optional { t.expression.as_str() } else { "0" };
+            greybox_model::parse(text).ok().map(|p| p.expr)
+        })
+        .collect::<Option<_>>()?;
+    let kinds = vec![LeafKind::State; nx + model.inputs.len()];
+    let tape = Tape::compile(&exprs, kinds, &resolve).ok()?;
+    data.pieces
+        .iter()
+        .zip(&hats.states)
+        .map(|(piece, hats)| {
+            if hats.iter().any(Option::is_none) {
+                return None;
+            }
+            let leaf = |i: usize| -> Lane<'_> {
+                if i < nx {
+                    Lane::Series(hats[i].as_deref().unwrap_or(&[]))
+                } else {
+                    Lane::Series(&piece.inputs[i - nx])
+                }
+            };
+            Some(tape.eval_batch(piece.len, &leaf))
+        })
+        .collect()
+}
+
+/// Rows of one equation with windows of `window` seconds.
+pub(crate) fn rows(
+    structure: &Structure,
+    model: &Model,
+    data: &Data,
+    values: &[Vec<Vec<f64>>],
+    equation: usize,
+    window: f64,
+) -> Option<Rows> {
+    let dt = data.pieces.iter().map(|p| p.dt).fold(f64::INFINITY, f64::min);
+    let order = model.states[equation].order;
+    let intervals = ((window / dt).round() as usize).max(8);
+    let kernel = Kernel::new(order, order + 1, intervals, dt).ok()?;
+    let hop = (intervals / 20).max(1);
+    let terms: Vec<usize> =
+        (0..structure.terms.len()).filter(|&i| structure.terms[i].equation == equation).collect();
+    let input = structure.equations[equation].input.as_ref().and_then(|name| model.input(name));
+    let zeros: Vec<Vec<f64>> = data.pieces.iter().map(|p| vec![0.0; p.len]).collect();
+    let state_of = |expression: &str| -> Option<(usize, usize)> {
+        let name = expression.trim_end_matches('\'');
+        let primes = expression.len() - name.len();
+        model.states.iter().position(|s| s.name == name).map(|j| (j, primes))
+    };
+    let pieces: Vec<Vec<Column<'_>>> = data
+        .pieces
+        .iter()
+        .enumerate()
+        .filter(|(_, p)| (p.dt / dt - 1.0).abs() < 1e-6)
+        .map(|(i, piece)| {
+            let mut columns: Vec<Column<'_>> = terms
+                .iter()
+                .map(|&t| match state_of(&structure.terms[t].expression) {
+                    // A derivative of a measured state: from the measurement itself.
+                    Some((j, primes)) => Column { signal: &piece.measured[j], order: primes, hold: Join::Smooth },
+                    None => Column { signal: &values[i][t], order: 0, hold: Join::Smooth },
+                })
+                .collect();
+            columns.push(match input {
+                Some(u) => Column {
+                    signal: &piece.inputs[u],
+                    order: 0,
+                    hold: match model.inputs[u].hold {
+                        Hold::Zero => Join::Zero,
+                        Hold::Linear => Join::Linear,
+                        Hold::BandLimited => Join::Smooth,
+                    },
+                },
+                None => Column { signal: &zeros[i], order: 0, hold: Join::Linear },
+            });
+            columns
+        })
+        .collect();
+    let mut rows = rows_of_pieces(&kernel, &pieces, hop).ok()?;
+    let target = rows.columns.pop()?;
+    let overlap = intervals.div_ceil(hop);
+    let independent = (target.len() as f64 / overlap as f64).max(1.0);
+    Some(Rows { columns: rows.columns, target, terms, independent, overlap })
+}
+
+/// The regression in triangular form; returns the columns' candidates with it. Without input the leading
+/// derivative moves to the right.
+pub(crate) fn reduce(structure: &Structure, rows: &Rows) -> (Reduced, Vec<usize>) {
+    let n = rows.target.len();
+    let free: Vec<usize> = (0..rows.terms.len()).filter(|&c| structure.has_coefficient(rows.terms[c])).collect();
+    let mut target = rows.target.clone();
+    for c in (0..rows.terms.len()).filter(|c| !free.contains(c)) {
+        target.iter_mut().zip(&rows.columns[c]).for_each(|(t, v)| *t -= v);
+    }
+    let k = free.len();
+    let mut a = Vec::with_capacity(n * (k + 1));
+    for &c in &free {
+        a.extend_from_slice(&rows.columns[c]);
+    }
+    a.extend_from_slice(&target);
+    let t = qr::triangle(&mut a, n, k + 1);
+    let stride = k + 1;
+    let mut r = vec![0.0; k * k];
+    for i in 0..k {
+        r[i * k..(i + 1) * k].copy_from_slice(&t[i * stride..i * stride + k]);
+    }
+    let z = (0..k).map(|i| t[i * stride + k]).collect();
+    // Rows of overlapping windows share their noise: a window's worth of them counts as one. The same
+    // factor in sum and count leaves the mean square as it is.
+    let share = rows.independent / n as f64;
+    let rest = t[k * stride + k].powi(2) * share;
+    let root = share.sqrt();
+    let reduced = Reduced {
+        columns: k,
+        r: r.iter().map(|v| v * root).collect(),
+        z: z_scaled(z, root),
+        rest,
+        samples: rows.independent.max(k as f64 + 2.0),
+        floor: 1e-10 * target.iter().map(|v| v * v).sum::<f64>() / n.max(1) as f64,
+    };
+    (reduced, free.into_iter().map(|c| rows.terms[c]).collect())
+}
+
+fn z_scaled(z: Vec<f64>, factor: f64) -> Vec<f64> {
+    z.into_iter().map(|v| v * factor).collect()
+}
+
+/// Length of a typical oscillation, s: twice the mean time between crossings of the mean, the shortest
+/// over the channels.
+pub(crate) fn period(data: &Data) -> f64 {
+    (0..data.channels.len())
+        .map(|c| {
+            let (mut crossings, mut duration) = (0usize, 0.0);
+            for piece in &data.pieces {
+                let y = &piece.smooth[c].value;
+                let mean = y.iter().sum::<f64>() / y.len() as f64;
+                let band = 0.1 * data.spread[c];
+                let mut side = 0i8;
+                for v in y {
+                    let now = if v - mean > band { 1 } else if v - mean < -band { -1 } else { side };
+                    crossings += usize::from(side != 0 && now != side);
+                    side = now;
+                }
+                duration += piece.len as f64 * piece.dt;
+            }
+            2.0 * duration / crossings.max(2) as f64
+        })
+        .fold(f64::INFINITY, f64::min)
+}
