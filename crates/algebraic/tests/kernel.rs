@@ -154,3 +154,22 @@ fn what_cannot_be_is_refused_with_its_reason() {
         AlgebraicError::InitialConditions { order: 3, s_derivatives: 2 }.to_string().contains("first sample")
     );
 }
+
+#[test]
+fn a_symmetric_kernel_has_symmetric_weights() {
+    // τ²(T−τ)² read backwards is itself; so the stencil of the cubics must be centred.
+    let kernel = Kernel::new(2, 3, 20, 0.1).unwrap();
+    for hold in [Hold::Linear, Hold::Smooth] {
+        for order in 0..=2 {
+            let weights = kernel.weights(order, hold).unwrap();
+            let v = weights.values();
+            let mirror = if order == 1 { -1.0 } else { 1.0 };
+            for i in 0..=20 {
+                assert!(
+                    (v[i] - mirror * v[20 - i]).abs() < 1e-13 * weights.gain(),
+                    "{hold:?} n {order} i {i}"
+                );
+            }
+        }
+    }
+}
