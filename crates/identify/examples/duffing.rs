@@ -1,19 +1,15 @@
 //! Prototype over seeds.
 #![allow(missing_docs, clippy::print_stdout, clippy::unwrap_used)]
-use greybox_calibrate::Data;
-use greybox_identify::output_error::{State, refine};
-use greybox_identify::structure::*;
-use greybox_model::Hold;
+use greybox_identify::{Library, Monomials, Options, Quiet, identify};
 use greybox_recording::{Channel, Recording};
 use rand::SeedableRng;
 use rand_distr::{Distribution, Normal};
-use std::sync::Arc;
 
 fn main() {
     let a: Vec<f64> = std::env::args().skip(1).map(|v| v.parse().unwrap()).collect();
     let (dt, sigma, t, seeds, first) = (a[0], a[1], a[2], a[3] as u64, a[4] as u64);
     let truth = ["x''", "x", "x^3", "x'", "x^2*x'", "x'^3"];
-    let mut exact = 0;
+    let (mut exact, mut covered, mut tested) = (0, 0, 0);
     let begin = std::time::Instant::now();
     for seed in first..first + seeds {
         let mut rng = rand_pcg::Pcg64Mcg::seed_from_u64(seed);
@@ -44,27 +40,18 @@ fn main() {
             Channel { name: "f".into(), unit: None, values: f },
             Channel { name: "x".into(), unit: None, values: y },
         ]).unwrap();
-        let mut terms = vec![Term { equation: 0, expression: "x''".into(), parameter: "m".into(), powers: vec![], order: 1, even: false, optional: false }];
-        for total in 0..=3u32 { for j in 0..=total { let i = total - j;
-            let mut e = Vec::new();
-            if i > 0 { e.push(if i == 1 { "x".to_string() } else { format!("x^{i}") }); }
-            if j > 0 { e.push(if j == 1 { "x'".to_string() } else { format!("x'^{j}") }); }
-            let expression = if e.is_empty() { "1".to_string() } else { e.join("*") };
-            terms.push(Term { equation: 0, expression, parameter: format!("g{i}{j}"), powers: vec![], order: total as usize, even: total % 2 == 0, optional: true });
-        } }
-        let structure = Structure { title: "d".into(), inputs: vec![(Signal { name: "f".into(), unit: None }, Hold::Linear)], states: vec![Signal { name: "x".into(), unit: None }], equations: vec![Equation { name: "eq".into(), input: Some("f".into()) }], terms, extras: vec![] };
-        let all = vec![true; structure.terms.len()];
-        let zero: Vec<f64> = structure.terms.iter().map(|t| match t.expression.as_str() { "x''" => 1.5, "x" => 4.0, "x'" => 2.0, "x'^3" => 0.5, _ => 0.0 }).collect();
-        let active: Vec<bool> = zero.iter().map(|v| *v != 0.0).collect();
-        let model = structure.model(&all, &zero, &[]).unwrap();
-        let data = Arc::new(Data::new(&model, std::slice::from_ref(&recording)).unwrap());
+        let options = Options { library: Library { monomials: Monomials::TotalDegree, constant: true, ..Library::default() }, order: 3, hold: Some(greybox_model::Hold::Linear), ..Options::new(&["x"], &["f"]) };
         let go = std::time::Instant::now();
-        let refined = refine(&structure, &data, State { active, values: zero, extras: vec![] }, &all).unwrap();
-        let names: Vec<String> = structure.terms.iter().enumerate().filter(|(i, _)| refined.state.active[*i]).map(|(i, t)| format!("{:.5} {}", refined.state.values[i], t.expression)).collect();
-        let set: Vec<&str> = structure.terms.iter().enumerate().filter(|(i, _)| refined.state.active[*i]).map(|(_, t)| t.expression.as_str()).collect();
+        let found = identify(std::slice::from_ref(&recording), std::slice::from_ref(&recording), &options, &Quiet).unwrap();
+        let e = &found.equations[0];
+        let names: Vec<String> = e.terms.iter().map(|t| format!("{:.5} {}", t.value, t.expression)).collect();
+        let set: Vec<&str> = e.terms.iter().map(|t| t.expression.as_str()).collect();
+        let right = [2.0, 6.0, 0.1, 1.0, 0.2, 1.0];
+        for (t, r) in truth.iter().zip(right) { if let Some(f) = e.terms.iter().find(|f| f.expression == *t) { let (a, b) = f.ci95.unwrap(); covered += usize::from(a <= r && r <= b); tested += 1; } }
         let ok = set.len() == truth.len() && truth.iter().all(|t| set.contains(t));
         exact += usize::from(ok);
-        println!("{seed} {ok} rounds {} method {:?} sigma {:.6} {:.2}s  {}", refined.rounds, refined.setup.method, refined.scale[0], go.elapsed().as_secs_f64(), names.join("  "));
+        let doubt: Vec<String> = e.doubtful.iter().map(|d| format!("{} {:.2}", d.expression, d.inclusion)).collect();
+        println!("{seed} {ok} rounds {} segments {} {:.2}s  {} | {}", found.rounds, found.segments, go.elapsed().as_secs_f64(), names.join("  "), doubt.join(", "));
     }
-    println!("{exact}/{seeds} in {:.1}s", begin.elapsed().as_secs_f64());
+    println!("{exact}/{seeds} in {:.1}s; intervals {covered}/{tested}", begin.elapsed().as_secs_f64());
 }

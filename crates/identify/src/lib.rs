@@ -1,4 +1,16 @@
 //! Governing equations from recordings alone.
-pub mod choose;
-pub mod output_error;
-pub mod structure;
+mod choose;
+mod error;
+mod identify;
+mod library;
+mod output_error;
+mod precision;
+mod structure;
+mod weak;
+
+pub use error::IdentifyError;
+pub use identify::{
+    DelayedState, DoubtfulTerm, FoundDelay, FoundEquation, FoundTerm, HoldoutSource, Identification, Observer,
+    Options, OrderChoice, Quiet, Role, identify,
+};
+pub use library::{Library, Monomials};

@@ -10,6 +10,7 @@
 use std::sync::Arc;
 
 use greybox_calibrate::{Data, Fit, Free, Level, Limits, Point, Setup, qr};
+use rayon::prelude::*;
 
 use crate::choose::Reduced;
 use crate::structure::Structure;
@@ -62,8 +63,10 @@ fn setup(structure: &Structure, data: &Arc<Data>, state: &State, base: Option<&S
             Free { index, mean: p.value, std: f64::INFINITY, lower, upper }
         })
         .collect();
+    let holds: Vec<greybox_model::Hold> = model.inputs.iter().map(|i| i.hold).collect();
     match base {
-        Some(base) => base.with_model(model, free).ok(),
+        Some(base) if base.holds == holds => base.with_model(model, free).ok(),
+        Some(base) => base.with_holds(holds).with_model(model, free).ok(),
         None => Setup::new(&model, data.clone(), free).ok(),
     }
 }
@@ -82,39 +85,130 @@ fn read_back(structure: &Structure, state: &mut State, setup: &Setup, fit: &Fit)
     }
 }
 
-/// The regression of the output on all candidates around the fitted model.
-struct Linearised {
-    reduced: Reduced,
-    /// Column of each candidate (None: it has no coefficient).
-    column: Vec<Option<usize>>,
-    extras: Vec<usize>,
+/// The regression of the output on all candidates around a fitted model.
+pub(crate) struct Linearised {
+    /// The regression.
+    pub reduced: Reduced,
+    /// Column of each candidate (none: it has no coefficient, or is not allowed).
+    pub column: Vec<Option<usize>>,
+    /// Columns of the extras' parameters.
+    pub extras: Vec<usize>,
+    /// Gram matrices of [J | z] over blocks of consecutive rows, `columns + 1` squared.
+    pub blocks: Vec<Vec<f64>>,
 }
 
-fn linearise(
+impl Linearised {
+    /// Columns that always stay, that are optional, and that are even.
+    pub(crate) fn roles(&self, structure: &Structure, allowed: &[bool]) -> (Vec<usize>, Vec<usize>, Vec<usize>) {
+        let pick = |wanted: &dyn Fn(usize) -> bool| -> Vec<usize> {
+            (0..structure.terms.len()).filter(|&i| wanted(i)).filter_map(|i| self.column[i]).collect()
+        };
+        let mut kept = pick(&|i| !structure.terms[i].optional);
+        kept.extend(&self.extras);
+        let optional = pick(&|i| structure.terms[i].optional && allowed[i]);
+        let even = pick(&|i| structure.terms[i].even);
+        (kept, optional, even)
+    }
+
+    /// The regression on blocks drawn with replacement.
+    pub(crate) fn resampled(&self, drawn: &[usize]) -> Reduced {
+        let p = self.reduced.columns;
+        let mut gram = vec![0.0; (p + 1) * (p + 1)];
+        for &b in drawn {
+            gram.iter_mut().zip(&self.blocks[b]).for_each(|(g, v)| *g += v);
+        }
+        let r = cholesky(&gram, p + 1);
+        let triangle = |i: usize, j: usize| r[i * (p + 1) + j];
+        Reduced {
+            r: (0..p * p).map(|k| triangle(k / p, k % p)).collect(),
+            z: (0..p).map(|i| triangle(i, p)).collect(),
+            rest: triangle(p, p).powi(2),
+            ..self.reduced.clone()
+        }
+    }
+}
+
+/// Upper triangular Cholesky factor of a symmetric positive semidefinite matrix, scaled to a unit diagonal
+/// first; a dependent column gets a zero row.
+fn cholesky(a: &[f64], n: usize) -> Vec<f64> {
+    let scale: Vec<f64> = (0..n).map(|i| a[i * n + i].max(0.0).sqrt()).collect();
+    let mut r = vec![0.0; n * n];
+    for i in 0..n {
+        if scale[i] == 0.0 {
+            continue;
+        }
+        for j in i..n {
+            if scale[j] == 0.0 {
+                continue;
+            }
+            let mut v = a[i * n + j] / (scale[i] * scale[j]);
+            for k in 0..i {
+                v -= r[k * n + i] * r[k * n + j];
+            }
+            if i == j {
+                r[i * n + i] = if v > 1e-13 { v.sqrt() } else { 0.0 };
+            } else if r[i * n + i] > 0.0 {
+                r[i * n + j] = v / r[i * n + i];
+            }
+        }
+    }
+    for i in 0..n {
+        for j in i..n {
+            r[i * n + j] *= scale[j];
+        }
+    }
+    r
+}
+
+/// One segment with what its start can absorb projected off.
+struct Projected {
+    rows: usize,
+    j: Vec<f64>,
+    z: Vec<f64>,
+}
+
+/// Linearises around `refined` with all candidates in `allowed`; `blocks` asks for about as many block Grams.
+pub(crate) fn linearise(
     structure: &Structure,
-    data: &Arc<Data>,
     refined: &Refined,
     allowed: &[bool],
+    blocks: usize,
 ) -> Option<Linearised> {
-    let wide_state = State {
-        active: refined.state.active.iter().zip(allowed).map(|(a, b)| *a || *b).collect(),
-        ..refined.state.clone()
-    };
-    let wide = setup(structure, data, &wide_state, Some(&refined.setup))?;
+    let active = refined.state.active.iter().zip(allowed).map(|(a, b)| *a || *b).collect();
+    let wide = setup(structure, &refined.setup.data, &State { active, ..refined.state.clone() }, Some(&refined.setup))?;
     let point = Point { parameters: wide.values(), starts: refined.fit.point.starts.clone() };
     let rows = wide.with_problem(&refined.level, &refined.scale, |p| p.rows(&point, true, None));
-    let (nx, np) = (wide.system.nx, wide.free.len());
-    let width = nx + np + 1;
+    let np = wide.free.len();
+    let theta: Vec<f64> = wide.free.iter().map(|f| point.parameters[f.index]).collect();
+    let projected: Vec<Projected> = rows
+        .into_par_iter()
+        .map(|s| {
+            let mut q = s.jx;
+            let nx = q.len() / s.rows;
+            qr::orthonormalise(&mut q, s.rows, nx);
+            let mut j = s.jp;
+            for column in j.chunks_exact_mut(s.rows) {
+                qr::project_off(&q, s.rows, column);
+            }
+            let mut z = s.r;
+            qr::project_off(&q, s.rows, &mut z);
+            for (column, theta) in j.chunks_exact(s.rows).zip(&theta) {
+                z.iter_mut().zip(column).for_each(|(z, v)| *z += theta * v);
+            }
+            Projected { rows: s.rows, j, z }
+        })
+        .collect();
+    if projected.iter().any(|s| s.z.iter().chain(&s.j).any(|v| !v.is_finite())) {
+        return None;
+    }
     let stride = np + 1;
-    use rayon::prelude::*;
-    let triangles: Vec<Vec<f64>> = rows
+    let triangles: Vec<Vec<f64>> = projected
         .par_iter()
         .map(|s| {
-            let mut a = Vec::with_capacity(width * s.rows);
-            a.extend_from_slice(&s.jx);
-            a.extend_from_slice(&s.jp);
-            a.extend_from_slice(&s.r);
-            qr::triangle(&mut a, s.rows, width)
+            let mut a = Vec::with_capacity(stride * s.rows);
+            a.extend_from_slice(&s.j);
+            a.extend_from_slice(&s.z);
+            qr::triangle(&mut a, s.rows, stride)
         })
         .collect();
     let m = triangles.len() * stride;
@@ -122,26 +216,23 @@ fn linearise(
     for (s, t) in triangles.iter().enumerate() {
         for i in 0..stride {
             for j in i..stride {
-                a[j * m + s * stride + i] = t[(nx + i) * width + nx + j];
+                a[j * m + s * stride + i] = t[i * stride + j];
             }
         }
     }
     let t = qr::triangle(&mut a, m, stride);
-    let mut r = vec![0.0; np * np];
-    for i in 0..np {
-        r[i * np..(i + 1) * np].copy_from_slice(&t[i * stride..i * stride + np]);
-    }
-    let theta: Vec<f64> = wide.free.iter().map(|f| point.parameters[f.index]).collect();
-    let z: Vec<f64> = (0..np)
-        .map(|i| t[i * stride + np] + (i..np).map(|j| r[i * np + j] * theta[j]).sum::<f64>())
+    let r: Vec<f64> = (0..np * np).map(|k| t[(k / np) * stride + k % np]).collect();
+    let z: Vec<f64> = (0..np).map(|i| t[i * stride + np]).collect();
+    let of = |name: &str| wide.model.parameter(name).and_then(|i| wide.free.iter().position(|f| f.index == i));
+    let column = structure
+        .terms
+        .iter()
+        .enumerate()
+        .map(|(i, t)| if allowed[i] || refined.state.active[i] { of(&t.parameter) } else { None })
         .collect();
-    let corner = t[np * stride + np];
-    let of = |name: &str| {
-        wide.model.parameter(name).and_then(|i| wide.free.iter().position(|f| f.index == i))
-    };
-    let column = structure.terms.iter().map(|t| of(&t.parameter)).collect();
     let extras = structure.extras.iter().flat_map(|e| &e.parameters).filter_map(|p| of(&p.0)).collect();
     let count: usize = refined.fit.count.iter().sum();
+    let data = &refined.setup.data;
     let floor = data
         .spread
         .iter()
@@ -149,113 +240,208 @@ fn linearise(
         .map(|(spread, scale)| (NUMERICAL * spread / scale).powi(2))
         .sum::<f64>()
         / data.spread.len() as f64;
-    let samples = count as f64;
-    Some(Linearised {
-        reduced: Reduced { columns: np, r, z, rest: corner * corner, samples, floor },
-        column,
-        extras,
-    })
+    let mut reduced =
+        Reduced { columns: np, r, z, rest: t[np * stride + np].powi(2), samples: count as f64, floor };
+    // Correlated residuals: as many rows as are independent.
+    let all: Vec<usize> = (0..np).collect();
+    let best = reduced.solve(&all).values;
+    let kappa = correlation_time(&projected, &best, refined, wide.system.ny);
+    let share = 1.0 / kappa;
+    reduced.r.iter_mut().chain(&mut reduced.z).for_each(|v| *v *= share.sqrt());
+    reduced.rest *= share;
+    reduced.samples *= share;
+    let blocks = if blocks > 0 { block_grams(&projected, np, share, blocks) } else { Vec::new() };
+    Some(Linearised { reduced, column, extras, blocks })
 }
 
-fn fit_at(
-    refined: &mut Refined,
-    structure: &Structure,
-    to: Level,
-    limits: Limits,
-) {
-    let start = refined.setup.stitch(&refined.level, &refined.fit.point, &to, &refined.scale);
-    let fit = refined.setup.with_problem(&to, &refined.scale, |p| p.fit(start, limits));
-    refined.level = to;
-    refined.fit = fit;
-    rescale(refined);
-    let setup = refined.setup.clone();
-    let fit = refined.fit.clone();
-    read_back(structure, &mut refined.state, &setup, &fit);
-}
-
-fn rescale(refined: &mut Refined) {
-    for c in 0..refined.scale.len() {
-        let rms = (refined.fit.rss[c] / refined.fit.count[c].max(1) as f64).sqrt() * refined.scale[c];
-        let least = 1e-9 * refined.setup.data.spread[c];
-        refined.scale[c] = rms.max(least).max(f64::MIN_POSITIVE);
-    }
-}
-
-/// Numbers of segments of the successive levels.
-const LEVELS: [usize; 3] = [60, 15, 4];
-
-/// Refines `start` on `data`, choosing among the candidates in `allowed`.
-pub fn refine(structure: &Structure, data: &Arc<Data>, start: State, allowed: &[bool]) -> Option<Refined> {
-    let setup0 = setup(structure, data, &start, None)?;
-    let level = setup0.level(LEVELS[0]);
-    let scale: Vec<f64> = data.sigma.iter().zip(&data.spread).map(|(s, d)| s.max(1e-6 * d)).collect();
-    let point = Point { parameters: setup0.values(), starts: setup0.starts(&level, &setup0.values()) };
-    let limits = Limits { iterations: 15, tolerance: 1e-4 };
-    let fit = setup0.with_problem(&level, &scale, |p| p.fit(point, limits));
-    let mut refined = Refined { state: start, setup: setup0, level, fit, scale, rounds: 0 };
-    rescale(&mut refined);
-    {
-        let (s, f) = (refined.setup.clone(), refined.fit.clone());
-        read_back(structure, &mut refined.state, &s, &f);
-    }
-    for count in LEVELS.into_iter().chain([1]) {
-        let level = refined.setup.level(count);
-        if level.segments != refined.level.segments {
-            fit_at(&mut refined, structure, level, Limits { iterations: 20, tolerance: 1e-5 });
-        }
-        let mut seen: Vec<Vec<bool>> = Vec::new();
-        for _ in 0..6 {
-            let linear = linearise(structure, data, &refined, allowed)?;
-            let kept: Vec<usize> = structure
-                .terms
-                .iter()
-                .zip(&linear.column)
-                .filter(|(t, _)| !t.optional)
-                .filter_map(|(_, c)| *c)
-                .chain(linear.extras.iter().copied())
-                .collect();
-            let optional: Vec<usize> = structure
-                .terms
-                .iter()
-                .zip(&linear.column)
-                .zip(allowed)
-                .filter(|((t, _), ok)| t.optional && **ok)
-                .filter_map(|((_, c), _)| *c)
-                .collect();
-            let even: Vec<usize> =
-                structure.terms.iter().zip(&linear.column).filter(|(t, _)| t.even).filter_map(|(_, c)| *c).collect();
-            let solution = linear.reduced.choose(&kept, &optional, &even);
-            let mut state = refined.state.clone();
-            for (i, term) in structure.terms.iter().enumerate() {
-                if term.optional {
-                    state.active[i] = linear.column[i].is_some_and(|c| solution.columns.contains(&c));
+/// 1 + 2 Σ ρ of the residual with all candidates, summed over lags while ρ is beyond chance.
+fn correlation_time(projected: &[Projected], theta: &[f64], refined: &Refined, ny: usize) -> f64 {
+    const LONGEST: usize = 400;
+    let residuals: Vec<Vec<f64>> = projected
+        .par_iter()
+        .map(|s| {
+            let mut e = s.z.clone();
+            for (column, theta) in s.j.chunks_exact(s.rows).zip(theta) {
+                e.iter_mut().zip(column).for_each(|(e, v)| *e -= theta * v);
+            }
+            e
+        })
+        .collect();
+    (0..ny)
+        .map(|c| {
+            let sum = |lag: usize| -> (f64, usize) {
+                residuals.iter().zip(&refined.level.segments).fold((0.0, 0), |(sum, n), (e, segment)| {
+                    let m = segment.range.len();
+                    let e = &e[c * m..(c + 1) * m];
+                    if lag < m { (sum + qr::dot(&e[lag..], &e[..m - lag]), n + m - lag) } else { (sum, n) }
+                })
+            };
+            let (zero, n) = sum(0);
+            if zero <= 0.0 {
+                return 1.0;
+            }
+            let chance = 2.5 / (n as f64).sqrt();
+            let mut time = 1.0;
+            for lag in 1..LONGEST {
+                let rho = sum(lag).0 / zero;
+                if rho < chance {
+                    break;
                 }
+                time += 2.0 * rho;
             }
-            if state.active == refined.state.active || seen.contains(&state.active) {
-                break;
-            }
-            seen.push(refined.state.active.clone());
-            for (i, c) in linear.column.iter().enumerate() {
-                let at = c.and_then(|c| solution.columns.iter().position(|s| *s == c));
-                if let Some(at) = at {
-                    // New terms start where the regression puts them, old ones where they are.
-                    if !refined.state.active[i] {
-                        state.values[i] = solution.values[at];
+            time
+        })
+        .fold(1.0, f64::max)
+}
+
+fn block_grams(projected: &[Projected], np: usize, share: f64, blocks: usize) -> Vec<Vec<f64>> {
+    let total: usize = projected.iter().map(|s| s.rows).sum();
+    let length = total.div_ceil(blocks).max(1);
+    projected
+        .par_iter()
+        .flat_map_iter(|s| {
+            (0..s.rows).step_by(length).map(move |from| {
+                let to = (from + length).min(s.rows);
+                let column = |c: usize| -> &[f64] {
+                    if c < np { &s.j[c * s.rows + from..c * s.rows + to] } else { &s.z[from..to] }
+                };
+                let mut gram = vec![0.0; (np + 1) * (np + 1)];
+                for i in 0..=np {
+                    for j in i..=np {
+                        let v = share * qr::dot(column(i), column(j));
+                        gram[i * (np + 1) + j] = v;
+                        gram[j * (np + 1) + i] = v;
                     }
                 }
+                gram
+            })
+        })
+        .collect()
+}
+
+impl Refined {
+    /// −2 ln likelihood with Schwarz's price for every parameter; smaller is better.
+    pub fn score(&self) -> f64 {
+        let data = &self.setup.data;
+        let total: f64 = self.fit.count.iter().sum::<usize>() as f64;
+        let fit: f64 = (0..self.fit.rss.len())
+            .map(|c| {
+                let n = self.fit.count[c].max(1) as f64;
+                let floor = (NUMERICAL * data.spread[c]).powi(2);
+                n * (self.scale[c].powi(2) + floor).ln()
+            })
+            .sum();
+        fit + self.setup.free.len() as f64 * total.max(2.0).ln()
+    }
+
+    fn after(mut self, structure: &Structure) -> Refined {
+        for c in 0..self.scale.len() {
+            let rms = (self.fit.rss[c] / self.fit.count[c].max(1) as f64).sqrt() * self.scale[c];
+            self.scale[c] = rms.max(1e-9 * self.setup.data.spread[c]).max(f64::MIN_POSITIVE);
+        }
+        let (setup, fit) = (self.setup.clone(), self.fit.clone());
+        read_back(structure, &mut self.state, &setup, &fit);
+        self
+    }
+
+    /// Whether a channel's residual has grown beyond `factor` times what it was in `before`.
+    fn worse(&self, before: &Refined, factor: f64) -> bool {
+        let data = &self.setup.data;
+        self.scale
+            .iter()
+            .zip(&before.scale)
+            .zip(&data.spread)
+            .any(|((now, then), spread)| !(*now <= factor * then.max(NUMERICAL * spread)))
+    }
+}
+
+/// Numbers of segments of the successive levels; a delay's history must not be cut, so that a model with
+/// one starts with whole records.
+const LEVELS: [usize; 4] = [60, 15, 4, 1];
+
+fn levels(structure: &Structure) -> &'static [usize] {
+    if structure.extras.is_empty() { &LEVELS } else { &LEVELS[3..] }
+}
+
+/// A first fit of `start` on short segments.
+pub fn begin(structure: &Structure, data: &Arc<Data>, start: State) -> Option<Refined> {
+    let setup = setup(structure, data, &start, None)?;
+    let level = setup.level(levels(structure)[0]);
+    let scale: Vec<f64> = data.sigma.iter().zip(&data.spread).map(|(s, d)| s.max(1e-6 * d)).collect();
+    let point = Point { parameters: setup.values(), starts: setup.starts(&level, &setup.values()) };
+    let limits = Limits { iterations: 15, tolerance: 1e-4 };
+    let fit = setup.with_problem(&level, &scale, |p| p.fit(point, limits));
+    fit.cost.is_finite().then(|| Refined { state: start, setup, level, fit, scale, rounds: 0 }.after(structure))
+}
+
+/// The same terms fitted again under another structure (other holds).
+pub fn refit(structure: &Structure, refined: &Refined) -> Option<Refined> {
+    let next = setup(structure, &refined.setup.data, &refined.state, Some(&refined.setup))?;
+    let point = Point { parameters: next.values(), starts: refined.fit.point.starts.clone() };
+    let fit = next.with_problem(&refined.level, &refined.scale, |p| {
+        p.fit(point, Limits { iterations: 20, tolerance: 1e-7 })
+    });
+    fit.cost.is_finite().then(|| Refined { setup: next, fit, ..refined.clone() }.after(structure))
+}
+
+fn fit_at(refined: &Refined, structure: &Structure, to: Level, limits: Limits) -> Refined {
+    let start = refined.setup.stitch(&refined.level, &refined.fit.point, &to, &refined.scale);
+    let fit = refined.setup.with_problem(&to, &refined.scale, |p| p.fit(start, limits));
+    Refined { level: to, fit, ..refined.clone() }.after(structure)
+}
+
+/// One round: linearise, choose, refit. None where the choice stays as it is or the new fit fails.
+fn round(structure: &Structure, refined: &Refined, allowed: &[bool], seen: &[Vec<bool>]) -> Option<Refined> {
+    let linear = linearise(structure, refined, allowed, 0)?;
+    let (kept, optional, even) = linear.roles(structure, allowed);
+    let solution = linear.reduced.choose(&kept, &optional, &even);
+    let mut state = refined.state.clone();
+    for (i, term) in structure.terms.iter().enumerate() {
+        if !term.optional {
+            continue;
+        }
+        let at = linear.column[i].and_then(|c| solution.columns.iter().position(|s| *s == c));
+        // New terms start where the regression puts them, old ones where they are.
+        if let Some(at) = at
+            && !state.active[i]
+        {
+            state.values[i] = solution.values[at];
+        }
+        state.active[i] = at.is_some();
+    }
+    if state.active == refined.state.active || seen.contains(&state.active) {
+        return None;
+    }
+    let next = setup(structure, &refined.setup.data, &state, Some(&refined.setup))?;
+    let point = Point { parameters: next.values(), starts: refined.fit.point.starts.clone() };
+    let limits = Limits { iterations: 20, tolerance: 1e-6 };
+    let fit = next.with_problem(&refined.level, &refined.scale, |p| p.fit(point, limits));
+    if !fit.cost.is_finite() {
+        return None;
+    }
+    Some(Refined { state, setup: next, fit, rounds: refined.rounds + 1, ..refined.clone() }.after(structure))
+}
+
+/// Refines a first fit, choosing among the candidates in `allowed`; segments grow until they are whole
+/// records, or as long as a fit still follows.
+pub fn refine(structure: &Structure, begun: Refined, allowed: &[bool]) -> Refined {
+    let mut refined = begun;
+    for &count in levels(structure) {
+        let level = refined.setup.level(count);
+        if level.segments != refined.level.segments {
+            let longer = fit_at(&refined, structure, level, Limits { iterations: 25, tolerance: 1e-5 });
+            if longer.worse(&refined, 1.5) {
+                break;
             }
-            let next = setup(structure, data, &state, Some(&refined.setup))?;
-            let point = Point { parameters: next.values(), starts: refined.fit.point.starts.clone() };
-            let fit = next.with_problem(&refined.level, &refined.scale, |p| {
-                p.fit(point, Limits { iterations: 20, tolerance: 1e-6 })
-            });
-            refined = Refined { state, setup: next, fit, rounds: refined.rounds + 1, ..refined };
-            rescale(&mut refined);
-            let (s, f) = (refined.setup.clone(), refined.fit.clone());
-            read_back(structure, &mut refined.state, &s, &f);
+            refined = longer;
+        }
+        let mut seen = vec![refined.state.active.clone()];
+        for _ in 0..6 {
+            let Some(next) = round(structure, &refined, allowed, &seen) else { break };
+            seen.push(next.state.active.clone());
+            refined = next;
         }
     }
     let level = refined.level.clone();
-    fit_at(&mut refined, structure, level, Limits { iterations: 30, tolerance: 1e-9 });
-    Some(refined)
+    fit_at(&refined, structure, level, Limits { iterations: 30, tolerance: 1e-9 })
 }

@@ -55,7 +55,7 @@ pub(crate) fn evaluate(structure: &Structure, model: &Model, data: &Data, hats: 
             greybox_model::parse(text).ok().map(|p| p.expr)
         })
         .collect::<Option<_>>()?;
-    let kinds = vec![LeafKind::State; nx + model.inputs.len()];
+    let kinds = vec![LeafKind::Input; nx + model.inputs.len()];
     let tape = Tape::compile(&exprs, kinds, &resolve).ok()?;
     data.pieces
         .iter()

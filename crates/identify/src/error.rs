@@ -1,0 +1,95 @@
+//! Why an identification could not be done.
+
+use greybox_calibrate::DataError;
+use greybox_model::ModelError;
+
+/// What is wrong with a request or its recordings.
+#[derive(Debug, thiserror::Error)]
+#[non_exhaustive]
+pub enum IdentifyError {
+    /// No state was named.
+    #[error("no state is named: say which channels are the coordinates of the machine")]
+    NoStates,
+    /// A name stands twice.
+    #[error("channel `{name}` is named twice, as {first} and as {second}: each channel has one role")]
+    Twice {
+        /// The channel.
+        name: String,
+        /// Its first role.
+        first: &'static str,
+        /// Its second role.
+        second: &'static str,
+    },
+    /// A channel's name cannot be used in an equation.
+    #[error("channel `{name}` cannot be a name in an equation: {reason}; rename it in the recording's header")]
+    Name {
+        /// The channel.
+        name: String,
+        /// What the model language says.
+        reason: String,
+    },
+    /// A term of the user that the model language does not understand.
+    #[error("term `{term}`: {reason}")]
+    Term {
+        /// As given.
+        term: String,
+        /// What is wrong.
+        reason: String,
+    },
+    /// A term without a state or input in it.
+    #[error("term `{term}` has neither a state nor an input in it; --library constant adds a constant force")]
+    ConstantTerm {
+        /// As given.
+        term: String,
+    },
+    /// A setting outside its range.
+    #[error("{what} is {found}, but must lie in {range}")]
+    Range {
+        /// The setting.
+        what: &'static str,
+        /// Its value.
+        found: f64,
+        /// Admissible values.
+        range: &'static str,
+    },
+    /// More inputs than equations can be told apart by.
+    #[error("an input must be named for a delayed state: without one the gain of the feedback sets no scale")]
+    DelayWithoutInput,
+    /// The delayed state is none of the states.
+    #[error("the delayed state `{name}` is not among the states {states}")]
+    DelayedState {
+        /// As given.
+        name: String,
+        /// The states.
+        states: String,
+    },
+    /// The library is larger than the data can carry.
+    #[error("{candidates} candidate terms on {samples} samples: too many; lower the order or record longer")]
+    TooManyTerms {
+        /// Number of candidates.
+        candidates: usize,
+        /// Number of samples.
+        samples: usize,
+    },
+    /// A coordinate that does not move.
+    #[error("channel `{name}` does not move: nothing can be learnt about it; excite the machine")]
+    Still {
+        /// The channel.
+        name: String,
+    },
+    /// The recordings are too short for one window of the weak form.
+    #[error("the longest gap-free stretch has {samples} samples: too few for a first estimate of the equation")]
+    TooShort {
+        /// Its length.
+        samples: usize,
+    },
+    /// No model could be fitted.
+    #[error("no equation of this library follows the recordings: every fit diverged; try another library or a lower order")]
+    NoFit,
+    /// The recordings do not fit the model that the request describes.
+    #[error(transparent)]
+    Data(#[from] DataError),
+    /// The model language refuses what the request describes.
+    #[error(transparent)]
+    Model(#[from] ModelError),
+}

@@ -1,0 +1,580 @@
+//! From recordings to the governing equations.
+
+use std::sync::Arc;
+
+use greybox_calibrate::{Data, FreeRun, Hats, Score, Setup, window_length};
+use greybox_model::{Hold, Model};
+use greybox_recording::Recording;
+
+use crate::error::IdentifyError;
+use crate::library::{Library, Setting, derivative};
+use crate::output_error::{self, Refined, State};
+use crate::precision::{self, Precision};
+use crate::structure::{Equation, Extra, Signal, Structure};
+use crate::weak;
+
+/// What to identify.
+#[derive(Debug, Clone, PartialEq)]
+pub struct Options {
+    /// Channels that are the coordinates; one equation each.
+    pub states: Vec<String>,
+    /// Channels that drive the machine. With one input, every equation has it on the right with factor one; the
+    /// others enter as terms. Without any, the leading coefficients are one.
+    pub inputs: Vec<String>,
+    /// Order of the leading derivative: 2 for mechanics (q̈), 1 for first-order systems.
+    pub derivatives: usize,
+    /// The candidate terms.
+    pub library: Library,
+    /// Orders of the library to search, from 1 to this.
+    pub order: usize,
+    /// What the inputs do between samples; none: found from the recordings.
+    pub hold: Option<Hold>,
+    /// A delayed feedback of a state.
+    pub delay: Option<DelayedState>,
+    /// Replicates of the block bootstrap behind the inclusion probabilities.
+    pub replicates: usize,
+    /// Seed of the bootstrap.
+    pub seed: u64,
+}
+
+impl Options {
+    /// The usual request: second order, polynomials up to order 6 for one state, up to 4 for several.
+    pub fn new(states: &[&str], inputs: &[&str]) -> Options {
+        use crate::library::Monomials;
+        let several = states.len() > 1;
+        let monomials = if several { Monomials::Separate } else { Monomials::Tensor };
+        Options {
+            states: states.iter().map(|s| (*s).to_string()).collect(),
+            inputs: inputs.iter().map(|s| (*s).to_string()).collect(),
+            derivatives: 2,
+            library: Library { monomials, ..Library::default() },
+            order: if several { 4 } else { 6 },
+            hold: None,
+            delay: None,
+            replicates: 100,
+            seed: 0,
+        }
+    }
+}
+
+/// A feedback k_p q(t − τ) on the left side of the equation of the state q.
+#[derive(Debug, Clone, PartialEq)]
+pub struct DelayedState {
+    /// The state.
+    pub state: String,
+    /// The gain k_p where it is known.
+    pub gain: Option<f64>,
+    /// Longest delay looked for, s.
+    pub longest: f64,
+}
+
+/// A chosen term.
+#[derive(Debug, Clone, PartialEq)]
+pub struct FoundTerm {
+    /// The term, without its coefficient.
+    pub expression: String,
+    /// Name of its coefficient in the model.
+    pub parameter: String,
+    /// Exponents of the variables, for a monomial.
+    pub powers: Vec<(String, u32)>,
+    /// The coefficient.
+    pub value: f64,
+    /// Its 95 % interval; none for a coefficient that sets the scale.
+    pub ci95: Option<(f64, f64)>,
+    /// Share of bootstrap replicates whose choice holds the term; none for terms that always stay.
+    pub inclusion: Option<f64>,
+}
+
+/// A term that was left out although the recordings do not rule it out, or kept although they hardly
+/// show it.
+#[derive(Debug, Clone, PartialEq)]
+pub struct DoubtfulTerm {
+    /// The term.
+    pub expression: String,
+    /// Whether the model has it.
+    pub chosen: bool,
+    /// Share of bootstrap replicates that choose it.
+    pub inclusion: f64,
+}
+
+/// One identified equation: Σ value × term = input.
+#[derive(Debug, Clone, PartialEq)]
+pub struct FoundEquation {
+    /// The state it governs.
+    pub state: String,
+    /// The input on its right.
+    pub input: Option<String>,
+    /// Its terms, the leading derivative first.
+    pub terms: Vec<FoundTerm>,
+    /// Terms in doubt.
+    pub doubtful: Vec<DoubtfulTerm>,
+}
+
+/// How the order of the library was chosen.
+#[derive(Debug, Clone, PartialEq)]
+pub struct OrderChoice {
+    /// The order of the chosen terms.
+    pub chosen: usize,
+    /// Criterion of `by_order`.
+    pub criterion: &'static str,
+    /// Its value for each order searched, summed over the equations.
+    pub by_order: Vec<(usize, f64)>,
+}
+
+/// An identified delay.
+#[derive(Debug, Clone, PartialEq)]
+pub struct FoundDelay {
+    /// The delayed state.
+    pub state: String,
+    /// The delay, s.
+    pub value: f64,
+    /// Its 95 % interval.
+    pub ci95: Option<(f64, f64)>,
+    /// The Cramér–Rao bound of its standard deviation at the noise found, s.
+    pub bound: Option<f64>,
+    /// Gain of the feedback.
+    pub gain: f64,
+    /// Its interval, where it was estimated.
+    pub gain_ci95: Option<(f64, f64)>,
+    /// Correlation of delay and gain, where both were estimated.
+    pub correlation: Option<f64>,
+}
+
+/// Free runs over the recordings of one role.
+#[derive(Debug, Clone)]
+pub struct Role {
+    /// The data.
+    pub data: Arc<Data>,
+    /// Simulation from the state estimated on the first quarter.
+    pub run: FreeRun,
+    /// Scores over all recordings.
+    pub scores: Vec<Score>,
+    /// Scores recording by recording.
+    pub by_recording: Vec<Vec<Score>>,
+}
+
+/// Where the held-out recordings came from.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum HoldoutSource {
+    /// Recordings of their own.
+    Given,
+    /// The last fifth of each training recording.
+    LastFifth,
+    /// None: the recordings are too short to cut.
+    None,
+}
+
+/// The identified equations.
+#[derive(Debug, Clone)]
+pub struct Identification {
+    /// The model, in the model language.
+    pub model: Model,
+    /// Its equations with uncertainty.
+    pub equations: Vec<FoundEquation>,
+    /// The order of the library.
+    pub order: OrderChoice,
+    /// Delays.
+    pub delays: Vec<FoundDelay>,
+    /// Fit on the training recordings.
+    pub train: Role,
+    /// Fit on held-out recordings.
+    pub holdout: Option<Role>,
+    /// Their source.
+    pub holdout_source: HoldoutSource,
+    /// Window of the restarted simulations, s.
+    pub window: f64,
+    /// Noise over spread, per channel.
+    pub noise_floor: Vec<f64>,
+    /// Residual RMS over the noise estimated from the recordings, per channel.
+    pub misfit: Vec<f64>,
+    /// Rounds of choice and refit.
+    pub rounds: usize,
+    /// Number of shooting segments of the last fit; one per piece: an output-error fit of whole records.
+    pub segments: usize,
+    /// Seed.
+    pub seed: u64,
+}
+
+/// Watches an identification; never steers it.
+pub trait Observer: Sync {
+    /// A stage begins.
+    fn stage(&self, _name: &str) {}
+}
+
+/// Nobody watches.
+#[derive(Debug, Clone, Copy, Default)]
+pub struct Quiet;
+impl Observer for Quiet {}
+
+/// Identifies the governing equations of `train`; `holdout` recordings are only simulated.
+///
+/// # Errors
+/// [`IdentifyError`] when the request or the recordings do not allow it.
+pub fn identify(
+    train: &[Recording],
+    holdout: &[Recording],
+    options: &Options,
+    observer: &dyn Observer,
+) -> Result<Identification, IdentifyError> {
+    let (fit_on, held, source) = split(train, holdout);
+    let structure = structure(&fit_on, options)?;
+    let all = vec![true; structure.terms.len()];
+    let ones: Vec<f64> = structure.terms.iter().map(|t| if t.optional { 0.0 } else { 1.0 }).collect();
+    let extras: Vec<f64> = structure.extras.iter().flat_map(|e| &e.parameters).map(|p| p.1).collect();
+    let whole = structure.model(&all, &ones, &extras)?;
+    let data = Arc::new(Data::new(&whole, &fit_on)?);
+    let samples: usize = data.pieces.iter().map(|p| p.len).sum();
+    if structure.terms.len() * 4 > samples {
+        return Err(IdentifyError::TooManyTerms { candidates: structure.terms.len(), samples });
+    }
+    if let Some(c) = data.spread.iter().position(|s| !(*s > 0.0)) {
+        return Err(IdentifyError::Still { name: data.channels[c].name.clone() });
+    }
+
+    observer.stage("weak form");
+    let hats = Hats::new(&whole, &data);
+    let first = first_estimates(&structure, &whole, &data, &hats, options)?;
+
+    observer.stage("output error");
+    let refined = best_refined(&structure, &data, &first).ok_or(IdentifyError::NoFit)?;
+    let (structure, data, refined) = match options.hold {
+        Some(_) => (structure, data, refined),
+        None => better_hold(structure, data, refined),
+    };
+
+    observer.stage("precision");
+    let precision = precision::assess(&structure, &refined, &first.allowed, options);
+    conclude(&structure, &data, &refined, &precision, &first, &held, source, options)
+}
+
+fn split(train: &[Recording], holdout: &[Recording]) -> (Vec<Recording>, Vec<Recording>, HoldoutSource) {
+    if !holdout.is_empty() {
+        return (train.to_vec(), holdout.to_vec(), HoldoutSource::Given);
+    }
+    let (head, tail) = Data::split_tail(train, 0.2);
+    if head.len() == train.len() {
+        (head, tail, HoldoutSource::LastFifth)
+    } else {
+        (train.to_vec(), Vec::new(), HoldoutSource::None)
+    }
+}
+
+/// The candidates that a request describes, with names and units from the recordings.
+pub fn structure(recordings: &[Recording], options: &Options) -> Result<Structure, IdentifyError> {
+    if options.states.is_empty() {
+        return Err(IdentifyError::NoStates);
+    }
+    if !(1..=2).contains(&options.derivatives) {
+        let found = options.derivatives as f64;
+        return Err(IdentifyError::Range { what: "the order of the leading derivative", found, range: "1 to 2" });
+    }
+    if !(1..=12).contains(&options.order) {
+        let found = options.order as f64;
+        return Err(IdentifyError::Range { what: "the order of the library", found, range: "1 to 12" });
+    }
+    let roles = options.states.iter().map(|s| (s, "state")).chain(options.inputs.iter().map(|s| (s, "input")));
+    let mut seen: Vec<(&String, &'static str)> = Vec::new();
+    for (name, role) in roles {
+        if let Some((_, first)) = seen.iter().find(|(n, _)| *n == name) {
+            return Err(IdentifyError::Twice { name: name.clone(), first, second: role });
+        }
+        check_name(name)?;
+        seen.push((name, role));
+    }
+    let unit = |name: &str| {
+        recordings.iter().flat_map(|r| r.channel(name)).find_map(|c| c.unit.clone())
+    };
+    let signal = |name: &String| Signal { name: name.clone(), unit: unit(name) };
+    let hold = options.hold.unwrap_or(Hold::Linear);
+    let mut library = options.library.clone();
+    for term in &library.terms {
+        check_term(term, options)?;
+    }
+    // Further inputs act like terms with coefficients of their own.
+    let own_terms = library.terms.len();
+    library.terms.extend(options.inputs.iter().skip(1).cloned());
+    let mut taken: Vec<String> = options.states.iter().chain(&options.inputs).cloned().collect();
+    taken.extend(["t", "pi", "tau", "kp"].map(String::from));
+    let mut setting =
+        Setting { states: &options.states, derivatives: options.derivatives, orders: options.order, taken };
+    let mut terms = library.terms(&mut setting);
+    for term in &mut terms {
+        // User terms come without parentheses in the report where they need none.
+        let bare = term.expression.trim_start_matches('(').trim_end_matches(')');
+        if options.inputs.iter().skip(1).any(|u| u == bare) && own_terms < library.terms.len() {
+            term.expression = bare.to_string();
+        }
+    }
+    let mut extras = Vec::new();
+    if let Some(delay) = &options.delay {
+        let Some(equation) = options.states.iter().position(|s| *s == delay.state) else {
+            return Err(IdentifyError::DelayedState {
+                name: delay.state.clone(),
+                states: options.states.join(", "),
+            });
+        };
+        if options.inputs.is_empty() {
+            return Err(IdentifyError::DelayWithoutInput);
+        }
+        if !(delay.longest > 0.0 && delay.longest.is_finite()) {
+            let found = delay.longest;
+            return Err(IdentifyError::Range { what: "the longest delay", found, range: "(0, ∞) s" });
+        }
+        extras.push(Extra {
+            equation,
+            expression: format!("kp*delay({}, tau)", delay.state),
+            parameters: vec![
+                ("kp".to_string(), delay.gain.unwrap_or(1.0), delay.gain.is_some()),
+                ("tau".to_string(), 0.25 * delay.longest, false),
+            ],
+        });
+    }
+    let files: Vec<&str> = recordings.iter().map(|r| r.name.as_str()).collect();
+    Ok(Structure {
+        title: format!("identified from {}", files.join(", ")),
+        inputs: options.inputs.iter().map(|n| (signal(n), hold)).collect(),
+        states: options.states.iter().map(signal).collect(),
+        equations: options
+            .states
+            .iter()
+            .map(|s| Equation { name: format!("motion_{s}"), input: options.inputs.first().cloned() })
+            .collect(),
+        terms,
+        extras,
+    })
+}
+
+fn check_name(name: &str) -> Result<(), IdentifyError> {
+    let wrong = |reason: String| IdentifyError::Name { name: name.to_string(), reason };
+    if ["t", "pi"].contains(&name) || greybox_model::Func::from_name(name).is_some() {
+        return Err(wrong("the language has another meaning for it".to_string()));
+    }
+    match greybox_model::parse(name) {
+        Ok(parsed) if matches!(&parsed.expr, greybox_model::Expr::Var { name: n, primes: 0 } if **n == *name) => Ok(()),
+        Ok(_) => Err(wrong("names have letters, digits and underscores, and begin with a letter".to_string())),
+        Err(e) => Err(wrong(e.to_string())),
+    }
+}
+
+fn check_term(term: &str, options: &Options) -> Result<(), IdentifyError> {
+    let wrong = |reason: String| IdentifyError::Term { term: term.to_string(), reason };
+    let parsed = greybox_model::parse(term).map_err(|e| wrong(e.to_string()))?;
+    let variables = parsed.expr.variables();
+    for (name, primes) in &variables {
+        let is_state = options.states.iter().any(|s| **s == **name);
+        let is_input = options.inputs.iter().any(|s| **s == **name);
+        if !is_state && !is_input {
+            let known: Vec<String> = options.states.iter().chain(&options.inputs).cloned().collect();
+            return Err(wrong(format!("`{name}` is neither a state nor an input (there are {})", known.join(", "))));
+        }
+        let most = if is_state { options.derivatives } else { 1 };
+        if usize::from(*primes) >= most {
+            let reached = derivative(name, usize::from(*primes));
+            return Err(wrong(format!("`{reached}` is a derivative that no term of the library may have")));
+        }
+    }
+    if variables.is_empty() {
+        return Err(IdentifyError::ConstantTerm { term: term.to_string() });
+    }
+    Ok(())
+}
+
+/// What the weak form says.
+pub(crate) struct First {
+    /// Starting points, one per window length.
+    pub starts: Vec<State>,
+    /// Candidates that the output error may choose from.
+    pub allowed: Vec<bool>,
+    /// Criterion by order.
+    pub by_order: Vec<(usize, f64)>,
+}
+
+/// Window lengths of the weak form, in typical oscillations.
+const WINDOWS: [f64; 3] = [0.3, 0.6, 1.2];
+
+fn first_estimates(
+    structure: &Structure,
+    model: &Model,
+    data: &Data,
+    hats: &Hats,
+    options: &Options,
+) -> Result<First, IdentifyError> {
+    let period = weak::period(data);
+    let longest = data.pieces.iter().map(|p| p.len).max().unwrap_or(0);
+    let dt = data.pieces.iter().map(|p| p.dt).fold(f64::INFINITY, f64::min);
+    let values = weak::evaluate(structure, model, data, hats).ok_or(IdentifyError::NoFit)?;
+    let extras: Vec<f64> = structure.extras.iter().flat_map(|e| &e.parameters).map(|p| p.1).collect();
+    let mut starts = Vec::new();
+    let mut by_order = Vec::new();
+    for share in WINDOWS {
+        let window = (share * period).clamp(16.0 * dt, 0.2 * longest as f64 * dt);
+        let mut state = State {
+            active: structure.terms.iter().map(|t| !t.optional).collect(),
+            values: structure.terms.iter().map(|t| if t.optional { 0.0 } else { 1.0 }).collect(),
+            extras: extras.clone(),
+        };
+        let mut complete = true;
+        for equation in 0..structure.equations.len() {
+            let Some(rows) = weak::rows(structure, model, data, &values, equation, window) else {
+                complete = false;
+                break;
+            };
+            let (reduced, terms) = weak::reduce(structure, &rows);
+            let pick = |wanted: &dyn Fn(usize) -> bool| -> Vec<usize> {
+                (0..terms.len()).filter(|&c| wanted(terms[c])).collect()
+            };
+            let kept = pick(&|t| !structure.terms[t].optional);
+            let optional = pick(&|t| structure.terms[t].optional);
+            let even = pick(&|t| structure.terms[t].even);
+            let solution = reduced.choose(&kept, &optional, &even);
+            for (&c, &v) in solution.columns.iter().zip(&solution.values) {
+                state.active[terms[c]] = true;
+                state.values[terms[c]] = v;
+            }
+        }
+        if complete {
+            starts.push(state);
+        }
+    }
+    by_order.push((options.order, 0.0));
+    if starts.is_empty() {
+        return Err(IdentifyError::TooShort { samples: longest });
+    }
+    let allowed = structure.terms.iter().map(|t| t.order <= options.order).collect();
+    Ok(First { starts, allowed, by_order })
+}
+
+fn best_refined(structure: &Structure, data: &Arc<Data>, first: &First) -> Option<Refined> {
+    let begun: Vec<Refined> =
+        first.starts.iter().filter_map(|s| output_error::begin(structure, data, s.clone())).collect();
+    let best = begun.into_iter().min_by(|a, b| a.score().total_cmp(&b.score()))?;
+    Some(output_error::refine(structure, best, &first.allowed))
+}
+
+/// The hold of the inputs that fits best, where the difference is beyond chance.
+fn better_hold(structure: Structure, data: Arc<Data>, refined: Refined) -> (Structure, Arc<Data>, Refined) {
+    if structure.inputs.is_empty() {
+        return (structure, data, refined);
+    }
+    let mut best: Option<(f64, Structure, Refined)> = None;
+    for hold in [Hold::Zero, Hold::BandLimited] {
+        let mut other = structure.clone();
+        other.inputs.iter_mut().for_each(|i| i.1 = hold);
+        let Some(next) = output_error::refit(&other, &refined) else { continue };
+        // Twice the gain in log-likelihood; 10 is far beyond what one choice of three gives by chance.
+        let gain = refined.score() - next.score();
+        if gain > 10.0 && best.as_ref().is_none_or(|b| gain > b.0) {
+            best = Some((gain, other, next));
+        }
+    }
+    match best {
+        Some((_, structure, refined)) => (structure, data, refined),
+        None => (structure, data, refined),
+    }
+}
+
+fn conclude(
+    structure: &Structure,
+    data: &Arc<Data>,
+    refined: &Refined,
+    precision: &Precision,
+    first: &First,
+    held: &[Recording],
+    source: HoldoutSource,
+    options: &Options,
+) -> Result<Identification, IdentifyError> {
+    let state = &refined.state;
+    let mut model = structure.model(&state.active, &state.values, &state.extras)?;
+    model.resolve_units()?;
+    let durations: Vec<f64> = data.pieces.iter().map(|p| p.len as f64 * p.dt).collect();
+    let dt = data.pieces.iter().map(|p| p.dt).fold(f64::INFINITY, f64::min);
+    let window = window_length(&durations, dt);
+    let role = |data: Arc<Data>| -> Option<Role> {
+        let mut setup = Setup::new(&model, data.clone(), Vec::new()).ok()?;
+        setup.method = refined.setup.method;
+        let values = setup.values();
+        let run = setup.free_run(&values, &refined.scale);
+        let scores = setup.scores(&run, &values, window, None);
+        let by_recording =
+            (0..data.recordings.len()).map(|r| setup.scores(&run, &values, window, Some(r))).collect();
+        Some(Role { data, run, scores, by_recording })
+    };
+    let train = role(data.clone()).ok_or(IdentifyError::NoFit)?;
+    let holdout =
+        if held.is_empty() { None } else { role(Arc::new(Data::new(&model, held)?)) };
+    let equations = structure
+        .equations
+        .iter()
+        .enumerate()
+        .map(|(e, equation)| {
+            let of_equation = || (0..structure.terms.len()).filter(move |&i| structure.terms[i].equation == e);
+            let terms = of_equation()
+                .filter(|&i| state.active[i])
+                .map(|i| {
+                    let t = &structure.terms[i];
+                    FoundTerm {
+                        expression: t.expression.clone(),
+                        parameter: t.parameter.clone(),
+                        powers: t.powers.clone(),
+                        value: state.values[i],
+                        ci95: precision.interval(i, state.values[i]),
+                        inclusion: if t.optional { precision.inclusion.get(i).copied() } else { None },
+                    }
+                })
+                .collect();
+            let doubtful = of_equation()
+                .filter(|&i| structure.terms[i].optional)
+                .filter_map(|i| {
+                    let inclusion = *precision.inclusion.get(i)?;
+                    (inclusion > 0.1 && inclusion < 0.9).then(|| DoubtfulTerm {
+                        expression: structure.terms[i].expression.clone(),
+                        chosen: state.active[i],
+                        inclusion,
+                    })
+                })
+                .collect();
+            FoundEquation {
+                state: options.states[e].clone(),
+                input: equation.input.clone(),
+                terms,
+                doubtful,
+            }
+        })
+        .collect();
+    let delays = options
+        .delay
+        .iter()
+        .map(|d| FoundDelay {
+            state: d.state.clone(),
+            value: state.extras[1],
+            ci95: precision.extra_interval(1, state.extras[1]),
+            bound: precision.extra_bound(1),
+            gain: state.extras[0],
+            gain_ci95: precision.extra_interval(0, state.extras[0]),
+            correlation: precision.extra_correlation,
+        })
+        .collect();
+    let chosen = structure
+        .terms
+        .iter()
+        .zip(&state.active)
+        .filter(|(t, a)| **a && t.optional)
+        .map(|(t, _)| t.order)
+        .max()
+        .unwrap_or(0);
+    Ok(Identification {
+        equations,
+        order: OrderChoice { chosen, criterion: "aic", by_order: first.by_order.clone() },
+        delays,
+        noise_floor: data.sigma.iter().zip(&data.spread).map(|(s, d)| s / d).collect(),
+        misfit: refined.scale.iter().zip(&data.sigma).map(|(r, s)| r / s).collect(),
+        rounds: refined.rounds,
+        segments: refined.level.segments.len(),
+        seed: options.seed,
+        model,
+        train,
+        holdout,
+        holdout_source: source,
+        window,
+    })
+}
