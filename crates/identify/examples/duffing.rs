@@ -53,5 +53,5 @@ fn main() {
         let doubt: Vec<String> = e.doubtful.iter().map(|d| format!("{} {:.2}", d.expression, d.inclusion)).collect();
         println!("{seed} {ok} rounds {} segments {} {:.2}s  {} | {}", found.rounds, found.segments, go.elapsed().as_secs_f64(), names.join("  "), doubt.join(", "));
     }
-    println!("{exact}/{seeds} in {:.1}s; intervals {covered}/{tested}", begin.elapsed().as_secs_f64());
+    println!("== {exact}/{seeds} in {:.1}s; intervals {covered}/{tested}", begin.elapsed().as_secs_f64());
 }
