@@ -57,7 +57,7 @@ impl Options {
     }
 }
 
-/// A feedback k_p q(t − τ) on the left side of the equation of the state q.
+/// A feedback k_p q(t − τ) on the right side of the equation of the state q (thesis Eq 3.3).
 #[derive(Debug, Clone, PartialEq)]
 pub struct DelayedState {
     /// The state.
@@ -260,7 +260,7 @@ fn split(train: &[Recording], holdout: &[Recording]) -> (Vec<Recording>, Vec<Rec
 }
 
 /// The candidates that a request describes, with names and units from the recordings.
-pub fn structure(recordings: &[Recording], options: &Options) -> Result<Structure, IdentifyError> {
+pub(crate) fn structure(recordings: &[Recording], options: &Options) -> Result<Structure, IdentifyError> {
     if options.states.is_empty() {
         return Err(IdentifyError::NoStates);
     }
@@ -322,7 +322,7 @@ pub fn structure(recordings: &[Recording], options: &Options) -> Result<Structur
         }
         extras.push(Extra {
             equation,
-            expression: format!("kp*delay({}, tau)", delay.state),
+            expression: format!("-kp*delay({}, tau)", delay.state),
             parameters: vec![
                 ("kp".to_string(), delay.gain.unwrap_or(1.0), delay.gain.is_some()),
                 ("tau".to_string(), 0.25 * delay.longest, false),
@@ -403,45 +403,88 @@ fn first_estimates(
     let longest = data.pieces.iter().map(|p| p.len).max().unwrap_or(0);
     let dt = data.pieces.iter().map(|p| p.dt).fold(f64::INFINITY, f64::min);
     let values = weak::evaluate(structure, model, data, hats).ok_or(IdentifyError::NoFit)?;
-    let extras: Vec<f64> = structure.extras.iter().flat_map(|e| &e.parameters).map(|p| p.1).collect();
-    let mut starts = Vec::new();
+    let mut starts: Vec<(f64, State)> = Vec::new();
     let mut by_order = Vec::new();
+    let trials = trials(options);
     for share in WINDOWS {
         let window = (share * period).clamp(16.0 * dt, 0.2 * longest as f64 * dt);
-        let mut state = State {
-            active: structure.terms.iter().map(|t| !t.optional).collect(),
-            values: structure.terms.iter().map(|t| if t.optional { 0.0 } else { 1.0 }).collect(),
-            extras: extras.clone(),
-        };
-        let mut complete = true;
-        for equation in 0..structure.equations.len() {
-            let Some(rows) = weak::rows(structure, model, data, &values, equation, window) else {
-                complete = false;
-                break;
-            };
-            let (reduced, terms) = weak::reduce(structure, &rows);
-            let pick = |wanted: &dyn Fn(usize) -> bool| -> Vec<usize> {
-                (0..terms.len()).filter(|&c| wanted(terms[c])).collect()
-            };
-            let kept = pick(&|t| !structure.terms[t].optional);
-            let optional = pick(&|t| structure.terms[t].optional);
-            let even = pick(&|t| structure.terms[t].even);
-            let solution = reduced.choose(&kept, &optional, &even);
-            for (&c, &v) in solution.columns.iter().zip(&solution.values) {
-                state.active[terms[c]] = true;
-                state.values[terms[c]] = v;
-            }
-        }
-        if complete {
-            starts.push(state);
-        }
+        starts.extend(
+            trials.iter().filter_map(|t| estimate(structure, model, data, &values, window, *t)),
+        );
     }
+    // Without a delay one start per window; with one, the most probable delays.
+    if !structure.extras.is_empty() {
+        starts.sort_by(|a, b| a.0.total_cmp(&b.0));
+        starts.truncate(WINDOWS.len());
+    }
+    let starts: Vec<State> = starts.into_iter().map(|s| s.1).collect();
     by_order.push((options.order, 0.0));
     if starts.is_empty() {
         return Err(IdentifyError::TooShort { samples: longest });
     }
     let allowed = structure.terms.iter().map(|t| t.order <= options.order).collect();
     Ok(First { starts, allowed, by_order })
+}
+
+/// Delays to try, where one is asked for.
+fn trials(options: &Options) -> Vec<Option<weak::Trial>> {
+    const DELAYS: usize = 16;
+    let Some(delay) = &options.delay else { return vec![None] };
+    let state = options.states.iter().position(|s| *s == delay.state).unwrap_or(0);
+    (1..=DELAYS)
+        .map(|i| {
+            let share = i as f64 / DELAYS as f64;
+            Some(weak::Trial { state, delay: share * delay.longest, gain: delay.gain })
+        })
+        .collect()
+}
+
+/// The weak form's choice with windows of one length, and how well it does.
+fn estimate(
+    structure: &Structure,
+    model: &Model,
+    data: &Data,
+    values: &[Vec<Vec<f64>>],
+    window: f64,
+    trial: Option<weak::Trial>,
+) -> Option<(f64, State)> {
+    let mut state = State {
+        active: structure.terms.iter().map(|t| !t.optional).collect(),
+        values: structure.terms.iter().map(|t| if t.optional { 0.0 } else { 1.0 }).collect(),
+        extras: structure.extras.iter().flat_map(|e| &e.parameters).map(|p| p.1).collect(),
+    };
+    let mut badness = 0.0;
+    for equation in 0..structure.equations.len() {
+        let own = trial.filter(|_| structure.extras.iter().any(|x| x.equation == equation));
+        let rows = weak::rows(structure, model, data, values, equation, window, own)?;
+        let gain = own.and_then(|t| t.gain);
+        let (reduced, terms) = weak::reduce(structure, &rows, gain);
+        let pick =
+            |wanted: &dyn Fn(usize) -> bool| (0..terms.len()).filter(|&c| wanted(terms[c])).collect::<Vec<_>>();
+        let mut kept = pick(&|t| !structure.terms[t].optional);
+        if own.is_some() && gain.is_none() {
+            kept.push(terms.len());
+        }
+        let optional = pick(&|t| structure.terms[t].optional);
+        let even = pick(&|t| structure.terms[t].even);
+        let solution = reduced.choose(&kept, &optional, &even);
+        badness += reduced.samples * (solution.rss / reduced.samples).ln()
+            + solution.columns.len() as f64 * reduced.samples.ln();
+        for (&c, &v) in solution.columns.iter().zip(&solution.values) {
+            match terms.get(c) {
+                Some(&t) => {
+                    state.active[t] = true;
+                    state.values[t] = v;
+                }
+                // The delayed state stands on the left as −k_p.
+                None => state.extras[0] = -v,
+            }
+        }
+        if let Some(t) = own {
+            state.extras[1] = t.delay;
+        }
+    }
+    Some((badness, state))
 }
 
 fn best_refined(structure: &Structure, data: &Arc<Data>, first: &First) -> Option<Refined> {
@@ -522,6 +565,18 @@ fn conclude(
                     }
                 })
                 .collect();
+            let mut terms: Vec<FoundTerm> = terms;
+            if structure.extras.iter().any(|x| x.equation == e) {
+                let gain = state.extras[0];
+                terms.push(FoundTerm {
+                    expression: format!("delay({}, tau)", options.states[e]),
+                    parameter: "kp".to_string(),
+                    powers: Vec::new(),
+                    value: -gain,
+                    ci95: precision.extra_interval(0, gain).map(|(a, b)| (-b, -a)),
+                    inclusion: None,
+                });
+            }
             let doubtful = of_equation()
                 .filter(|&i| structure.terms[i].optional)
                 .filter_map(|i| {

@@ -21,10 +21,34 @@ pub(crate) struct Rows {
     pub target: Vec<f64>,
     /// Index of each candidate among the structure's terms.
     pub terms: Vec<usize>,
+    /// The delayed state's column, where the equation has one.
+    pub delayed: Option<Vec<f64>>,
     /// Windows without overlap among the rows.
     pub independent: f64,
-    /// Rows per window without overlap.
-    pub overlap: usize,
+}
+
+/// A delayed feedback, its delay held at a trial value.
+#[derive(Debug, Clone, Copy)]
+pub(crate) struct Trial {
+    /// The delayed state.
+    pub state: usize,
+    /// The delay, s.
+    pub delay: f64,
+    /// The gain where it is known.
+    pub gain: Option<f64>,
+}
+
+/// `signal` a time `delay` earlier, its first sample held before the start.
+fn earlier(signal: &[f64], dt: f64, delay: f64) -> Vec<f64> {
+    let shift = delay / dt;
+    (0..signal.len())
+        .map(|k| {
+            let at = (k as f64 - shift).max(0.0);
+            let (i, w) = (at.floor() as usize, at.fract());
+            let next = signal[(i + 1).min(signal.len() - 1)];
+            signal[i] + w * (next - signal[i])
+        })
+        .collect()
 }
 
 /// Values of all candidate terms along the smoothed states, `[piece][term][sample]`.
@@ -84,6 +108,7 @@ pub(crate) fn rows(
     values: &[Vec<Vec<f64>>],
     equation: usize,
     window: f64,
+    trial: Option<Trial>,
 ) -> Option<Rows> {
     let dt = data.pieces.iter().map(|p| p.dt).fold(f64::INFINITY, f64::min);
     let order = model.states[equation].order;
@@ -93,6 +118,12 @@ pub(crate) fn rows(
     let terms: Vec<usize> =
         (0..structure.terms.len()).filter(|&i| structure.terms[i].equation == equation).collect();
     let input = structure.equations[equation].input.as_ref().and_then(|name| model.input(name));
+    let late: Vec<Vec<f64>> = match trial {
+        Some(t) => {
+            data.pieces.iter().map(|p| earlier(&p.smooth[t.state].value, p.dt, t.delay)).collect()
+        }
+        None => Vec::new(),
+    };
     let zeros: Vec<Vec<f64>> = data.pieces.iter().map(|p| vec![0.0; p.len]).collect();
     let state_of = |expression: &str| -> Option<(usize, usize)> {
         let name = expression.trim_end_matches('\'');
@@ -113,6 +144,9 @@ pub(crate) fn rows(
                     None => Column { signal: &values[i][t], order: 0, hold: Join::Smooth },
                 })
                 .collect();
+            if let Some(signal) = late.get(i) {
+                columns.push(Column { signal, order: 0, hold: Join::Linear });
+            }
             columns.push(match input {
                 Some(u) => Column {
                     signal: &piece.inputs[u],
@@ -130,24 +164,32 @@ pub(crate) fn rows(
         .collect();
     let mut rows = rows_of_pieces(&kernel, &pieces, hop).ok()?;
     let target = rows.columns.pop()?;
+    let delayed = if trial.is_some() { rows.columns.pop() } else { None };
     let overlap = intervals.div_ceil(hop);
     let independent = (target.len() as f64 / overlap as f64).max(1.0);
-    Some(Rows { columns: rows.columns, target, terms, independent, overlap })
+    Some(Rows { columns: rows.columns, target, terms, delayed, independent })
 }
 
 /// The regression in triangular form; returns the columns' candidates with it. Without input the leading
-/// derivative moves to the right.
-pub(crate) fn reduce(structure: &Structure, rows: &Rows) -> (Reduced, Vec<usize>) {
+/// derivative moves to the right; a delayed feedback does where its gain is known, else it is the last column.
+pub(crate) fn reduce(structure: &Structure, rows: &Rows, gain: Option<f64>) -> (Reduced, Vec<usize>) {
     let n = rows.target.len();
     let free: Vec<usize> = (0..rows.terms.len()).filter(|&c| structure.has_coefficient(rows.terms[c])).collect();
     let mut target = rows.target.clone();
     for c in (0..rows.terms.len()).filter(|c| !free.contains(c)) {
         target.iter_mut().zip(&rows.columns[c]).for_each(|(t, v)| *t -= v);
     }
-    let k = free.len();
+    let mut unknown: Vec<&[f64]> = free.iter().map(|&c| rows.columns[c].as_slice()).collect();
+    if let Some(delayed) = &rows.delayed {
+        match gain {
+            Some(gain) => target.iter_mut().zip(delayed).for_each(|(t, v)| *t += gain * v),
+            None => unknown.push(delayed),
+        }
+    }
+    let k = unknown.len();
     let mut a = Vec::with_capacity(n * (k + 1));
-    for &c in &free {
-        a.extend_from_slice(&rows.columns[c]);
+    for column in &unknown {
+        a.extend_from_slice(column);
     }
     a.extend_from_slice(&target);
     let t = qr::triangle(&mut a, n, k + 1);
