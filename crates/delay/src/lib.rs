@@ -1,0 +1,2 @@
+//! Time delays.
+pub mod spectrum;
