@@ -1,6 +1,7 @@
 //! Time delays.
 pub mod bound;
 pub mod exact;
+pub mod expansion;
 mod qr;
 pub mod spectrum;
 mod spline;
