@@ -5,3 +5,4 @@ pub mod expansion;
 mod qr;
 pub mod spectrum;
 mod spline;
+pub mod taylor;
