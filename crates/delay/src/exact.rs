@@ -221,7 +221,8 @@ pub enum Warning {
         /// That end, s.
         delay: f64,
     },
-    /// τ and the gain act alike: [`ENTANGLED`] or more in correlation.
+    /// τ and the gain act alike ([`ENTANGLED`] or more in correlation) and there is enough noise for it to matter
+    /// (a standard deviation of τ above [`PRECISE`] of τ).
     Entangled {
         /// Their correlation.
         correlation: f64,
@@ -240,9 +241,14 @@ pub enum Warning {
     },
 }
 
-/// Correlation of τ and g from which a fit is called entangled: 0.98 inflates the variance of τ by
-/// 1/(1 − 0.98²) ≈ 25, its standard deviation fivefold, against a known gain.
-pub const ENTANGLED: f64 = 0.98;
+/// Correlation of τ and g from which a fit is called entangled: 0.95 inflates the variance of τ by
+/// 1/(1 − 0.95²) ≈ 10 against a known gain, the usual line of serious collinearity; from there on the noise in
+/// the columns themselves, which no covariance of least squares counts, biases both.
+pub const ENTANGLED: f64 = 0.95;
+
+/// Share of τ below which its standard deviation makes a correlation harmless: with little noise even strongly
+/// correlated parameters are well determined.
+pub const PRECISE: f64 = 0.01;
 
 /// 99 % point of χ² with one degree of freedom.
 const CHI_SQUARED_99: f64 = 6.634_896_601;
@@ -464,6 +470,7 @@ impl<'a> Problem<'a> {
         }
         if let Some(correlation) = gain_correlation
             && correlation.abs() >= ENTANGLED
+            && delay_std > PRECISE * delay
         {
             warnings.push(Warning::Entangled { correlation });
         }

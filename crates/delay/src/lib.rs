@@ -6,3 +6,4 @@ mod qr;
 pub mod spectrum;
 mod spline;
 pub mod taylor;
+pub mod windows;

@@ -19,7 +19,7 @@
 //! Columns come from any operation on the signals: windows, or the iterated integrals of Eq 3.10.
 use crate::qr::{Compressed, Factors};
 use rand_pcg::Pcg64Mcg;
-use rand_pcg::rand_core::Rng;
+use rand_pcg::rand_core::{Rng, SeedableRng};
 
 /// Why there is no model.
 #[derive(Debug, Clone, Copy, PartialEq, thiserror::Error)]
@@ -312,8 +312,7 @@ fn thresholded(
 /// Rows of a replicate: blocks of consecutive rows, drawn with replacement.
 fn draw(rows: usize, options: &Options, replicate: u64) -> Vec<usize> {
     // One stream per replicate: the result does not depend on the order of work.
-    let seed = u128::from(options.seed) << 64 | u128::from(replicate);
-    let mut random = Pcg64Mcg::new(seed.wrapping_mul(0x9E37_79B9_7F4A_7C15_F39C_C060_5CED_C835) | 1);
+    let mut random = Pcg64Mcg::seed_from_u64(mixed(options.seed ^ mixed(replicate)));
     let wanted = replicate_rows(rows, options);
     let block = options.block.min(rows);
     let starts = rows - block + 1;
@@ -325,6 +324,14 @@ fn draw(rows: usize, options: &Options, replicate: u64) -> Vec<usize> {
     }
     drawn.truncate(wanted);
     drawn
+}
+
+/// SplitMix64's finaliser: neighbouring numbers become unrelated ones.
+fn mixed(number: u64) -> u64 {
+    let z = number.wrapping_add(0x9E37_79B9_7F4A_7C15);
+    let z = (z ^ (z >> 30)).wrapping_mul(0xBF58_476D_1CE4_E5B9);
+    let z = (z ^ (z >> 27)).wrapping_mul(0x94D0_49BB_1331_11EB);
+    z ^ (z >> 31)
 }
 
 fn replicate_rows(rows: usize, options: &Options) -> usize {

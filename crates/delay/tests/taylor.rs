@@ -2,10 +2,11 @@
 use greybox_delay::taylor::{Data, Options, Order, Search, TaylorError, logarithmic, search};
 use rand_distr::{Distribution, StandardNormal};
 use rand_pcg::Pcg64Mcg;
+use rand_pcg::rand_core::SeedableRng;
 
 /// Ten columns, of which 0 (small, protected), 2 and 5 count; noise with neighbours correlated by `memory`.
 fn made(rows: usize, noise: f64, memory: f64, seed: u64) -> (Vec<Vec<f64>>, Vec<f64>) {
-    let mut rng = Pcg64Mcg::new(u128::from(seed) + 11);
+    let mut rng = Pcg64Mcg::seed_from_u64(seed);
     let mut normal = || -> f64 { StandardNormal.sample(&mut rng) };
     let columns: Vec<Vec<f64>> = (0..10)
         .map(|_| {
