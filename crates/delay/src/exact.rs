@@ -512,7 +512,7 @@ impl<'a> Problem<'a> {
         for piece in &self.pieces {
             let n = piece.len();
             let own = scores.columns(top, n);
-            sum += &own * own.transpose();
+            sum += own * own.transpose();
             for lag in 1..=lags.min(n.saturating_sub(1)) {
                 let weight = 1.0 - lag as f64 / (lags as f64 + 1.0);
                 let cross = own.columns(0, n - lag) * own.columns(lag, n - lag).transpose() * weight;

@@ -113,7 +113,7 @@ impl Expansion {
             return Err(ExpansionError::Derivative { derivative, order: self.order });
         }
         let factorial: f64 = (1..=derivative).map(|k| k as f64).product();
-        let sign = if derivative % 2 == 0 { 1.0 } else { -1.0 };
+        let sign = if derivative.is_multiple_of(2) { 1.0 } else { -1.0 };
         let power = sign * factorial * (coefficient - own) / self.gain;
         let delay = power.signum() * power.abs().powf(1.0 / derivative as f64);
         Ok(Reading { derivative, delay, admissible: power >= 0.0 })

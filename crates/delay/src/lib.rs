@@ -1,4 +1,5 @@
-//! Time delays.
+#![doc = include_str!("../README.md")]
+
 pub mod bound;
 pub mod exact;
 pub mod expansion;

@@ -71,7 +71,7 @@ fn recordings_are_fitted_together() {
 /// Target noise only: the errors of many fits against the covariance they claim.
 fn scatter(correlation: f64, lags: usize) -> (f64, f64) {
     let made = Made::new(rich, 900, -2.0, 0.2);
-    let normal = Normal::new(0.0, 0.3).unwrap();
+    let normal = Normal::new(0.0, 0.3).expect("valid input");
     let mut rng = Pcg64Mcg::seed_from_u64(7);
     let runs = 200;
     let (mut squares, mut claimed) = (0.0, 0.0);
@@ -88,7 +88,7 @@ fn scatter(correlation: f64, lags: usize) -> (f64, f64) {
             .collect();
         let rows = Rows { target: &target, ..made.rows() };
         let options = Options { correlated_rows: lags, grid: 51, ..Options::new(Gain::Free, 0.0, 0.5) };
-        let fit = fit(&[rows], &options).unwrap();
+        let fit = fit(&[rows], &options).expect("valid input");
         squares += (fit.delay - 0.2).powi(2) / f64::from(runs);
         claimed += fit.delay_std.powi(2) / f64::from(runs);
     }

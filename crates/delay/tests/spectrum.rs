@@ -4,7 +4,7 @@ use greybox_simulate::rigs::{RotaryFlexibleJoint, Sampling};
 
 fn joint(plant: RotaryFlexibleJoint) -> DelaySystem {
     let [undelayed, delayed] = plant.linearised();
-    DelaySystem::new(&undelayed, &delayed, plant.delay).unwrap()
+    DelaySystem::new(&undelayed, &delayed, plant.delay).expect("valid input")
 }
 
 fn near(root: Root, re: f64, im: f64, tolerance: f64) {

@@ -36,7 +36,7 @@ fn run(options: &Options) -> Search {
     let (train, f) = made(600, 0.01, 0.0, 1);
     let (test, g) = made(600, 0.01, 0.0, 2);
     search(Data { columns: &train, target: &f }, Data { columns: &test, target: &g }, &ORDERS, options)
-        .unwrap()
+        .expect("valid input")
 }
 
 #[test]

@@ -40,21 +40,21 @@ fn through(r: &Duffing, order: usize, operation: impl Fn(&[Column<'_>]) -> Vec<V
     }));
     columns.push(smooth(&r.f, 0));
     let mut rows = operation(&columns);
-    let target = rows.pop().unwrap();
+    let target = rows.pop().expect("valid input");
     (rows, target)
 }
 
 /// Windows of 1 s with the kernel t²(T − t)², which leaves the first sample to the third derivative.
 fn windows(r: &Duffing, order: usize, initial: Initial) -> Rows {
-    let kernel = Kernel::new(2, 3, 1000, DT).unwrap().with_initial(initial);
-    through(r, order, |columns| greybox_algebraic::rows(&kernel, columns, 10).unwrap().columns)
+    let kernel = Kernel::new(2, 3, 1000, DT).expect("valid input").with_initial(initial);
+    through(r, order, |columns| greybox_algebraic::rows(&kernel, columns, 10).expect("valid input").columns)
 }
 
 /// Eq 3.10 at every tenth sample of one window over the whole recording.
 fn literal(r: &Duffing, order: usize, initial: Initial) -> Rows {
-    let form = Iterated::new(2, 3, DT).unwrap().with_initial(initial);
+    let form = Iterated::new(2, 3, DT).expect("valid input").with_initial(initial);
     let restart = Restart { intervals: r.x.len() - 1, hop: 1, every: 10 };
-    through(r, order, |columns| form.rows(columns, restart).unwrap().columns)
+    through(r, order, |columns| form.rows(columns, restart).expect("valid input").columns)
 }
 
 fn data(rows: &Rows) -> Data<'_> {
@@ -62,11 +62,11 @@ fn data(rows: &Rows) -> Data<'_> {
 }
 
 fn algorithm_2(train: &Rows, test: &Rows, last: usize, options: &Options) -> Search {
-    search(data(train), data(test), &orders(last), options).unwrap()
+    search(data(train), data(test), &orders(last), options).expect("valid input")
 }
 
 fn reading(model: &Model) -> Reading {
-    Expansion::new(-2.0, 3).unwrap().read(3, model.coefficients[0], 0.0).unwrap()
+    Expansion::new(-2.0, 3).expect("valid input").read(3, model.coefficients[0], 0.0).expect("valid input")
 }
 
 /// x‴, x″, x′, x, x³, x′³, x²x′ among the columns.
