@@ -477,10 +477,12 @@ impl<'a> Problem<'a> {
         if delay_std >= 0.5 * span / 12.0_f64.sqrt() {
             warnings.push(Warning::Uninformative { std: delay_std });
         }
-        if let Some((delay, rss)) = second
+        let step = span / (options.grid - 1) as f64;
+        if let Some((rival, rss)) = second
+            && (rival - delay).abs() > step
             && effective_rows * (rss / at.rss).ln() < CHI_SQUARED_99
         {
-            warnings.push(Warning::Rival { delay });
+            warnings.push(Warning::Rival { delay: rival });
         }
         let separability = Separability {
             gain_correlation,

@@ -241,7 +241,14 @@ impl DelaySystem {
         let (delta, _) = self.characteristic(root);
         let late = self.delayed.iter().map(|(delay, a)| a.norm() * (-root.re * delay).exp());
         let size = root.norm() + self.undelayed.norm() + late.sum::<f64>();
-        if size == 0.0 { 0.0 } else { delta.singular_values().min() / size }
+        if size == 0.0 {
+            0.0
+        } else if size.is_finite() {
+            delta.singular_values().min() / size
+        } else {
+            // e^(−λτ) overflowed, far to the left.
+            f64::INFINITY
+        }
     }
 
     /// Δ(λ) and dΔ/dλ = I + Σ τₖ Aₖ e^(−λτₖ).

@@ -95,6 +95,21 @@ fn a_long_delay_takes_more_points() {
 }
 
 #[test]
+fn extreme_systems_end_in_an_answer_or_an_error() {
+    // Thousands of roots of nearly one real part: no mesh resolves them, and that is said.
+    let system = DelaySystem::new(&[[-1000.0]], &[[1e-3]], 10.0).unwrap();
+    assert!(matches!(system.rightmost(), Err(SpectrumError::Unresolved { points: 129, wanted: 1 })));
+    // e^(−λτ) overflows at the eigenvalue of the undelayed part.
+    assert_eq!(system.residual(Root { re: -1000.0, im: 0.0 }), f64::INFINITY);
+    for scale in [1e-300, 1e-30, 1e30, 1e150, 1e300] {
+        let system = DelaySystem::new(&[[-scale, scale], [0.0, -scale]], &[[scale, 0.0], [scale, 0.0]], 1.0);
+        if let Ok(roots) = system.unwrap().roots(2) {
+            assert!(roots.iter().all(|r| r.re.is_finite() && r.im.is_finite()), "{scale} {roots:?}");
+        }
+    }
+}
+
+#[test]
 fn bad_input_is_refused() {
     let square = [[0.0, 1.0], [1.0, 0.0]];
     let empty: [[f64; 1]; 0] = [];
