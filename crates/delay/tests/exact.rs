@@ -187,3 +187,78 @@ fn bad_input_is_refused() {
     let error = run(Rows { delayed: &constant, ..rows }, &options).unwrap_err();
     assert_eq!(error, ExactError::NoInformation);
 }
+
+#[test]
+fn covariance_is_the_newey_west_sandwich() {
+    let made = Made::new(rich, 500, -2.0, 0.2);
+    let normal = Normal::new(0.0, 0.3).unwrap();
+    let mut rng = Pcg64Mcg::seed_from_u64(5);
+    let target: Vec<f64> = made.target.iter().map(|f| f + normal.sample(&mut rng)).collect();
+    let lags = 7;
+    let options = Options { correlated_rows: lags, ..Options::new(Gain::Free, 0.0, 0.5) };
+    let fit = fit(&[Rows { target: &target, ..made.rows() }], &options).unwrap();
+    // Jacobian rows in the order τ, g, c₀, c₁, from the closed form of the signal.
+    let first = 50;
+    let t = |k: usize| k as f64 * DT;
+    let jacobian: Vec<[f64; 4]> = (first..500)
+        .map(|k| {
+            let (late, slope) = rich(t(k) - fit.delay);
+            [-fit.gain * slope, late, rich(t(k)).1, rich(t(k)).0]
+        })
+        .collect();
+    let residual: Vec<f64> = (first..500)
+        .map(|k| {
+            let [_, late, c0, c1] = jacobian[k - first];
+            target[k] - fit.gain * late - fit.coefficients[0] * c0 - fit.coefficients[1] * c1
+        })
+        .collect();
+    let n = jacobian.len();
+    let product = |i: usize, j: usize| {
+        nalgebra::Vector4::from(jacobian[i])
+            * residual[i]
+            * residual[j]
+            * nalgebra::RowVector4::from(jacobian[j])
+    };
+    let mut meat = nalgebra::Matrix4::zeros();
+    for i in 0..n {
+        meat += product(i, i);
+        for lag in 1..=lags.min(n - 1 - i) {
+            let weight = 1.0 - lag as f64 / (lags as f64 + 1.0);
+            meat += (product(i, i + lag) + product(i + lag, i)) * weight;
+        }
+    }
+    let information: nalgebra::Matrix4<f64> =
+        jacobian.iter().map(|j| nalgebra::Vector4::from(*j) * nalgebra::RowVector4::from(*j)).sum();
+    let bread = information.try_inverse().unwrap();
+    let expected = bread * meat * bread * (n as f64 / (n as f64 - 4.0));
+    for i in 0..4 {
+        for j in 0..4 {
+            let scale = (expected[(i, i)] * expected[(j, j)]).sqrt();
+            let error = (fit.covariance[i][j] - expected[(i, j)]).abs() / scale;
+            assert!(error < 1e-3, "{i} {j}: {} {}", fit.covariance[i][j], expected[(i, j)]);
+        }
+    }
+}
+
+#[test]
+fn units_do_not_matter() {
+    let made = Made::new(rich, 800, -2.0, 0.2037);
+    let normal = Normal::new(0.0, 0.1).unwrap();
+    let mut rng = Pcg64Mcg::seed_from_u64(9);
+    let target: Vec<f64> = made.target.iter().map(|f| f + normal.sample(&mut rng)).collect();
+    let options = Options { correlated_rows: 5, ..Options::new(Gain::Free, 0.0, 0.5) };
+    let plain = fit(&[Rows { target: &target, ..made.rows() }], &options).unwrap();
+    // Columns in micro- and megaunits, the delayed signal in nanounits, time in milliseconds.
+    let scaled = |v: &[f64], by: f64| -> Vec<f64> { v.iter().map(|v| v * by).collect() };
+    let columns = vec![scaled(&made.columns[0], 1e6), scaled(&made.columns[1], 1e-6)];
+    let (target, delayed) = (scaled(&target, 1e3), scaled(&made.delayed, 1e9));
+    let rows = Rows { target: &target, columns: &columns, delayed: &delayed, dt: 1e3 * DT, ..made.rows() };
+    let other = fit(&[rows], &Options { to: 500.0, ..options }).unwrap();
+    let same = |a: f64, b: f64| (a / b - 1.0).abs() < 1e-9;
+    assert!(same(other.delay, 1e3 * plain.delay) && same(other.gain, 1e-6 * plain.gain));
+    assert!(same(other.coefficients[0], 1e-3 * plain.coefficients[0]));
+    assert!(same(other.coefficients[1], 1e9 * plain.coefficients[1]));
+    assert!(same(other.delay_std, 1e3 * plain.delay_std));
+    assert!(same(other.separability.inflation, plain.separability.inflation));
+    assert!(same(other.separability.condition, plain.separability.condition));
+}
