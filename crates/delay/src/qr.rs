@@ -1,0 +1,129 @@
+//! Least squares by Householder QR of normalised columns: the only solver of this crate.
+use nalgebra::DMatrix;
+
+/// A = Q R diag(scale): columns are divided by their norms first, so that units do not matter.
+pub(crate) struct Factors {
+    /// Orthonormal columns, n × k.
+    pub(crate) q: DMatrix<f64>,
+    /// Upper triangle of the normalised columns, k × k.
+    r: DMatrix<f64>,
+    /// Norms of the columns.
+    scale: Vec<f64>,
+}
+
+/// A column depends linearly on those before it.
+pub(crate) struct Dependent {
+    /// Index of the column.
+    pub(crate) column: usize,
+}
+
+/// A normalised column whose part orthogonal to those before it is smaller is taken as dependent: what is left of
+/// it is rounding.
+const RANK: f64 = 1e-12;
+
+impl Factors {
+    /// Factors a matrix with at least as many rows as columns and finite entries.
+    pub(crate) fn new(mut a: DMatrix<f64>) -> Result<Self, Dependent> {
+        let mut scale = Vec::with_capacity(a.ncols());
+        for (column, mut entries) in a.column_iter_mut().enumerate() {
+            let norm = entries.norm();
+            if norm == 0.0 {
+                return Err(Dependent { column });
+            }
+            entries /= norm;
+            scale.push(norm);
+        }
+        let (q, r) = a.qr().unpack();
+        match (0..r.ncols()).find(|&j| r[(j, j)].abs() < RANK) {
+            Some(column) => Err(Dependent { column }),
+            None => Ok(Self { q, r, scale }),
+        }
+    }
+
+    /// The coefficients that minimise |A c − b|.
+    pub(crate) fn solve(&self, b: &[f64]) -> Vec<f64> {
+        let k = self.scale.len();
+        let mut c: Vec<f64> = (0..k).map(|j| dot(self.q.column(j).as_slice(), b)).collect();
+        for j in (0..k).rev() {
+            c[j] /= self.r[(j, j)];
+            for i in 0..j {
+                c[i] -= self.r[(i, j)] * c[j];
+            }
+        }
+        c.iter().zip(&self.scale).map(|(c, s)| c / s).collect()
+    }
+
+    /// Removes from `v` what lies in the span of the columns. Applied twice, it is orthogonal to rounding.
+    pub(crate) fn project_out(&self, v: &mut [f64]) {
+        for _ in 0..2 {
+            for q in self.q.column_iter() {
+                let along = dot(q.as_slice(), v);
+                v.iter_mut().zip(q.iter()).for_each(|(v, q)| *v -= along * q);
+            }
+        }
+    }
+
+    /// R⁻¹ with the scaling undone: (AᵀA)⁻¹ = S Sᵀ.
+    pub(crate) fn inverse_factor(&self) -> DMatrix<f64> {
+        let k = self.scale.len();
+        let mut inverse = DMatrix::<f64>::zeros(k, k);
+        for j in 0..k {
+            inverse[(j, j)] = 1.0 / self.r[(j, j)];
+            for i in (0..j).rev() {
+                let sum: f64 = (i + 1..=j).map(|l| self.r[(i, l)] * inverse[(l, j)]).sum();
+                inverse[(i, j)] = -sum / self.r[(i, i)];
+            }
+        }
+        for (i, scale) in self.scale.iter().enumerate() {
+            inverse.row_mut(i).iter_mut().for_each(|e| *e /= scale);
+        }
+        inverse
+    }
+
+    /// Condition number of the normalised columns.
+    pub(crate) fn condition(&self) -> f64 {
+        let singular = self.r.singular_values();
+        singular.max() / singular.min()
+    }
+}
+
+pub(crate) fn dot(a: &[f64], b: &[f64]) -> f64 {
+    a.iter().zip(b).map(|(a, b)| a * b).sum()
+}
+
+/// Rows of a symmetric matrix.
+pub(crate) fn to_rows(m: &DMatrix<f64>) -> Vec<Vec<f64>> {
+    m.row_iter().map(|row| row.iter().copied().collect()).collect()
+}
+
+/// A regression problem reduced to as many rows as columns: |A c − b|² = |R c − z|² + rest, and so for every
+/// leading part of the columns.
+pub(crate) struct Compressed {
+    pub(crate) r: DMatrix<f64>,
+    pub(crate) z: Vec<f64>,
+    rest: f64,
+    rows: usize,
+}
+
+impl Compressed {
+    /// Reduces the given rows (repeats allowed) of a problem.
+    pub(crate) fn new(columns: &[Vec<f64>], target: &[f64], rows: &[usize]) -> Self {
+        let a = DMatrix::from_fn(rows.len(), columns.len(), |i, j| columns[j][rows[i]]);
+        let mut b: Vec<f64> = rows.iter().map(|&i| target[i]).collect();
+        let (q, r) = a.qr().unpack();
+        let z: Vec<f64> = q.column_iter().map(|q| dot(q.as_slice(), &b)).collect();
+        for (q, z) in q.column_iter().zip(&z) {
+            b.iter_mut().zip(q.iter()).for_each(|(b, q)| *b -= z * q);
+        }
+        Self { r, z, rest: dot(&b, &b), rows: rows.len() }
+    }
+
+    /// |A c − b|²/n for coefficients of the leading columns.
+    pub(crate) fn mean_square_error(&self, coefficients: &[f64]) -> f64 {
+        let mut left = self.z.clone();
+        for (j, c) in coefficients.iter().enumerate().filter(|(_, c)| **c != 0.0) {
+            left.iter_mut().zip(self.r.column(j).iter()).for_each(|(l, r)| *l -= c * r);
+        }
+        (dot(&left, &left) + self.rest) / self.rows as f64
+    }
+}
