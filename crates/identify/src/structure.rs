@@ -30,11 +30,9 @@ pub(crate) struct Signal {
     pub unit: Option<String>,
 }
 
-/// A part of an equation that is not a coefficient times a term: a delayed feedback.
+/// A part of every equation that is not a coefficient times a term: a delayed feedback beside the input.
 #[derive(Debug, Clone, PartialEq)]
 pub(crate) struct Extra {
-    /// Index of the equation.
-    pub equation: usize,
     /// Expression in the model language.
     pub expression: String,
     /// Its parameters: name, first value, whether known.
@@ -120,7 +118,7 @@ impl Structure {
                     (true, expression) => format!("{}*{expression}", t.parameter),
                 })
                 .collect();
-            left.extend(self.extras.iter().filter(|x| x.equation == e).map(|x| x.expression.clone()));
+            left.extend(self.extras.iter().map(|x| x.expression.clone()));
             let left = left.join(" + ").replace("+ -", "- ");
             let right = equation.input.as_deref().unwrap_or("0");
             let _ = writeln!(text, "{} = \"{left} = {right}\"", equation.name);

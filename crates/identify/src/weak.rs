@@ -25,6 +25,10 @@ pub(crate) struct Rows {
     pub delayed: Option<Vec<f64>>,
     /// Windows without overlap among the rows.
     pub independent: f64,
+    /// Rows that share samples with one row, on one side.
+    pub overlap: usize,
+    /// Row ranges of the pieces.
+    pub pieces: Vec<std::ops::Range<usize>>,
 }
 
 /// A delayed feedback, its delay held at a trial value.
@@ -167,28 +171,50 @@ pub(crate) fn rows(
     let delayed = if trial.is_some() { rows.columns.pop() } else { None };
     let overlap = intervals.div_ceil(hop);
     let independent = (target.len() as f64 / overlap as f64).max(1.0);
-    Some(Rows { columns: rows.columns, target, terms, delayed, independent })
+    let mut pieces: Vec<std::ops::Range<usize>> = Vec::new();
+    for (row, piece) in rows.pieces.iter().enumerate() {
+        match pieces.last_mut() {
+            Some(range) if rows.pieces[range.start] == *piece => range.end = row + 1,
+            _ => pieces.push(row..row + 1),
+        }
+    }
+    Some(Rows { columns: rows.columns, target, terms, delayed, independent, overlap, pieces })
 }
 
-/// The regression in triangular form; returns the columns' candidates with it. Without input the leading
-/// derivative moves to the right; a delayed feedback does where its gain is known, else it is the last column.
-pub(crate) fn reduce(structure: &Structure, rows: &Rows, gain: Option<f64>) -> (Reduced, Vec<usize>) {
-    let n = rows.target.len();
-    let free: Vec<usize> = (0..rows.terms.len()).filter(|&c| structure.has_coefficient(rows.terms[c])).collect();
+/// Target, columns with the candidates they stand for (none: the delayed feedback), and the columns that must stay.
+/// Without input the leading derivative moves to the right; a delayed feedback does where its gain is known.
+pub(crate) fn regression(
+    structure: &Structure,
+    rows: &Rows,
+    gain: Option<f64>,
+) -> (Vec<f64>, Vec<(Option<usize>, Vec<f64>)>, Vec<usize>) {
     let mut target = rows.target.clone();
-    for c in (0..rows.terms.len()).filter(|c| !free.contains(c)) {
-        target.iter_mut().zip(&rows.columns[c]).for_each(|(t, v)| *t -= v);
-    }
-    let mut unknown: Vec<&[f64]> = free.iter().map(|&c| rows.columns[c].as_slice()).collect();
+    let mut columns: Vec<(Option<usize>, Vec<f64>)> = Vec::new();
     if let Some(delayed) = &rows.delayed {
         match gain {
             Some(gain) => target.iter_mut().zip(delayed).for_each(|(t, v)| *t += gain * v),
-            None => unknown.push(delayed),
+            None => columns.push((None, delayed.clone())),
         }
     }
-    let k = unknown.len();
+    for (&term, column) in rows.terms.iter().zip(&rows.columns) {
+        if structure.has_coefficient(term) {
+            columns.push((Some(term), column.clone()));
+        } else {
+            target.iter_mut().zip(column).for_each(|(t, v)| *t -= v);
+        }
+    }
+    let stays = |t: &Option<usize>| t.is_none_or(|t| !structure.terms[t].optional);
+    let protected = (0..columns.len()).filter(|&c| stays(&columns[c].0)).collect();
+    (target, columns, protected)
+}
+
+/// The regression in triangular form, and the candidates of its columns (none: the delayed feedback).
+pub(crate) fn reduce(structure: &Structure, rows: &Rows, gain: Option<f64>) -> (Reduced, Vec<Option<usize>>) {
+    let (target, columns, _) = regression(structure, rows, gain);
+    let n = target.len();
+    let k = columns.len();
     let mut a = Vec::with_capacity(n * (k + 1));
-    for column in &unknown {
+    for (_, column) in &columns {
         a.extend_from_slice(column);
     }
     a.extend_from_slice(&target);
@@ -212,7 +238,7 @@ pub(crate) fn reduce(structure: &Structure, rows: &Rows, gain: Option<f64>) -> (
         samples: rows.independent.max(k as f64 + 2.0),
         floor: 1e-10 * target.iter().map(|v| v * v).sum::<f64>() / n.max(1) as f64,
     };
-    (reduced, free.into_iter().map(|c| rows.terms[c]).collect())
+    (reduced, columns.into_iter().map(|c| c.0).collect())
 }
 
 fn z_scaled(z: Vec<f64>, factor: f64) -> Vec<f64> {
