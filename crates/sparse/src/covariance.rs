@@ -51,7 +51,10 @@ pub fn newey_west(
     let sample = Sample::new(design, rows)?;
     let normalised = sample.normalised(design.columns());
     let l = cholesky(&normalised.correlation, normalised.columns, active).ok_or_else(|| {
-        SparseError::RankDeficient { column: active[k - 1], others: active[..k - 1].to_vec() }
+        SparseError::RankDeficient {
+            column: active.last().copied().unwrap_or(0),
+            others: active.iter().copied().take(k.saturating_sub(1)).collect(),
+        }
     })?;
     // Scores of normalised columns, range by range.
     let residual = design.residual(coefficients, rows);

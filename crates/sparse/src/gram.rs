@@ -219,7 +219,17 @@ impl<'a> Sample<'a> {
         &self.gram
     }
 
-    /// The first `columns` columns, normalised.
+    /// Check that there are as many columns as asked for, and at least one.
+    pub(crate) fn check_size(&self, columns: usize) -> Result<(), SparseError> {
+        let found = self.gram.columns();
+        if columns == 0 || columns > found {
+            let column = columns.saturating_sub(1);
+            return Err(SparseError::NoSuchColumn { what: "the number of columns", column, columns: found });
+        }
+        Ok(())
+    }
+
+    /// The first `columns` columns (all, if there are fewer), normalised.
     #[must_use]
     pub fn normalised(&self, columns: usize) -> Normalised {
         let g = &self.gram;

@@ -2,7 +2,6 @@
 //! doi:10.18637/jss.v033.i01; sign-fixed steps after Lee et al., NIPS 2006).
 
 use crate::SparseError;
-use crate::design::Design;
 use crate::gram::{Normalised, Sample};
 use crate::least_squares::{cholesky, cholesky_back};
 use crate::stlsq::{check_grid, live_columns};
@@ -37,6 +36,7 @@ pub fn lasso(
     weights: &[f64],
 ) -> Result<Vec<Vec<f64>>, SparseError> {
     check_grid(grid)?;
+    sample.check_size(columns)?;
     if !weights.is_empty() && weights.len() != columns {
         return Err(SparseError::Length {
             what: "the list of weights".into(),
@@ -49,7 +49,6 @@ pub fn lasso(
     }
     let weight = |j: usize| weights.get(j).copied().unwrap_or(1.0);
     let protected: Vec<usize> = (0..columns).filter(|&j| weight(j) == 0.0).collect();
-    Design::check_columns("the list of columns", &protected, sample.gram().columns())?;
     let normalised = sample.normalised(columns);
     let live = live_columns(&normalised, &protected)?;
     let free: Vec<usize> = live.iter().copied().filter(|j| weight(*j) > 0.0).collect();
@@ -256,7 +255,10 @@ pub fn soft_threshold(z: f64, gamma: f64) -> f64 {
 /// # Errors
 /// As [`Sample::solve`].
 pub fn refit(sample: &Sample<'_>, path: &[Vec<f64>]) -> Result<Vec<Vec<f64>>, SparseError> {
-    let columns = path.first().map_or(0, Vec::len);
+    let columns = path.iter().map(Vec::len).max().unwrap_or(0);
+    if columns > 0 {
+        sample.check_size(columns)?;
+    }
     let normalised = sample.normalised(columns);
     path.iter()
         .map(|c| {

@@ -122,6 +122,7 @@ impl Reduced {
 
     /// Column-normalised triangular factor of the active columns: its columns (m values each), the rotated
     /// target (m values, then one more: the norm of the residual) and the columns' norms.
+    #[allow(clippy::type_complexity)] // one factorisation with its three parts, taken apart at once
     pub(crate) fn triangle(
         &self,
         active: &[usize],

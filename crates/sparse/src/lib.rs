@@ -10,6 +10,9 @@
 //! | [`mod@bootstrap`], [`covariance`] | spread of the coefficients, also for correlated rows |
 //!
 //! The README's example recovers a sparse cubic.
+// A single range is a set of rows here, never a mistaken list of numbers.
+#![allow(clippy::single_range_in_vec_init)]
+
 pub mod bootstrap;
 pub mod covariance;
 pub mod criteria;

@@ -44,13 +44,7 @@ impl Selector {
         grid: &[f64],
         protected: &[usize],
     ) -> Result<Vec<Vec<f64>>, SparseError> {
-        if columns == 0 || columns > sample.gram().columns() {
-            return Err(SparseError::NoSuchColumn {
-                what: "the size of the order",
-                column: columns.saturating_sub(1),
-                columns: sample.gram().columns(),
-            });
-        }
+        sample.check_size(columns)?;
         Design::check_columns("the protected list", protected, columns)?;
         let weights = || (0..columns).map(|j| if protected.contains(&j) { 0.0 } else { 1.0 });
         match self {

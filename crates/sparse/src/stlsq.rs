@@ -31,6 +31,7 @@ pub fn stlsq(
     protected: &[usize],
 ) -> Result<Vec<Vec<f64>>, SparseError> {
     check_grid(grid)?;
+    sample.check_size(columns)?;
     Design::check_columns("the protected list", protected, columns)?;
     let normalised = sample.normalised(columns);
     let mut solved: BTreeMap<Vec<usize>, Vec<f64>> = BTreeMap::new();

@@ -108,6 +108,7 @@ struct Triangle {
 
 impl Triangle {
     fn new(sample: &Sample<'_>, columns: usize, protected: &[usize]) -> Result<Self, SparseError> {
+        sample.check_size(columns)?;
         Design::check_columns("the protected list", protected, columns)?;
         let normalised = sample.normalised(columns);
         let live = live_columns(&normalised, protected)?;

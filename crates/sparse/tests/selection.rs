@@ -1,5 +1,7 @@
 //! Known answers and recovery.
 
+#![allow(clippy::single_range_in_vec_init)]
+
 use greybox_sparse::*;
 use rand::SeedableRng;
 use rand_distr::{Distribution, StandardNormal};

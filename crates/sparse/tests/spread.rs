@@ -1,5 +1,7 @@
 //! Spread of coefficients when rows are correlated.
 
+#![allow(clippy::single_range_in_vec_init)]
+
 use greybox_sparse::*;
 use rand::SeedableRng;
 use rand_distr::{Distribution, StandardNormal};
