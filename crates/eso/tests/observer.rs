@@ -110,6 +110,26 @@ fn zero_phase_with_an_input_knows_the_direction_of_time() {
 }
 
 #[test]
+fn zero_phase_turns_the_input_of_a_first_order_plant() {
+    // y' = 2 u + d: seen backward, both change their sign.
+    let h = 1e-3;
+    let design = Design::<2>::from_bandwidth(80.0, [Fal::LINEAR; 2]).unwrap();
+    let observer = Observer::new(design, h, Scheme::Trapezoidal).unwrap().with_extended_state(2.0).unwrap();
+    let us: Vec<f64> = (0..3000).map(|k| (7e-3 * f64::from(k)).cos().signum()).collect();
+    let mut ys = vec![0.0];
+    for u in &us[1..] {
+        ys.push(ys[ys.len() - 1] + h * (2.0 * u - 1.5));
+    }
+    // us[k] acts from sample k − 1 here, so the observer gets it one sample earlier.
+    let acting: Vec<f64> = us[1..].iter().copied().chain([0.0]).collect();
+    let mut z = vec![[0.0; 2]; ys.len()];
+    record::zero_phase(&observer, &ys, Some(&acting), &mut z).unwrap();
+    for k in 500..2500 {
+        assert!((z[k][1] + 1.5).abs() < 1e-6, "at {k}: {:?}", z[k]);
+    }
+}
+
+#[test]
 fn missing_samples_are_bridged() {
     let mut observer = Observer::new(Design::thesis(), 1e-3, Scheme::Trapezoidal).unwrap();
     assert_eq!(observer.update(f64::NAN, 0.0), [0.0, 0.0]);
