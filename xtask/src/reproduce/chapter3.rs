@@ -1,0 +1,143 @@
+//! Chapter 3: identification with time delay.
+
+use anyhow::Result;
+
+use super::chapter2::{Beam, photograph};
+use super::fixture::Fixture;
+use super::index::number;
+use super::{Check, Column, Entry, Piece, Status, Table};
+
+/// Its tables and figures, in order.
+pub(crate) fn entries() -> Vec<Entry> {
+    vec![
+        Entry { id: "Table 3.1", make: None },
+        Entry { id: "Table 3.2", make: Some(table_3_2) },
+        Entry { id: "Figure 3.1", make: None },
+        Entry { id: "Figure 3.2", make: Some(photograph) },
+        Entry { id: "Table 3.3", make: Some(table_3_3) },
+        Entry { id: "Figure 3.3", make: None },
+        Entry { id: "Figure 3.4", make: None },
+        Entry { id: "Figure 3.5", make: None },
+        Entry { id: "Table 3.4", make: None },
+        Entry { id: "Table 3.5", make: None },
+    ]
+}
+
+/// The gain of the proportional control in section 3.3.
+const KP: f64 = 2.0;
+
+/// Physical parameters from the coefficients of equation 3.9, with the signs of erratum E12.
+#[derive(Debug, Clone, Copy, PartialEq)]
+struct Physical {
+    tau: f64,
+    m: f64,
+    c1: f64,
+    k1: f64,
+}
+
+/// kp τ³/6 on x''', m − kp τ²/2 on x'', c1 + kp τ on x', k1 − kp on x.
+///
+/// As E12 asks: 3.12 is printed with the opposite signs of the last three. The cube root is the real one, a
+/// negative coefficient gives a negative delay.
+fn physical(kp: f64, jerk: f64, inertia: f64, damping: f64, stiffness: f64) -> Physical {
+    let tau = (6.0 * jerk / kp).cbrt();
+    Physical { tau, m: inertia + 0.5 * kp * tau * tau, c1: damping - kp * tau, k1: stiffness + kp }
+}
+
+/// Table 3.2 from the coefficients that Table 3.1 prints.
+fn table_3_2(fixture: &Fixture) -> Result<Piece> {
+    let from_table = physical(KP, 0.001515, 0.9611, 1.3922, 3.9830);
+    let exact = physical(KP, 0.0026667, 0.96, 1.4, 4.0);
+    let values = vec![
+        ("m".to_owned(), from_table.m),
+        ("k1".to_owned(), from_table.k1),
+        ("c1".to_owned(), from_table.c1),
+        ("tau".to_owned(), from_table.tau),
+    ];
+    let (mut to_thesis, mut to_truth): (f64, f64) = (0.0, 0.0);
+    for (row, value) in &values {
+        to_thesis = to_thesis.max((value - fixture.number(row, "thesis")?).abs());
+    }
+    for (row, value) in [("m", exact.m), ("k1", exact.k1), ("c1", exact.c1), ("tau", exact.tau)] {
+        to_truth = to_truth.max((value - fixture.number(row, "truth")?).abs());
+    }
+    // With the signs of 3.12 as printed.
+    let tau = from_table.tau;
+    let as_printed = [("m", 0.9611 - 0.5 * KP * tau * tau), ("c1", 1.3922 + KP * tau), ("k1", 3.9830 - KP)];
+    let mut rows = Vec::new();
+    for (name, wrong) in as_printed {
+        let ours = values.iter().find(|(row, _)| row == name).map_or(f64::NAN, |(_, value)| *value);
+        rows.push(vec![name.into(), number(fixture.number(name, "thesis")?), number(ours), number(wrong)]);
+    }
+    let mut piece = Piece::new(
+        Status::Constants,
+        "What the coefficients printed in Table 3.1 imply, with the signs of erratum E12: the thesis's two tables \
+         agree. k3, c2 and c3 stand in Table 3.1 as they are. An estimate of ours is not in this table.",
+    );
+    piece.columns.push(Column { title: "from Table 3.1's coefficients".into(), values });
+    let headings = ["", "thesis", "signs of E12", "signs as printed in 3.12"].map(String::from).into();
+    piece.tables.push(Table {
+        caption: "Which signs of equation 3.12 the thesis used".into(),
+        headings,
+        rows,
+    });
+    piece.checks.push(Check::new("largest gap to Table 3.2, from Table 3.1", to_thesis));
+    piece
+        .checks
+        .push(Check::new("largest gap to the selected values, from the exact coefficients", to_truth));
+    Ok(piece)
+}
+
+/// Table 3.3: constants, and the nominal column of Table 3.5 that contradicts them (E8, E10).
+fn table_3_3(fixture: &Fixture) -> Result<Piece> {
+    let (printed, consistent) = (Beam::read(fixture, "thesis")?, Beam::read(fixture, "truth")?);
+    let a = 1.0 / consistent.volts_per_torque();
+    // E16: the gain that both entries of Table 3.5 need, which the text does not state.
+    let kp = 10f64.sqrt();
+    let tau = 0.2;
+    let row = |name: &str, thesis: f64, printed: f64, consistent: f64| {
+        vec![name.to_owned(), number(thesis), number(printed), number(consistent)]
+    };
+    let nominal = 0.5 * a * kp * tau * tau;
+    let rows = vec![
+        row("ks·(Jl + Jeq)/Jl", 2.0501, printed.joint_stiffness(), consistent.joint_stiffness()),
+        row("a·kp·τ²/2 with kp = √10, τ = 0.2 s", 0.008121, nominal, nominal),
+        row("Jeq + a·kp·τ²/2", 0.0102, 9.76e-5 + nominal, 0.002084 + nominal),
+        row("Beq − a·kp·τ", -0.0662, 0.015 - a * kp * tau, 0.015 - a * kp * tau),
+    ];
+    let mut piece = Piece::new(
+        Status::Constants,
+        "Data-sheet values, the same as in Table 2.2. Jeq contradicts the nominal column of Table 3.5; the last column \
+         is the set that agrees with it.",
+    );
+    let headings = ["", "Table 3.5, nominal", "from the constants as printed", "from the consistent set"];
+    piece.tables.push(Table {
+        caption: "What the constants give, beside the nominal column of Table 3.5; a = ηg·kg·ηm·kt/Rm".into(),
+        headings: headings.map(String::from).into(),
+        rows,
+    });
+    piece.checks.push(Check::new("ks*(Jl + Jeq)/Jl, consistent", consistent.joint_stiffness()));
+    piece.checks.push(Check::new("a*kp*tau^2/2 against Table 3.5", nominal / 0.008121));
+    piece.checks.push(Check::new("Beq - a*kp*tau against Table 3.5", (0.015 - a * kp * tau) / -0.0662));
+    Ok(piece)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn coefficients_go_there_and_back() {
+        let (kp, tau) = (KP, 0.17_f64);
+        let (m, c1, k1) = (1.3, 0.4, 5.0);
+        let back = physical(kp, kp * tau.powi(3) / 6.0, m - kp * tau * tau / 2.0, c1 + kp * tau, k1 - kp);
+        for (a, b) in [(back.tau, tau), (back.m, m), (back.c1, c1), (back.k1, k1)] {
+            assert!((a - b).abs() < 1e-14);
+        }
+    }
+
+    #[test]
+    fn a_negative_coefficient_gives_a_negative_delay() {
+        assert!(physical(KP, -0.001515, 1.0, 1.0, 1.0).tau < -0.1);
+    }
+}
