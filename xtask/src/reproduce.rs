@@ -10,6 +10,7 @@ mod chapter3;
 pub(crate) mod figure;
 mod fixture;
 mod index;
+mod joint;
 
 use std::path::{Path, PathBuf};
 

@@ -160,16 +160,35 @@ impl Beam {
         (self.jl + self.jeq) / self.jl
     }
 
+    /// θ'' of equation 3.21 with B_l = 0: the torque in N m beside damping, back-emf and spring, over Jeq.
+    pub(crate) fn hub_acceleration(&self, torque: f64, dtheta: f64, alpha: f64) -> f64 {
+        let back_emf = self.kg * self.km / self.volts_per_torque() * dtheta;
+        (torque - back_emf - self.beq * dtheta + self.ks * alpha) / self.jeq
+    }
+
+    /// ks/Jl, 1/s².
+    pub(crate) fn spring_over_link(&self) -> f64 {
+        self.ks / self.jl
+    }
+
+    /// The joint of section 3.4 as Table 3.5 has it (E8, E9): Jeq = 0.00208, Beq = 0.015.
+    pub(crate) fn joint() -> Self {
+        Self { jeq: 0.00208, beq: 0.015, ..Self::consistent() }
+    }
+
     /// The spring's factor in the α-equation, ks (Jl + Jeq)/Jl.
     pub(crate) fn joint_stiffness(&self) -> f64 {
         self.ks * self.inertia_ratio()
     }
 }
 
+/// Something that follows from the constants.
+type Quantity = fn(&Beam) -> f64;
+
 /// What the constants, as printed and consistent, make of the thesis's other numbers: the table, and the
 /// largest relative gap of the consistent set.
 fn consistency(printed: &Beam, consistent: &Beam) -> (Table, f64) {
-    let quantities: [(&str, fn(&Beam) -> f64, f64); 4] = [
+    let quantities: [(&str, Quantity, f64); 4] = [
         ("θ'' of Table 2.3: C·Jeq", Beam::inertia, 0.016231),
         ("θ' of Table 2.3: C·(Beq + ηg·kg²·km·ηm·kt/Rm)", Beam::damping, 0.7323),
         ("α in the θ-equation of Table 2.3: −C·ks", Beam::stiffness, -10.124),

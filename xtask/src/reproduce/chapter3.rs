@@ -1,11 +1,15 @@
 //! Chapter 3: identification with time delay.
 
-use anyhow::Result;
+use std::f64::consts::TAU;
+
+use anyhow::{Context, Result};
+use greybox_eso::{Design, Observer, Scheme, record};
 
 use super::chapter2::{Beam, photograph};
+use super::figure::{Axis, Plot, Series, Style};
 use super::fixture::Fixture;
 use super::index::number;
-use super::{Check, Column, Entry, Piece, Status, Table};
+use super::{Check, Column, Drawing, Entry, Piece, Status, Table, joint};
 
 /// Its tables and figures, in order.
 pub(crate) fn entries() -> Vec<Entry> {
@@ -15,8 +19,8 @@ pub(crate) fn entries() -> Vec<Entry> {
         Entry { id: "Figure 3.1", make: None },
         Entry { id: "Figure 3.2", make: Some(photograph) },
         Entry { id: "Table 3.3", make: Some(table_3_3) },
-        Entry { id: "Figure 3.3", make: None },
-        Entry { id: "Figure 3.4", make: None },
+        Entry { id: "Figure 3.3", make: Some(figure_3_3) },
+        Entry { id: "Figure 3.4", make: Some(figure_3_4) },
         Entry { id: "Figure 3.5", make: None },
         Entry { id: "Table 3.4", make: None },
         Entry { id: "Table 3.5", make: None },
@@ -120,6 +124,102 @@ fn table_3_3(fixture: &Fixture) -> Result<Piece> {
     piece.checks.push(Check::new("a*kp*tau^2/2 against Table 3.5", nominal / 0.008121));
     piece.checks.push(Check::new("Beq - a*kp*tau against Table 3.5", (0.015 - a * kp * tau) / -0.0662));
     Ok(piece)
+}
+
+/// Figure 3.3: the joint follows 2 sin(2π 0.66 t).
+fn figure_3_3(fixture: &Fixture) -> Result<Piece> {
+    let (amplitude, frequency) = reference_of(fixture)?;
+    response(fixture, |t| amplitude * (TAU * frequency * t).sin())
+}
+
+/// Figure 3.4: the joint follows a square wave.
+fn figure_3_4(fixture: &Fixture) -> Result<Piece> {
+    let (amplitude, frequency) = reference_of(fixture)?;
+    response(fixture, |t| if (frequency * t).fract() < 0.5 { amplitude } else { -amplitude })
+}
+
+fn reference_of(fixture: &Fixture) -> Result<(f64, f64)> {
+    let get = |row: &str| fixture.number(row, "thesis");
+    Ok((get("amplitude of the reference")?, get("frequency of the reference")?))
+}
+
+/// Seconds of the record that are drawn.
+const SHOWN: f64 = 10.0;
+
+/// The four signals of figures 3.3 and 3.4 on the virtual joint, for one minute, and how well the observer of
+/// equation 3.27 estimates the velocities.
+fn response(fixture: &Fixture, reference: impl Fn(f64) -> f64) -> Result<Piece> {
+    let run = joint::run(&Beam::joint(), reference, 60.0);
+    let (theta, alpha) = (run.column(0), run.column(1));
+    let mut piece = Piece::new(
+        Status::VirtualRig,
+        "The recordings are not public. A linear joint with the constants of Table 3.5, kp = √10 (E16) and the delay of \
+         0.2 s takes the place of the real one: free of noise and friction, and without the amplifier's limit of 10 V.",
+    );
+    let largest = |values: &[f64]| values.iter().fold(0.0_f64, |most, v| most.max(v.abs()));
+    piece.checks.extend([
+        Check::new("theta at 1 s, rad", theta[1000]),
+        Check::new("theta at 5 s, rad", theta[5000]),
+        Check::new("theta at 20 s, rad", theta[20_000]),
+        Check::new("alpha at 20 s, rad", alpha[20_000]),
+        Check::new("largest theta, rad", largest(&theta)),
+        Check::new("largest alpha, rad", largest(&alpha)),
+        Check::new("largest voltage, V", largest(&run.voltage)),
+    ]);
+
+    let mut draw = |caption: &str, unit: &str, series: Vec<(&str, Style, &[f64])>| -> Result<()> {
+        let curves = series.into_iter().map(|(label, style, values)| {
+            let points = values.iter().enumerate().step_by(10).map(|(k, v)| [k as f64 * joint::STEP, *v]);
+            Series::new(label, style, points.take_while(|p| p[0] <= SHOWN).collect())
+        });
+        let plot = Plot {
+            alt: format!("{}: {caption}", fixture.id),
+            x: Axis::linear("time in s"),
+            y: Axis::linear(unit),
+            series: curves.collect(),
+        };
+        let svg = plot.to_svg().with_context(|| format!("{caption}: nothing to draw"))?;
+        piece.figures.push(Drawing { caption: caption.into(), svg });
+        Ok(())
+    };
+    draw("Motor voltage.", "V_m in V", vec![("", Style::Line, &run.voltage)])?;
+    draw(
+        "Angle of the base and its reference.",
+        "angle in rad",
+        vec![("θ", Style::Line, &theta), ("θ_d", Style::Dashed, &run.reference)],
+    )?;
+    draw("Deflection of the joint.", "α in rad", vec![("", Style::Line, &alpha)])?;
+    for (name, angle, rate) in [("theta", &theta, run.column(2)), ("alpha", &alpha, run.column(3))] {
+        let observer = Observer::new(Design::thesis(), joint::STEP, Scheme::Euler)?;
+        let (mut literal, mut ahead) = (vec![[0.0; 2]; angle.len()], vec![[0.0; 2]; angle.len()]);
+        let complete = record::lag_compensated(&observer, angle, None, &mut literal, &mut ahead)?;
+        let estimate: Vec<f64> = literal.iter().map(|z| z[1]).collect();
+        let compensated: Vec<f64> = ahead.iter().map(|z| z[1]).collect();
+        let off = |estimate: &[f64]| relative_rms(&estimate[1000..complete], &rate[1000..complete]);
+        let symbol = if name == "theta" { "θ'" } else { "α'" };
+        draw(
+            &format!(
+                "{symbol}, and its estimate by the observer of equation 3.27, which lags by 25 ms (E6)."
+            ),
+            &format!("{symbol} in rad/s"),
+            vec![("true", Style::Line, &rate), ("z₂", Style::Dashed, &estimate)],
+        )?;
+        let literal_error = off(&estimate);
+        let compensated_error = off(&compensated);
+        piece.checks.push(Check::new(format!("{name}' by the observer, relative rms error"), literal_error));
+        piece.checks.push(Check::new(
+            format!("{name}' by the observer, lag taken out, relative rms error"),
+            compensated_error,
+        ));
+    }
+    Ok(piece)
+}
+
+/// RMS(estimate − truth) / RMS(truth).
+fn relative_rms(estimate: &[f64], truth: &[f64]) -> f64 {
+    let wrong: f64 = estimate.iter().zip(truth).map(|(e, t)| (e - t) * (e - t)).sum();
+    let size: f64 = truth.iter().map(|t| t * t).sum();
+    (wrong / size).sqrt()
 }
 
 #[cfg(test)]
