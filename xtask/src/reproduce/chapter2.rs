@@ -99,7 +99,7 @@ fn figure_2_1(fixture: &Fixture) -> Result<Piece> {
 }
 
 /// Constants of the rotary flexible beam (equations 2.20 and 2.21).
-#[derive(Debug, Clone, Copy)]
+#[derive(Debug, Clone, Copy, PartialEq)]
 pub(crate) struct Beam {
     jl: f64,
     jeq: f64,
@@ -275,6 +275,15 @@ mod tests {
             }
             assert_eq!(next, n);
         }
+    }
+
+    #[test]
+    fn the_constants_in_use_are_those_of_the_tables() {
+        let folder = crate::root().join("fixtures").join("thesis");
+        let table = |id: &str| Fixture::read(&folder, id).unwrap();
+        assert_eq!(Beam::read(&table("Table 2.2"), "truth").unwrap(), Beam::consistent());
+        let joint = Beam { jeq: 0.002084, ..Beam::joint() };
+        assert_eq!(Beam::read(&table("Table 3.3"), "truth").unwrap(), joint);
     }
 
     #[test]

@@ -237,6 +237,17 @@ mod tests {
     }
 
     #[test]
+    fn the_coefficients_in_use_are_those_of_table_3_1() {
+        let folder = crate::root().join("fixtures").join("thesis");
+        let table = Fixture::read(&folder, "Table 3.1").unwrap();
+        let get = |row: &str| table.number(row, "thesis").unwrap();
+        assert_eq!(
+            physical(KP, get("x'''"), get("x''"), get("x'"), get("x")),
+            physical(KP, 0.001515, 0.9611, 1.3922, 3.9830)
+        );
+    }
+
+    #[test]
     fn a_negative_coefficient_gives_a_negative_delay() {
         assert!(physical(KP, -0.001515, 1.0, 1.0, 1.0).tau < -0.1);
     }
