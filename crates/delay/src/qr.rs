@@ -22,16 +22,20 @@ pub(crate) struct Dependent {
 const RANK: f64 = 1e-12;
 
 impl Factors {
-    /// Factors a matrix with at least as many rows as columns and finite entries.
+    /// Factors a matrix with at least as many rows as columns. A column that is zero, or whose numbers
+    /// overflowed, is as good as dependent.
     pub(crate) fn new(mut a: DMatrix<f64>) -> Result<Self, Dependent> {
         let mut scale = Vec::with_capacity(a.ncols());
         for (column, mut entries) in a.column_iter_mut().enumerate() {
+            // In two steps, so that squares neither overflow nor vanish.
+            let largest = entries.amax();
+            entries /= largest;
             let norm = entries.norm();
-            if norm == 0.0 {
+            if !(largest > 0.0 && (largest * norm).is_finite() && norm.is_finite()) {
                 return Err(Dependent { column });
             }
             entries /= norm;
-            scale.push(norm);
+            scale.push(largest * norm);
         }
         let (q, r) = a.qr().unpack();
         match (0..r.ncols()).find(|&j| r[(j, j)].abs() < RANK) {
@@ -82,8 +86,8 @@ impl Factors {
 
     /// Condition number of the normalised columns.
     pub(crate) fn condition(&self) -> f64 {
-        let singular = self.r.singular_values();
-        singular.max() / singular.min()
+        let svd = self.r.clone().try_svd(false, false, f64::EPSILON, 100 * self.scale.len());
+        svd.map_or(f64::INFINITY, |svd| svd.singular_values.max() / svd.singular_values.min())
     }
 }
 
