@@ -99,35 +99,3 @@ pub(crate) fn dot(a: &[f64], b: &[f64]) -> f64 {
 pub(crate) fn to_rows(m: &DMatrix<f64>) -> Vec<Vec<f64>> {
     m.row_iter().map(|row| row.iter().copied().collect()).collect()
 }
-
-/// A regression problem reduced to as many rows as columns: |A c − b|² = |R c − z|² + rest, and so for every
-/// leading part of the columns.
-pub(crate) struct Compressed {
-    pub(crate) r: DMatrix<f64>,
-    pub(crate) z: Vec<f64>,
-    rest: f64,
-    rows: usize,
-}
-
-impl Compressed {
-    /// Reduces the given rows (repeats allowed) of a problem.
-    pub(crate) fn new(columns: &[Vec<f64>], target: &[f64], rows: &[usize]) -> Self {
-        let a = DMatrix::from_fn(rows.len(), columns.len(), |i, j| columns[j][rows[i]]);
-        let mut b: Vec<f64> = rows.iter().map(|&i| target[i]).collect();
-        let (q, r) = a.qr().unpack();
-        let z: Vec<f64> = q.column_iter().map(|q| dot(q.as_slice(), &b)).collect();
-        for (q, z) in q.column_iter().zip(&z) {
-            b.iter_mut().zip(q.iter()).for_each(|(b, q)| *b -= z * q);
-        }
-        Self { r, z, rest: dot(&b, &b), rows: rows.len() }
-    }
-
-    /// |A c − b|²/n for coefficients of the leading columns.
-    pub(crate) fn mean_square_error(&self, coefficients: &[f64]) -> f64 {
-        let mut left = self.z.clone();
-        for (j, c) in coefficients.iter().enumerate().filter(|(_, c)| **c != 0.0) {
-            left.iter_mut().zip(self.r.column(j).iter()).for_each(|(l, r)| *l -= c * r);
-        }
-        (dot(&left, &left) + self.rest) / self.rows as f64
-    }
-}

@@ -4,6 +4,7 @@ use greybox_delay::exact::{self, Gain, Rows};
 use greybox_delay::expansion::Expansion;
 use greybox_delay::spectrum::DelaySystem;
 use greybox_delay::taylor::{self, Data, Order};
+use greybox_sparse::{Resampling, Selector};
 use proptest::prelude::*;
 
 /// Numbers of every kind, ordinary ones most often.
@@ -66,8 +67,8 @@ proptest! {
         let options = taylor::Options {
             protected,
             replicates: 2,
-            ratio,
-            block,
+            resampling: if block == 0 { Resampling::Rows { ratio } } else { Resampling::Blocks { length: block } },
+            selector: Selector::StlsqRaw,
             thresholds: vec![threshold, 0.1],
             tolerance,
             seed,
