@@ -184,9 +184,9 @@ pub fn search(
     let target = [train.target, test.target].concat();
     let design = Design::new(&slices(&columns), &target)?;
     let training = 0..train.target.len();
-    let judging = [training.end..target.len()];
-    let judge = Sample::new(&design, &judging)?;
-    let penalty = Penalty::Validated { grid: options.thresholds.clone(), rows: judging.to_vec() };
+    let judging = training.end..target.len();
+    let judge = Sample::new(&design, std::slice::from_ref(&judging))?;
+    let penalty = Penalty::Validated { grid: options.thresholds.clone(), rows: vec![judging] };
     let protected: Vec<usize> = (0..options.protected).collect();
     let mut models = Vec::with_capacity(orders.len());
     for &Order { order, columns } in orders {
