@@ -118,6 +118,9 @@ pub enum ExactError {
         /// Index of the column.
         column: usize,
     },
+    /// Squares overflow.
+    #[error("the sum of squares overflows: state the signals in larger units")]
+    Overflow,
     /// The delayed signal does not depend on the delay (it is constant), or is one of the columns for every delay.
     #[error("the delayed signal says nothing on the delay: it is constant, or a combination of the columns")]
     NoInformation,
@@ -272,7 +275,10 @@ pub fn fit(recordings: &[Rows<'_>], options: &Options) -> Result<Fit, ExactError
         })
         .collect();
     refined.sort_by(|a, b| a.1.total_cmp(&b.1));
-    let Some(&(delay, _)) = refined.first() else { return Err(ExactError::NoInformation) };
+    let Some(&(delay, rss)) = refined.first() else { return Err(ExactError::NoInformation) };
+    if !rss.is_finite() {
+        return Err(ExactError::Overflow);
+    }
     problem.finish(delay, refined.get(1).copied(), profile, options)
 }
 
@@ -345,7 +351,7 @@ impl<'a> Problem<'a> {
 
     fn grid(&self, options: &Options) -> impl Iterator<Item = f64> + use<> {
         let Options { from, to, grid, .. } = *options;
-        (0..grid).map(move |i| from + (to - from) * i as f64 / (grid - 1) as f64)
+        (0..grid).map(move |i| (from + (to - from) * i as f64 / (grid - 1) as f64).min(to))
     }
 
     fn project_out(&self, v: &mut [f64]) {
@@ -402,16 +408,16 @@ impl<'a> Problem<'a> {
             let full = (tau - dot(&now.slope, &now.residual) / size).clamp(low, high) - tau;
             let mut step = full;
             let better = (0..40).find_map(|_| {
-                let trial = self.residual(tau + step);
+                let at = (tau + step).clamp(low, high);
+                let trial = self.residual(at);
                 if trial.rss < now.rss {
-                    return Some(trial);
+                    return Some((at, trial));
                 }
                 step *= 0.5;
                 None
             });
-            let Some(trial) = better else { break };
-            tau += step;
-            now = trial;
+            let Some((at, trial)) = better else { break };
+            (tau, now) = (at, trial);
             if step.abs() <= 1e-13 * (high - low) {
                 break;
             }

@@ -22,16 +22,20 @@ pub(crate) struct Dependent {
 const RANK: f64 = 1e-12;
 
 impl Factors {
-    /// Factors a matrix with at least as many rows as columns and finite entries.
+    /// Factors a matrix with at least as many rows as columns. A column that is zero, or whose numbers
+    /// overflowed, is as good as dependent.
     pub(crate) fn new(mut a: DMatrix<f64>) -> Result<Self, Dependent> {
         let mut scale = Vec::with_capacity(a.ncols());
         for (column, mut entries) in a.column_iter_mut().enumerate() {
+            // In two steps, so that squares neither overflow nor vanish.
+            let largest = entries.amax();
+            entries /= largest;
             let norm = entries.norm();
-            if norm == 0.0 {
+            if !(largest > 0.0 && (largest * norm).is_finite() && norm.is_finite()) {
                 return Err(Dependent { column });
             }
             entries /= norm;
-            scale.push(norm);
+            scale.push(largest * norm);
         }
         let (q, r) = a.qr().unpack();
         match (0..r.ncols()).find(|&j| r[(j, j)].abs() < RANK) {
@@ -82,8 +86,8 @@ impl Factors {
 
     /// Condition number of the normalised columns.
     pub(crate) fn condition(&self) -> f64 {
-        let singular = self.r.singular_values();
-        singular.max() / singular.min()
+        let svd = self.r.clone().try_svd(false, false, f64::EPSILON, 100 * self.scale.len());
+        svd.map_or(f64::INFINITY, |svd| svd.singular_values.max() / svd.singular_values.min())
     }
 }
 
@@ -94,36 +98,4 @@ pub(crate) fn dot(a: &[f64], b: &[f64]) -> f64 {
 /// Rows of a symmetric matrix.
 pub(crate) fn to_rows(m: &DMatrix<f64>) -> Vec<Vec<f64>> {
     m.row_iter().map(|row| row.iter().copied().collect()).collect()
-}
-
-/// A regression problem reduced to as many rows as columns: |A c − b|² = |R c − z|² + rest, and so for every
-/// leading part of the columns.
-pub(crate) struct Compressed {
-    pub(crate) r: DMatrix<f64>,
-    pub(crate) z: Vec<f64>,
-    rest: f64,
-    rows: usize,
-}
-
-impl Compressed {
-    /// Reduces the given rows (repeats allowed) of a problem.
-    pub(crate) fn new(columns: &[Vec<f64>], target: &[f64], rows: &[usize]) -> Self {
-        let a = DMatrix::from_fn(rows.len(), columns.len(), |i, j| columns[j][rows[i]]);
-        let mut b: Vec<f64> = rows.iter().map(|&i| target[i]).collect();
-        let (q, r) = a.qr().unpack();
-        let z: Vec<f64> = q.column_iter().map(|q| dot(q.as_slice(), &b)).collect();
-        for (q, z) in q.column_iter().zip(&z) {
-            b.iter_mut().zip(q.iter()).for_each(|(b, q)| *b -= z * q);
-        }
-        Self { r, z, rest: dot(&b, &b), rows: rows.len() }
-    }
-
-    /// |A c − b|²/n for coefficients of the leading columns.
-    pub(crate) fn mean_square_error(&self, coefficients: &[f64]) -> f64 {
-        let mut left = self.z.clone();
-        for (j, c) in coefficients.iter().enumerate().filter(|(_, c)| **c != 0.0) {
-            left.iter_mut().zip(self.r.column(j).iter()).for_each(|(l, r)| *l -= c * r);
-        }
-        (dot(&left, &left) + self.rest) / self.rows as f64
-    }
 }

@@ -244,7 +244,8 @@ impl DelaySystem {
         if size == 0.0 {
             0.0
         } else if size.is_finite() {
-            delta.singular_values().min() / size
+            let svd = delta.try_svd(false, false, f64::EPSILON, 100 * self.order());
+            svd.map_or(f64::INFINITY, |svd| svd.singular_values.min() / size)
         } else {
             // e^(−λτ) overflowed, far to the left.
             f64::INFINITY
@@ -343,11 +344,13 @@ fn square<R: AsRef<[f64]>>(
     Ok(DMatrix::from_fn(order, order, |i, j| rows[i].as_ref()[j]))
 }
 
-/// Eigenvalues of a real matrix; `None` when the QR iteration does not end.
+/// Eigenvalues of a real matrix; `None` when the QR iteration does not end or overflows.
 fn eigenvalues(matrix: DMatrix<f64>) -> Option<Vec<Complex<f64>>> {
     let iterations = 60 * matrix.nrows().max(10);
     let schur = Schur::try_new(matrix, f64::EPSILON, iterations)?;
-    Some(schur.complex_eigenvalues().iter().copied().collect())
+    let values: Vec<Complex<f64>> = schur.complex_eigenvalues().iter().copied().collect();
+    // Entries near the largest number overflow on the way.
+    values.iter().all(|v| v.re.is_finite() && v.im.is_finite()).then_some(values)
 }
 
 /// The `count` rightmost, sorted by falling real part; of equal real parts the higher frequency first.

@@ -1,5 +1,6 @@
 //! Algorithm 2 on made-up columns.
-use greybox_delay::taylor::{Data, Options, Order, Search, TaylorError, logarithmic, search};
+use greybox_delay::taylor::{Data, Options, Order, Search, TaylorError, search};
+use greybox_sparse::{Resampling, SparseError, log_grid};
 use rand_distr::{Distribution, StandardNormal};
 use rand_pcg::Pcg64Mcg;
 use rand_pcg::rand_core::SeedableRng;
@@ -52,7 +53,7 @@ fn the_smallest_sufficient_order_and_its_terms_are_found() {
 
 #[test]
 fn what_is_not_protected_falls() {
-    let options = Options { thresholds: logarithmic(0.05, 0.2, 5), ..Options::thesis(0, 0) };
+    let options = Options { thresholds: log_grid(0.05, 0.2, 5), ..Options::thesis(0, 0) };
     assert_eq!(run(&options).model().unwrap().active(), [2, 5]);
     let options = Options { protected: 1, ..options };
     assert_eq!(run(&options).model().unwrap().active(), [0, 2, 5]);
@@ -65,50 +66,39 @@ fn a_seed_decides_everything() {
 }
 
 #[test]
-fn dependent_columns_are_dropped_not_fatal() {
+fn dependent_columns_end_the_search() {
     let (mut train, f) = made(300, 0.01, 0.0, 1);
     let (mut test, g) = made(300, 0.01, 0.0, 2);
     train[6] = train[5].iter().map(|c| 3.0 * c).collect();
     test[6] = test[5].iter().map(|c| 3.0 * c).collect();
-    let run = |protected| {
-        let (train, test) = (Data { columns: &train, target: &f }, Data { columns: &test, target: &g });
-        search(train, test, &ORDERS, &Options::thesis(protected, 0))
-    };
-    assert_eq!(run(1).unwrap().models[2].active(), [0, 2, 5]);
-    assert_eq!(run(7).unwrap_err(), TaylorError::Orders { order: 1, columns: 4 });
-    let last = [ORDERS[2]];
     let (train, test) = (Data { columns: &train, target: &f }, Data { columns: &test, target: &g });
-    let error = search(train, test, &last, &Options::thesis(7, 0)).unwrap_err();
-    assert_eq!(error, TaylorError::Dependent { column: 6 });
+    let found = search(train, test, &ORDERS, &Options::thesis(1, 0)).unwrap();
+    assert_eq!(found.models.len(), 2);
+    assert_eq!(found.model().unwrap().active(), [0, 2, 5]);
+    let error = search(train, test, &ORDERS[2..], &Options::thesis(1, 0)).unwrap_err();
+    assert!(matches!(error, TaylorError::Regression(SparseError::RankDeficient { .. })), "{error}");
 }
 
 #[test]
 fn single_rows_understate_the_scatter_that_blocks_show() {
-    // Truth: the scatter of the coefficient over fresh recordings.
-    let estimates: Vec<f64> = (0..60)
-        .map(|seed| {
-            let (train, f) = made(600, 0.3, 0.8, 100 + seed);
-            let data = Data { columns: &train, target: &f };
-            let options =
-                Options { replicates: 1, ratio: 10.0, thresholds: vec![0.0], ..Options::thesis(1, seed) };
-            search(data, data, &[Order { order: 1, columns: 6 }], &options).unwrap().models[0].coefficients[2]
-        })
-        .collect();
-    let scatter = (estimates.iter().map(|c| (c - 2.0).powi(2)).sum::<f64>() / 60.0).sqrt();
-    let claimed = |block| {
-        let mean: f64 = (0..20)
-            .map(|seed| {
-                let (train, f) = made(600, 0.3, 0.8, 100 + seed);
-                let data = Data { columns: &train, target: &f };
-                let base = Options::thesis(1, seed);
-                let options = Options { replicates: 60, ratio: 1.0, block, thresholds: vec![0.0], ..base };
-                search(data, data, &[Order { order: 1, columns: 6 }], &options).unwrap().models[0].std[2]
-            })
-            .sum();
-        mean / 20.0
+    let order = [Order { order: 1, columns: 6 }];
+    let spread = |seed: u64, options: &Options| {
+        let (train, f) = made(600, 0.3, 0.8, 100 + seed);
+        let data = Data { columns: &train, target: &f };
+        let found = search(data, data, &order, options).unwrap();
+        (found.models[0].coefficients[2], found.models[0].std[2])
     };
-    assert!(claimed(1) < 0.5 * scatter, "{} {scatter}", claimed(1));
-    assert!((claimed(40) / scatter - 1.0).abs() < 0.35, "{} {scatter}", claimed(40));
+    // Truth: the scatter of the coefficient over fresh recordings.
+    let options =
+        |resampling, seed| Options { thresholds: vec![0.0], resampling, ..Options::thesis(1, seed) };
+    let rows = Resampling::Rows { ratio: 1.0 };
+    let squares: f64 = (0..60).map(|seed| (spread(seed, &options(rows, seed)).0 - 2.0).powi(2)).sum();
+    let scatter = (squares / 60.0).sqrt();
+    let claimed =
+        |resampling| (0..20).map(|seed| spread(seed, &options(resampling, seed)).1).sum::<f64>() / 20.0;
+    let (single, blocks) = (claimed(rows), claimed(Resampling::Blocks { length: 40 }));
+    assert!(single < 0.6 * scatter, "{single} {scatter}");
+    assert!((blocks / scatter - 1.0).abs() < 0.35, "{blocks} {scatter}");
 }
 
 #[test]
@@ -117,19 +107,24 @@ fn bad_input_is_refused() {
     let data = Data { columns: &train, target: &f };
     let base = Options::thesis(1, 0);
     let with = |options: &Options| search(data, data, &ORDERS, options).unwrap_err();
+    let regression = |error: &TaylorError| matches!(error, TaylorError::Regression(_));
     assert_eq!(search(data, data, &[], &base).unwrap_err(), TaylorError::NoOrder);
-    assert!(matches!(with(&Options { replicates: 0, ..base.clone() }), TaylorError::Option { .. }));
-    assert!(matches!(with(&Options { ratio: f64::NAN, ..base.clone() }), TaylorError::Option { .. }));
-    assert!(matches!(with(&Options { thresholds: vec![], ..base.clone() }), TaylorError::Option { .. }));
-    assert!(matches!(with(&Options { thresholds: vec![-1.0], ..base.clone() }), TaylorError::Option { .. }));
-    assert!(matches!(with(&Options { block: 0, ..base.clone() }), TaylorError::Option { .. }));
-    assert!(matches!(with(&Options { ratio: 0.1, ..base.clone() }), TaylorError::TooFewRows { rows: 6, .. }));
+    assert!(regression(&with(&Options { replicates: 0, ..base.clone() })));
+    let nothing = Resampling::Rows { ratio: f64::NAN };
+    assert!(regression(&with(&Options { resampling: nothing, ..base.clone() })));
+    assert!(regression(&with(&Options { thresholds: vec![], ..base.clone() })));
+    assert!(regression(&with(&Options { thresholds: vec![-1.0], ..base.clone() })));
+    assert!(matches!(with(&Options { tolerance: -1.0, ..base.clone() }), TaylorError::Tolerance { .. }));
+    assert!(matches!(with(&Options { protected: 7, ..base.clone() }), TaylorError::Orders { order: 1, .. }));
     let short = Data { columns: &train[..5], target: &f };
-    assert!(matches!(search(short, data, &ORDERS, &base), Err(TaylorError::Shape { data: "training", .. })));
+    assert!(matches!(
+        search(short, data, &ORDERS, &base),
+        Err(TaylorError::Columns { data: "training", .. })
+    ));
     let cut = Data { columns: &train, target: &f[1..] };
-    assert!(matches!(search(data, cut, &ORDERS, &base), Err(TaylorError::Shape { data: "test", .. })));
+    assert!(matches!(search(data, cut, &ORDERS, &base), Err(TaylorError::Rows { data: "test", .. })));
     let mut spoiled = train.clone();
     spoiled[9][17] = f64::NAN;
     let error = search(data, Data { columns: &spoiled, target: &f }, &ORDERS, &base).unwrap_err();
-    assert_eq!(error, TaylorError::NotFinite { data: "test", row: 17 });
+    assert!(error.to_string().contains("77"), "{error}");
 }
