@@ -5,6 +5,7 @@ use std::sync::Arc;
 use greybox_calibrate::{Data, FreeRun, Hats, Score, Setup, window_length};
 use greybox_model::{Hold, Model};
 use greybox_recording::Recording;
+use greybox_sparse::{folds, select};
 
 use crate::error::IdentifyError;
 use crate::library::{Library, Setting, derivative};
@@ -452,25 +453,24 @@ fn order_search(
         let sizes: Vec<usize> = (1..=options.order)
             .map(|n| columns.iter().filter(|c| c.0.is_none_or(|t| structure.terms[t].order <= n)).count())
             .collect();
-        let settings = greybox_sparse::select::Options {
-            protected,
-            gap: rows.overlap,
-            effective: true,
+        let settings = select::Options {
             folds: 5,
-            ..greybox_sparse::select::Options::normalised()
+            gap: rows.overlap,
+            sample_size: select::SampleSize::Effective,
+            ..select::Options::normalised()
         };
         // Too many columns for the windows there are: the orders below are still searched.
         let mut last = sizes.len();
         while last > 0 {
-            let problem = greybox_sparse::select::Problem {
-                columns: &views[..sizes[last - 1]],
-                target: &target,
-                orders: &sizes[..last],
-                pieces: &rows.pieces,
-            };
-            if let Ok(search) = greybox_sparse::select::search(&problem, &settings) {
+            let found = greybox_sparse::Rows::new(&views[..sizes[last - 1]], &target)
+                .and_then(|table| {
+                    let split = folds::train_test(&rows.pieces, 0.5, rows.overlap)?;
+                    select::Problem::new(table, &sizes[..last], &protected, split)
+                })
+                .and_then(|problem| select::search(&problem, &settings));
+            if let Ok(search) = found {
                 for (sum, order) in total.iter_mut().zip(&search.orders) {
-                    sum.1 += order.criterion;
+                    sum.1 += order.aic;
                 }
                 break;
             }

@@ -1,121 +1,129 @@
-//! Why a regression could not be set up or solved.
+//! What can be wrong with a regression's input.
 
-/// Why a regression could not be set up or solved. Rows and columns are counted from 0.
-#[derive(Debug, Clone, PartialEq, thiserror::Error)]
+use thiserror::Error;
+
+/// Why a sparse regression could not be done. Every variant says what to change.
+#[derive(Debug, Clone, PartialEq, Error)]
 #[non_exhaustive]
 pub enum SparseError {
-    /// A column, a target or a residual has the wrong length.
-    #[error("{what} has {found} rows, expected {expected}; cut all to the same rows")]
+    /// A column, target or option list has the wrong length.
+    #[error("{what} has {found} entries where {expected} are needed")]
     Length {
-        /// Which slice.
+        /// What was counted, as `column 3` or `term x*x'`.
         what: String,
-        /// Its length.
+        /// The length found.
         found: usize,
-        /// The length of the others.
+        /// The length needed.
         expected: usize,
     },
     /// A value is NaN or infinite.
-    #[error("{what}, row {row}: the value is {value}; leave out rows that are not finite")]
+    #[error("{what} is not finite in row {row}: drop that row (or leave a gap there) before the regression")]
     NotFinite {
-        /// Which slice.
+        /// The column, target, variable or term.
         what: String,
-        /// The first bad row.
+        /// Row counted from 0.
         row: usize,
-        /// What stands there.
-        value: f64,
     },
-    /// There are no rows, no columns, or nothing but zeros where numbers are needed.
-    #[error("{what} is empty; {mend}")]
+    /// There are no rows, columns, orders or λ to work on.
+    #[error("there are no {what}: give at least one")]
     Empty {
-        /// What is empty.
-        what: String,
-        /// What to do about it.
-        mend: &'static str,
-    },
-    /// A column number does not exist.
-    #[error("{what} names column {column}, but there are {columns} columns (0 to {})", columns.saturating_sub(1))]
-    NoSuchColumn {
-        /// Who names it.
+        /// What is missing.
         what: &'static str,
-        /// The number.
-        column: usize,
-        /// How many columns there are.
-        columns: usize,
     },
-    /// A range of rows lies outside the data or is reversed.
-    #[error("rows {start}..{end} do not exist: there are {rows} rows")]
-    NoSuchRows {
+    /// A set of rows holds too few of them for what is asked.
+    #[error(
+        "{what} has {found} rows, but at least {needed} are needed: use fewer parts, a smaller gap or a longer recording"
+    )]
+    TooFewRows {
+        /// The set of rows, as `fold 2` or `the test rows`.
+        what: String,
+        /// Rows found.
+        found: usize,
+        /// Rows needed.
+        needed: usize,
+    },
+    /// A range of rows lies outside the data, is empty or overlaps its neighbour.
+    #[error(
+        "the row range {start}..{end} is empty, overlaps its predecessor or passes the last of {rows} rows: give ascending, separate, non-empty ranges"
+    )]
+    RowRange {
         /// First row of the range.
         start: usize,
-        /// One after the last row of the range.
+        /// One past the last row.
         end: usize,
-        /// How many rows there are.
+        /// Rows there are.
         rows: usize,
     },
-    /// The column depends linearly on the other ones, so its coefficient is not determined.
+    /// A column index is outside the columns there are.
+    #[error("column {column} does not exist: there are {columns} columns, counted from 0")]
+    NoSuchColumn {
+        /// The index found.
+        column: usize,
+        /// The number of columns.
+        columns: usize,
+    },
+    /// Columns that must be in the model are linearly dependent.
     #[error(
-        "column {column} is a linear combination of the columns {others:?} on these rows; leave it out or excite the system more richly"
+        "column {column} must stay in the model but is zero or a linear combination of the columns before it (what is left of it: {relative:.1e} of its norm): remove or merge it, or excite the system further"
     )]
     RankDeficient {
         /// The dependent column.
         column: usize,
-        /// The other columns of the model.
-        others: Vec<usize>,
+        /// ‖column − projection‖ / ‖column‖.
+        relative: f64,
     },
-    /// Fewer rows than unknowns.
-    #[error("{rows} rows cannot determine {unknowns} coefficients; take more rows or fewer columns")]
-    TooFewRows {
-        /// How many rows.
-        rows: usize,
-        /// How many coefficients.
-        unknowns: usize,
-    },
-    /// The rows cannot be divided as asked.
+    /// A Gram matrix is too ill-conditioned for a Cholesky factorisation; use the rows.
     #[error(
-        "{rows} rows cannot be divided into {folds} folds with a gap of {gap} rows; take fewer folds or a smaller gap"
+        "the Gram matrix loses column {column} to rounding (relative pivot {pivot:.1e}): factorise the rows by QR instead"
     )]
-    Folds {
-        /// How many rows.
-        rows: usize,
-        /// How many folds were asked for.
-        folds: usize,
-        /// Rows dropped between folds.
-        gap: usize,
+    IllConditioned {
+        /// The column whose pivot vanished.
+        column: usize,
+        /// Pivot divided by the column's squared norm.
+        pivot: f64,
     },
-    /// An option lies outside its range.
-    #[error("{name} = {value}, expected {expected}")]
+    /// The target is zero in every row.
+    #[error("the target is zero in every row: nothing is to be explained")]
+    ZeroTarget,
+    /// An option has a value outside its range.
+    #[error("option {name} is {found}: it must be {expected}")]
     Option {
-        /// The option.
+        /// The option's name.
         name: &'static str,
-        /// Its value.
-        value: f64,
-        /// The values allowed.
+        /// The value found.
+        found: f64,
+        /// The range or kind needed.
         expected: &'static str,
     },
-    /// Exhaustive search over too many columns.
-    #[error("exhaustive search over {found} optional columns (at most {limit}); use backward elimination")]
-    TooManyColumns {
-        /// Optional columns found.
-        found: usize,
-        /// The limit.
-        limit: usize,
-    },
-    /// A term names a user function for which no values were given.
-    #[error("term {term}: no values were given for the function `{name}`; pass them as (name, values)")]
-    NoUserValues {
-        /// The term as text.
-        term: String,
-        /// The function's name.
+    /// An expression named by a library has no values.
+    #[error("no values were given for the expression '{name}' of the library")]
+    UnknownExpression {
+        /// The expression's name.
         name: String,
     },
-    /// An iteration did not reach its tolerance.
-    #[error("LASSO at lambda = {lambda:e}: duality gap {gap:e} after {sweeps} sweeps; take a larger lambda")]
-    NotConverged {
-        /// The penalty.
-        lambda: f64,
-        /// The relative duality gap reached.
-        gap: f64,
-        /// Sweeps done.
-        sweeps: usize,
+    /// Exhaustive search over too many columns.
+    #[error(
+        "best subset over {optional} optional columns is too many (at most {most}): use backward elimination"
+    )]
+    TooManyColumns {
+        /// Optional columns asked for.
+        optional: usize,
+        /// The most allowed.
+        most: usize,
     },
+}
+
+/// `Ok` if `value` is finite and within `[low, high]`.
+pub(crate) fn check_range(
+    name: &'static str,
+    value: f64,
+    low: f64,
+    high: f64,
+    expected: &'static str,
+) -> Result<(), SparseError> {
+    if value.is_finite() && value >= low && value <= high {
+        Ok(())
+    } else {
+        Err(SparseError::Option { name, found: value, expected })
+    }
 }

@@ -1,281 +1,284 @@
-//! Sums of products by blocks of rows, from which every fold, order and penalty is served.
+//! Gram matrices by blocks of rows.
 
 use std::ops::Range;
-use std::sync::{Arc, OnceLock};
 
 use faer::linalg::matmul::matmul;
-use faer::{Accum, Mat, MatMut, MatRef, Par};
+use faer::{Accum, Mat, Par};
 
-use crate::SparseError;
-use crate::design::Design;
-use crate::least_squares::{self, Reduced};
+use crate::error::SparseError;
+use crate::rows::{Rows, check_ranges, count};
 
-/// Rows copied at a time: the panel of target and columns stays in the cache.
-const PANEL: usize = 512;
+/// Rows of a panel: its columns stay in the second-level cache while they are multiplied.
+const PANEL: usize = 1024;
 
-/// Gram matrix M = ZᵀWZ of Z = [p a₀ … a_{k−1}] over a set of rows with weights W.
+/// The Gram matrix of `[P p]` for n rows and k columns: PᵀP, Pᵀp and pᵀp, additive over rows.
 ///
-/// Additive: the Gram matrix of a union of blocks is the sum, of a fold's complement the total less the fold.
-/// The target stands first, so that the first k columns of a nested library are the leading part.
-#[derive(Debug, Clone)]
+/// ```
+/// use greybox_sparse::{Gram, Rows};
+/// let (x, y) = ([1.0, 2.0, 3.0], [2.0, 4.0, 6.0]);
+/// let rows = Rows::new(&[&x], &y)?;
+/// let mut gram = Gram::of_rows(&rows, &[0..2])?;
+/// gram.add(&Gram::of_rows(&rows, &[2..3])?)?;
+/// assert_eq!((gram.rows(), gram.product(0, 0), gram.moment(0), gram.target_square()), (3, 14.0, 28.0, 56.0));
+/// # Ok::<(), greybox_sparse::SparseError>(())
+/// ```
+#[derive(Debug, Clone, PartialEq)]
 pub struct Gram {
-    /// k + 1, also the leading dimension.
-    size: usize,
-    /// Column-major, symmetric, of the columns divided by `scale`.
-    matrix: Vec<f64>,
-    scale: Arc<[f64]>,
-    rows: f64,
+    columns: usize,
+    rows: usize,
+    /// (k + 1)² column-major, symmetric, the target last.
+    values: Vec<f64>,
 }
 
 impl Gram {
-    /// Gram matrix over ranges of rows (n × k rows of work done once, panel by panel).
+    /// The Gram matrix of no rows.
     #[must_use]
-    pub fn new(design: &Design<'_>, rows: &[Range<usize>]) -> Self {
-        let pieces: Vec<_> = rows.iter().map(|r| (r.clone(), 1.0)).collect();
-        Self::weighted(design, &pieces)
+    pub fn zero(columns: usize) -> Self {
+        Self { columns, rows: 0, values: vec![0.0; (columns + 1) * (columns + 1)] }
     }
 
-    /// As [`Gram::new`] with a weight ≥ 0 for every range (how often a bootstrap sample holds it).
-    #[must_use]
-    pub fn weighted(design: &Design<'_>, pieces: &[(Range<usize>, f64)]) -> Self {
-        let size = design.columns() + 1;
-        let mut sum = Mat::<f64>::zeros(size, size);
-        let mut panel = vec![0.0; PANEL * size];
-        let mut filled = 0;
-        let mut rows = 0.0;
-        for (range, weight) in pieces {
-            let root = weight.sqrt();
-            rows += weight * range.len() as f64;
-            let mut at = range.start;
-            while at < range.end {
-                let take = (PANEL - filled).min(range.end - at);
-                for j in 0..size {
-                    let factor = root / design.scale()[j];
-                    let source = &design.augmented(j)[at..at + take];
-                    let to = j * PANEL + filled;
-                    for (z, a) in panel[to..to + take].iter_mut().zip(source) {
-                        *z = a * factor;
-                    }
-                }
-                at += take;
-                filled += take;
-                if filled == PANEL {
-                    accumulate(sum.as_mut(), &panel, size, filled);
-                    filled = 0;
+    pub(crate) fn from_augmented(values: Vec<f64>, columns: usize, rows: usize) -> Self {
+        Self { columns, rows, values }
+    }
+
+    /// The Gram matrix of the rows in `ranges`: one pass, panel by panel.
+    ///
+    /// # Errors
+    /// [`SparseError::RowRange`], [`SparseError::Empty`].
+    pub fn of_rows(rows: &Rows<'_>, ranges: &[Range<usize>]) -> Result<Self, SparseError> {
+        check_ranges(ranges, rows.rows())?;
+        let panels = ranges
+            .iter()
+            .flat_map(|r| r.clone().step_by(PANEL).map(|start| (start, (start + PANEL).min(r.end))));
+        Ok(Self::accumulate(rows.columns(), panels, |panel, (start, end)| {
+            for j in 0..=rows.columns() {
+                let from = if j < rows.columns() { rows.column(j) } else { rows.target() };
+                panel[j * (end - start)..(j + 1) * (end - start)].copy_from_slice(&from[start..end]);
+            }
+            end - start
+        })
+        .with_rows(count(ranges)))
+    }
+
+    /// The Gram matrix of rows taken `weights[i]` times each (a bootstrap sample): Σ wᵢ rowᵢ rowᵢᵀ.
+    ///
+    /// # Errors
+    /// [`SparseError::Length`] if there is not one weight per row.
+    pub fn of_weighted_rows(rows: &Rows<'_>, weights: &[u32]) -> Result<Self, SparseError> {
+        if weights.len() != rows.rows() {
+            return Err(SparseError::Length {
+                what: "the list of row weights".into(),
+                found: weights.len(),
+                expected: rows.rows(),
+            });
+        }
+        let taken: Vec<(usize, f64)> = weights
+            .iter()
+            .enumerate()
+            .filter(|&(_, &w)| w > 0)
+            .map(|(i, &w)| (i, f64::from(w).sqrt()))
+            .collect();
+        let gram = Self::accumulate(rows.columns(), taken.chunks(PANEL), |panel, chunk| {
+            for j in 0..=rows.columns() {
+                let from = if j < rows.columns() { rows.column(j) } else { rows.target() };
+                for (to, &(i, w)) in panel[j * chunk.len()..].iter_mut().zip(chunk) {
+                    *to = w * from[i];
                 }
             }
+            chunk.len()
+        });
+        Ok(gram.with_rows(weights.iter().map(|&w| w as usize).sum()))
+    }
+
+    /// Sums panelᵀ panel; `fill` writes a panel column-major and returns its rows.
+    fn accumulate<P>(
+        columns: usize,
+        panels: impl Iterator<Item = P>,
+        mut fill: impl FnMut(&mut [f64], P) -> usize,
+    ) -> Self {
+        let m = columns + 1;
+        let mut panel = vec![0.0; PANEL * m];
+        let mut sum = Mat::<f64>::zeros(m, m);
+        for source in panels {
+            let n = fill(&mut panel, source);
+            let a = faer::MatRef::from_column_major_slice(&panel[..n * m], n, m);
+            matmul(sum.as_mut(), Accum::Add, a.transpose(), a, 1.0, Par::Seq);
         }
-        accumulate(sum.as_mut(), &panel, size, filled);
-        let matrix =
-            (0..size).flat_map(|j| (0..size).map(move |i| (i, j))).map(|(i, j)| sum[(i, j)]).collect();
-        Self { size, matrix, scale: design.scale().into(), rows }
+        let mut values = vec![0.0; m * m];
+        for j in 0..m {
+            for i in 0..=j {
+                values[j * m + i] = sum[(i, j)];
+                values[i * m + j] = sum[(i, j)];
+            }
+        }
+        Self { columns, rows: 0, values }
+    }
+
+    fn with_rows(mut self, rows: usize) -> Self {
+        self.rows = rows;
+        self
+    }
+
+    /// Adds the rows of another Gram matrix over the same columns.
+    ///
+    /// # Errors
+    /// [`SparseError::Length`] for another number of columns.
+    pub fn add(&mut self, other: &Self) -> Result<(), SparseError> {
+        self.combine(other, 1.0)?;
+        self.rows += other.rows;
+        Ok(())
+    }
+
+    /// Takes rows away again: a fold's complement is total − fold. Where the fold holds most of the energy the
+    /// difference cancels; [`BlockGram::sum`] of the other blocks does not.
+    ///
+    /// # Errors
+    /// [`SparseError::Length`] for another number of columns.
+    pub fn subtract(&mut self, other: &Self) -> Result<(), SparseError> {
+        self.combine(other, -1.0)?;
+        self.rows = self.rows.saturating_sub(other.rows);
+        Ok(())
+    }
+
+    fn combine(&mut self, other: &Self, factor: f64) -> Result<(), SparseError> {
+        if other.columns != self.columns {
+            return Err(SparseError::Length {
+                what: "the columns of a Gram matrix".into(),
+                found: other.columns,
+                expected: self.columns,
+            });
+        }
+        for (a, b) in self.values.iter_mut().zip(&other.values) {
+            *a += factor * b;
+        }
+        Ok(())
     }
 
     /// Number of columns k.
     #[must_use]
     pub fn columns(&self) -> usize {
-        self.size - 1
+        self.columns
     }
 
-    /// Number of rows, a repeated row counted as often as it is held.
+    /// Number of rows n.
     #[must_use]
-    pub fn rows(&self) -> f64 {
+    pub fn rows(&self) -> usize {
         self.rows
     }
 
-    /// aᵢᵀ W aⱼ in the columns' own units.
+    /// (PᵀP)ᵢⱼ; zero outside.
     #[must_use]
     pub fn product(&self, i: usize, j: usize) -> f64 {
-        self.at(i + 1, j + 1) * self.scale[i + 1] * self.scale[j + 1]
+        if i < self.columns && j < self.columns { self.augmented(i, j) } else { 0.0 }
     }
 
-    /// aⱼᵀ W p in own units.
+    /// (Pᵀp)ᵢ; zero outside.
     #[must_use]
-    pub fn cross(&self, j: usize) -> f64 {
-        self.at(j + 1, 0) * self.scale[j + 1] * self.scale[0]
+    pub fn moment(&self, i: usize) -> f64 {
+        if i < self.columns { self.augmented(i, self.columns) } else { 0.0 }
     }
 
-    /// pᵀ W p.
+    /// pᵀp.
     #[must_use]
-    pub fn energy(&self) -> f64 {
-        self.at(0, 0) * self.scale[0] * self.scale[0]
+    pub fn target_square(&self) -> f64 {
+        self.augmented(self.columns, self.columns)
     }
 
-    /// Sum with the Gram matrix of other rows of the same design.
+    /// ‖column j‖₂ of every column.
     #[must_use]
-    pub fn plus(&self, other: &Self) -> Self {
-        self.combine(other, 1.0)
+    pub fn norms(&self) -> Vec<f64> {
+        (0..self.columns).map(|j| self.augmented(j, j).max(0.0).sqrt()).collect()
     }
 
-    /// What is left when the rows of `other`, all held by `self`, are taken away.
+    /// Entry of the (k + 1)² matrix with the target last.
+    #[inline]
+    pub(crate) fn augmented(&self, i: usize, j: usize) -> f64 {
+        self.values[j * (self.columns + 1) + i]
+    }
+}
+
+/// Gram matrices of disjoint blocks of rows, kept apart for folds and the block bootstrap.
+#[derive(Debug, Clone, PartialEq)]
+pub struct BlockGram {
+    blocks: Vec<Gram>,
+    columns: usize,
+}
+
+impl BlockGram {
+    /// One Gram matrix per range.
+    ///
+    /// # Errors
+    /// As [`Gram::of_rows`].
+    pub fn of_rows(rows: &Rows<'_>, ranges: &[Range<usize>]) -> Result<Self, SparseError> {
+        check_ranges(ranges, rows.rows())?;
+        let blocks = ranges
+            .iter()
+            .map(|r| Gram::of_rows(rows, std::slice::from_ref(r)))
+            .collect::<Result<Vec<_>, _>>()?;
+        Ok(Self { blocks, columns: rows.columns() })
+    }
+
+    /// The blocks.
     #[must_use]
-    pub fn minus(&self, other: &Self) -> Self {
-        self.combine(other, -1.0)
+    pub fn blocks(&self) -> &[Gram] {
+        &self.blocks
     }
 
-    fn combine(&self, other: &Self, sign: f64) -> Self {
-        let matrix = self.matrix.iter().zip(&other.matrix).map(|(a, b)| a + sign * b).collect();
-        Self { matrix, scale: self.scale.clone(), size: self.size, rows: self.rows + sign * other.rows }
+    /// Sum over the given blocks, repeated ones as often as named; unknown indices count as nothing.
+    #[must_use]
+    pub fn sum(&self, which: impl IntoIterator<Item = usize>) -> Gram {
+        let mut total = Gram::zero(self.columns);
+        for block in which.into_iter().filter_map(|i| self.blocks.get(i)) {
+            for (a, b) in total.values.iter_mut().zip(&block.values) {
+                *a += b;
+            }
+            total.rows += block.rows;
+        }
+        total
+    }
+}
+
+#[cfg(test)]
+#[allow(clippy::single_range_in_vec_init)]
+mod tests {
+    use super::*;
+    use crate::testing::design;
+
+    fn direct(columns: &[Vec<f64>], y: &[f64], i: usize, j: usize) -> f64 {
+        let of = |l: usize| if l < columns.len() { &columns[l][..] } else { y };
+        of(i).iter().zip(of(j)).map(|(a, b)| a * b).sum()
     }
 
-    /// Add `weight` times another Gram matrix of the same design.
-    pub(crate) fn add(&mut self, other: &Self, weight: f64) {
-        self.matrix.iter_mut().zip(&other.matrix).for_each(|(a, b)| *a += weight * b);
-        self.rows += weight * other.rows;
-    }
-
-    /// All rows `weight` times.
-    pub(crate) fn scaled(&self, weight: f64) -> Self {
-        let mut out = self.clone();
-        out.matrix.iter_mut().for_each(|v| *v *= weight);
-        out.rows *= weight;
-        out
-    }
-
-    fn at(&self, i: usize, j: usize) -> f64 {
-        self.matrix[j * self.size + i]
-    }
-
-    /// ‖p − Σ cⱼ aⱼ‖² for the first columns, with the part of it that rounding can make: (RSS, uncertainty).
-    fn rss(&self, coefficients: &[f64]) -> (f64, f64) {
-        let c: Vec<f64> = std::iter::once(-1.0)
-            .chain(coefficients.iter().enumerate().map(|(j, c)| c * (self.scale[j + 1] / self.scale[0])))
-            .collect();
-        let (mut sum, mut magnitude) = (0.0, 0.0);
-        for (j, cj) in c.iter().enumerate().filter(|(_, c)| **c != 0.0) {
-            for (i, ci) in c.iter().enumerate().filter(|(_, c)| **c != 0.0) {
-                let term = ci * self.at(i, j) * cj;
-                sum += term;
-                magnitude += term.abs();
+    #[test]
+    fn equals_the_sums_and_is_additive() {
+        let (columns, y) = design(2500, 4, 1);
+        let rows = Rows::from_vecs(&columns, &y).unwrap();
+        let whole = Gram::of_rows(&rows, &[0..2500]).unwrap();
+        for i in 0..5 {
+            for j in 0..5 {
+                let truth = direct(&columns, &y, i, j);
+                assert!((whole.augmented(i, j) - truth).abs() < 1e-10 * 2500.0);
             }
         }
-        let unit = self.scale[0] * self.scale[0];
-        (sum * unit, magnitude * unit * f64::EPSILON * 16.0)
-    }
-}
-
-/// sum += ZᵀZ for the first `rows` rows of the panel.
-fn accumulate(sum: MatMut<'_, f64>, panel: &[f64], size: usize, rows: usize) {
-    if rows > 0 {
-        let z = MatRef::from_column_major_slice(panel, PANEL, size).subrows(0, rows);
-        matmul(sum, Accum::Add, z.transpose(), z, 1.0, Par::Seq);
-    }
-}
-
-/// The first k columns of a sample with all columns and the target of unit length.
-///
-/// ρᵢⱼ = aᵢᵀaⱼ/(‖aᵢ‖‖aⱼ‖), rⱼ = aⱼᵀp/(‖aⱼ‖‖p‖); coefficients βⱼ = cⱼ‖aⱼ‖/‖p‖; RSS in units of ‖p‖².
-#[derive(Debug, Clone)]
-pub struct Normalised {
-    /// Number of columns k.
-    pub columns: usize,
-    /// ρ, column-major k × k (zero rows and columns for columns of zeros).
-    pub correlation: Vec<f64>,
-    /// r, k values.
-    pub cross: Vec<f64>,
-    /// ‖p‖/‖aⱼ‖: multiply β by it to have c; 0 for a column of zeros.
-    pub unit: Vec<f64>,
-}
-
-/// A set of rows of a design: their Gram matrix and, when rounding asks for it, their triangular factor.
-///
-/// Every selector of this crate takes a `Sample`. Solutions come from a Cholesky factor of the normalised Gram
-/// matrix as long as its smallest pivot shows that this is accurate, else from a QR factor of the rows.
-#[derive(Debug)]
-pub struct Sample<'a> {
-    design: &'a Design<'a>,
-    pieces: Vec<(Range<usize>, f64)>,
-    gram: Gram,
-    reduced: OnceLock<Reduced>,
-}
-
-impl<'a> Sample<'a> {
-    /// The rows of the given ranges.
-    ///
-    /// # Errors
-    /// [`SparseError::NoSuchRows`], [`SparseError::Empty`].
-    pub fn new(design: &'a Design<'a>, rows: &[Range<usize>]) -> Result<Self, SparseError> {
-        design.check_rows(rows)?;
-        Ok(Self::from_gram(design, rows, Gram::new(design, rows)))
-    }
-
-    /// The rows of the given ranges whose Gram matrix is known already.
-    pub(crate) fn from_gram(design: &'a Design<'a>, rows: &[Range<usize>], gram: Gram) -> Self {
-        Self::from_weighted(design, rows.iter().map(|r| (r.clone(), 1.0)).collect(), gram)
-    }
-
-    /// Weighted ranges whose Gram matrix is known already.
-    pub(crate) fn from_weighted(
-        design: &'a Design<'a>,
-        pieces: Vec<(Range<usize>, f64)>,
-        gram: Gram,
-    ) -> Self {
-        Self { design, pieces, gram, reduced: OnceLock::new() }
-    }
-
-    /// The Gram matrix.
-    #[must_use]
-    pub fn gram(&self) -> &Gram {
-        &self.gram
-    }
-
-    /// Check that there are as many columns as asked for, and at least one.
-    pub(crate) fn check_size(&self, columns: usize) -> Result<(), SparseError> {
-        let found = self.gram.columns();
-        if columns == 0 || columns > found {
-            let column = columns.saturating_sub(1);
-            return Err(SparseError::NoSuchColumn { what: "the number of columns", column, columns: found });
-        }
-        Ok(())
-    }
-
-    /// The first `columns` columns (all, if there are fewer), normalised.
-    #[must_use]
-    pub fn normalised(&self, columns: usize) -> Normalised {
-        let g = &self.gram;
-        let k = columns.min(g.columns());
-        let norm: Vec<f64> = (0..=k).map(|j| g.at(j, j).max(0.0).sqrt()).collect();
-        let inverse: Vec<f64> = norm.iter().map(|n| if *n > 0.0 { 1.0 / n } else { 0.0 }).collect();
-        let mut correlation = vec![0.0; k * k];
-        for j in 0..k {
-            for i in 0..k {
-                correlation[j * k + i] = g.at(i + 1, j + 1) * inverse[i + 1] * inverse[j + 1];
-            }
-        }
-        let cross = (0..k).map(|j| g.at(j + 1, 0) * inverse[j + 1] * inverse[0]).collect();
-        let unit = (0..k).map(|j| (norm[0] * inverse[j + 1]) * (g.scale[0] / g.scale[j + 1])).collect();
-        Normalised { columns: k, correlation, cross, unit }
-    }
-
-    /// Least squares on the columns `active`: coefficients in the columns' own units, in the order of `active`.
-    ///
-    /// # Errors
-    /// [`SparseError::RankDeficient`] naming the dependent column; [`SparseError::TooFewRows`].
-    pub fn solve(&self, active: &[usize], normalised: &Normalised) -> Result<Vec<f64>, SparseError> {
-        match least_squares::cholesky_solve(normalised, active) {
-            Some(beta) => Ok(active.iter().zip(beta).map(|(&j, b)| b * normalised.unit[j]).collect()),
-            None => self.solve_rows(active),
+        let blocks = BlockGram::of_rows(&rows, &[0..700, 700..1900, 1900..2500]).unwrap();
+        let sum = blocks.sum(0..3);
+        let mut back = whole.clone();
+        back.subtract(&blocks.blocks()[1]).unwrap();
+        let complement = blocks.sum([0, 2]);
+        assert_eq!((sum.rows(), back.rows(), complement.rows()), (2500, 1300, 1300));
+        for (a, b) in sum.values.iter().zip(&whole.values).chain(back.values.iter().zip(&complement.values)) {
+            assert!((a - b).abs() < 1e-9);
         }
     }
 
-    /// As [`Sample::solve`], always from the rows (column-normalised Householder QR).
-    ///
-    /// # Errors
-    /// As [`Sample::solve`].
-    pub fn solve_rows(&self, active: &[usize]) -> Result<Vec<f64>, SparseError> {
-        self.reduced().solve(active, self.gram.rows())
-    }
-
-    /// The triangular factor of [p a₀ …], computed when first asked for.
-    pub(crate) fn reduced(&self) -> &Reduced {
-        self.reduced.get_or_init(|| Reduced::new(self.design, &self.pieces))
-    }
-
-    /// Residual sum of squares ‖p − Σ cⱼ aⱼ‖² on these rows; where the Gram matrix cannot resolve it
-    /// (a nearly perfect fit) it is taken from the triangular factor of the rows.
-    #[must_use]
-    pub fn rss(&self, coefficients: &[f64]) -> f64 {
-        let (rss, uncertainty) = self.gram.rss(coefficients);
-        if rss > 1e4 * uncertainty { rss } else { self.reduced().rss(coefficients) }
+    #[test]
+    fn weights_repeat_rows() {
+        let (columns, y) = design(5, 2, 2);
+        let rows = Rows::from_vecs(&columns, &y).unwrap();
+        let weighted = Gram::of_weighted_rows(&rows, &[2, 0, 1, 0, 3]).unwrap();
+        let truth = 2.0 * columns[0][0] * y[0] + columns[0][2] * y[2] + 3.0 * columns[0][4] * y[4];
+        assert!((weighted.moment(0) - truth).abs() < 1e-13);
+        assert_eq!(weighted.rows(), 6);
+        assert!(Gram::of_weighted_rows(&rows, &[1]).is_err());
     }
 }

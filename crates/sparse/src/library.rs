@@ -1,372 +1,589 @@
-//! Libraries of candidate terms, nested by order (thesis Eq 2.2, Algorithm 1 lines 3 to 5).
+//! Libraries of candidate terms, nested by order.
+//!
+//! A library of order N + 1 holds that of order N in its first columns ("add new polynomial terms only",
+//! Algorithm 1 line 5), so one evaluation and one factorisation serve all orders.
 
+use std::collections::BTreeMap;
 use std::fmt;
 
-use crate::SparseError;
+use crate::error::SparseError;
+use crate::rows::first_not_finite;
 
-/// A function of one variable that multiplies the powers of a term.
-#[derive(Debug, Clone, PartialEq, Eq, Hash)]
+/// A function of one variable, or an expression the caller evaluates.
+#[derive(Debug, Clone, PartialEq, Eq, PartialOrd, Ord)]
+#[non_exhaustive]
 pub enum Function {
-    /// sin(n·v) of variable number `variable` with the harmonic n.
+    /// sin(h x).
     Sin {
         /// Index of the variable.
         variable: usize,
-        /// n ≥ 1.
+        /// The harmonic h ≥ 1.
         harmonic: u32,
     },
-    /// cos(n·v).
+    /// cos(h x).
     Cos {
         /// Index of the variable.
         variable: usize,
-        /// n ≥ 1.
+        /// The harmonic h ≥ 1.
         harmonic: u32,
     },
-    /// sign(v), 0 at v = 0: Coulomb friction of a velocity.
+    /// sign(x), zero at zero (Coulomb friction).
     Sign {
         /// Index of the variable.
         variable: usize,
     },
-    /// |v|.
+    /// |x|.
     Abs {
         /// Index of the variable.
         variable: usize,
     },
-    /// A function the caller evaluates, known by its text.
-    User(String),
+    /// A named expression whose values the caller supplies.
+    Expression(String),
 }
 
-/// One column of a library: Π vᵢ^eᵢ, times a function where there is one.
-#[derive(Debug, Clone, PartialEq, Eq, Hash)]
+/// One candidate term: a product of powers of the variables and at most one function.
+#[derive(Debug, Clone, PartialEq, Eq, PartialOrd, Ord)]
 pub struct Term {
-    /// Exponent of every variable.
-    pub powers: Vec<u32>,
-    /// The other factor.
-    pub function: Option<Function>,
+    powers: Vec<u32>,
+    function: Option<Function>,
 }
 
 impl Term {
-    /// The term in the variables' names, such as `x^2*x'`, `sin(2*theta)` or `1`.
-    ///
-    /// ```
-    /// let term = greybox_sparse::Term { powers: vec![2, 1], function: None };
-    /// assert_eq!(term.display(&["x".into(), "x'".into()]).to_string(), "x^2*x'");
-    /// ```
+    /// The product of `variable[i]^powers[i]`; all zero is the constant 1.
     #[must_use]
-    pub fn display<'a>(&'a self, variables: &'a [String]) -> TermText<'a> {
-        TermText { term: self, variables }
+    pub fn powers(powers: &[u32]) -> Self {
+        Self { powers: powers.to_vec(), function: None }
     }
-}
 
-/// A term with its variables' names, to be printed.
-#[derive(Debug)]
-pub struct TermText<'a> {
-    term: &'a Term,
-    variables: &'a [String],
-}
+    /// A function alone.
+    #[must_use]
+    pub fn function(function: Function) -> Self {
+        Self { powers: Vec::new(), function: Some(function) }
+    }
 
-impl fmt::Display for TermText<'_> {
-    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
-        let name = |i: usize| self.variables.get(i).map_or("?", String::as_str);
-        let harmonic = |n: u32| if n == 1 { String::new() } else { format!("{n}*") };
-        let mut factors: Vec<String> = Vec::new();
-        for (i, &power) in self.term.powers.iter().enumerate() {
-            match power {
-                0 => {}
-                1 => factors.push(name(i).to_owned()),
-                e => factors.push(format!("{}^{e}", name(i))),
+    /// This term times a function (which replaces one it had).
+    #[must_use]
+    pub fn times(mut self, function: Function) -> Self {
+        self.function = Some(function);
+        self
+    }
+
+    /// The power of variable `i`.
+    #[must_use]
+    pub fn power(&self, i: usize) -> u32 {
+        self.powers.get(i).copied().unwrap_or(0)
+    }
+
+    /// Sum of the powers.
+    #[must_use]
+    pub fn degree(&self) -> u32 {
+        self.powers.iter().sum()
+    }
+
+    /// The function, if there is one.
+    #[must_use]
+    pub fn its_function(&self) -> Option<&Function> {
+        self.function.as_ref()
+    }
+
+    /// Text such as `x^2*x'`, `sin(2*theta)`, `sign(theta')`, `1`; variables beyond `names` print as `?`.
+    #[must_use]
+    pub fn label(&self, names: &[String]) -> String {
+        let name = |i: usize| names.get(i).map_or("?", String::as_str);
+        let mut factors: Vec<String> = self
+            .powers
+            .iter()
+            .enumerate()
+            .filter(|&(_, &p)| p > 0)
+            .map(|(i, &p)| if p == 1 { name(i).to_owned() } else { format!("{}^{p}", name(i)) })
+            .collect();
+        let angle = |v: usize, h: u32| if h == 1 { name(v).to_owned() } else { format!("{h}*{}", name(v)) };
+        match &self.function {
+            Some(Function::Sin { variable, harmonic }) => {
+                factors.push(format!("sin({})", angle(*variable, *harmonic)));
             }
-        }
-        match &self.term.function {
-            None => {}
-            Some(Function::Sin { variable, harmonic: n }) => {
-                factors.push(format!("sin({}{})", harmonic(*n), name(*variable)));
-            }
-            Some(Function::Cos { variable, harmonic: n }) => {
-                factors.push(format!("cos({}{})", harmonic(*n), name(*variable)));
+            Some(Function::Cos { variable, harmonic }) => {
+                factors.push(format!("cos({})", angle(*variable, *harmonic)));
             }
             Some(Function::Sign { variable }) => factors.push(format!("sign({})", name(*variable))),
             Some(Function::Abs { variable }) => factors.push(format!("abs({})", name(*variable))),
-            Some(Function::User(text)) => factors.push(text.clone()),
+            Some(Function::Expression(text)) => factors.push(text.clone()),
+            None => {}
         }
-        f.write_str(if factors.is_empty() { "1" } else { "" })?;
-        f.write_str(&factors.join("*"))
+        if factors.is_empty() { "1".to_owned() } else { factors.join("*") }
+    }
+
+    fn largest_variable(&self) -> Option<usize> {
+        let of_powers = self.powers.iter().rposition(|&p| p > 0);
+        let of_function = match self.function {
+            Some(
+                Function::Sin { variable, .. }
+                | Function::Cos { variable, .. }
+                | Function::Sign { variable }
+                | Function::Abs { variable },
+            ) => Some(variable),
+            _ => None,
+        };
+        of_powers.max(of_function)
     }
 }
 
-/// Terms ordered so that order N+1 only adds terms behind those of order N: one Gram matrix serves all orders.
+/// Terms over named variables, nested by order: order r is the first [`Library::len_of_order`]`(r)` terms.
+///
+/// ```
+/// use greybox_sparse::Library;
+/// // Thesis Eq 2.2 with N = M = 3: fifteen terms, no constant.
+/// let library = Library::tensor(&["x", "x'"], &[3, 3]);
+/// assert_eq!(library.len(), 15);
+/// assert_eq!(library.len_of_order(1), 3);
+/// assert_eq!(library.labels()[..3], ["x", "x'", "x*x'"]);
+/// ```
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct Library {
     variables: Vec<String>,
     terms: Vec<Term>,
-    sizes: Vec<usize>,
+    /// Number of terms in each order 1, 2, …
+    lengths: Vec<usize>,
 }
 
 impl Library {
-    /// All Π vᵢ^eᵢ with eᵢ ≤ `limits[i]` but the constant (thesis Eq 2.2: for x, x' and N = M = 3 there are 15).
-    /// Order n holds those with every exponent ≤ n.
-    ///
-    /// ```
-    /// let library = greybox_sparse::Library::tensor(&["x", "x'"], &[3, 3]);
-    /// assert_eq!(library.sizes(), [3, 8, 15]);
-    /// assert_eq!(library.names()[..3], ["x", "x'", "x*x'"]);
-    /// ```
+    /// All products x₁^i₁ x₂^i₂ … with i_k ≤ `highest[k]`, without the constant (thesis Eq 2.2). Order r holds
+    /// those with i_k ≤ min(r, `highest[k]`). A missing entry of `highest` counts as 0.
     #[must_use]
-    pub fn tensor(variables: &[&str], limits: &[u32]) -> Self {
-        let limit = |i: usize| limits.get(i).copied().unwrap_or(0);
-        let mut powers = vec![Vec::new()];
-        for i in 0..variables.len() {
-            powers = extend(&powers, |_| limit(i));
-        }
-        let highest = (0..variables.len()).map(limit).max().unwrap_or(0);
-        Self::by_order(variables, powers, highest, |p| p.iter().copied().max().unwrap_or(0))
+    pub fn tensor(variables: &[&str], highest: &[u32]) -> Self {
+        let bound = |r: u32| -> Vec<u32> {
+            (0..variables.len()).map(|k| highest.get(k).copied().unwrap_or(0).min(r)).collect()
+        };
+        let orders = highest.iter().take(variables.len()).copied().max().unwrap_or(0);
+        Self::from_shells(
+            variables,
+            (1..=orders).map(|r| {
+                let mut shell = multi_indices(&bound(r));
+                shell.retain(|powers| powers.iter().copied().max() == Some(r));
+                shell
+            }),
+        )
     }
 
-    /// All monomials of total degree 1 to `degree` (0 to `degree` with `constant`, which then stands first).
+    /// All monomials of total degree ≤ `degree`; order r holds those of degree ≤ r. With `constant` the term 1
+    /// stands first and is in every order.
     #[must_use]
     pub fn total_degree(variables: &[&str], degree: u32, constant: bool) -> Self {
-        let mut powers = vec![Vec::new()];
-        for _ in variables {
-            powers = extend(&powers, |p| degree - p.iter().sum::<u32>());
-        }
-        let library = Self::by_order(variables, powers, degree, |p| p.iter().sum());
-        if constant {
-            library.with_leading(&[Term { powers: vec![0; variables.len()], function: None }])
-        } else {
-            library
-        }
+        let library = Self::from_shells(
+            variables,
+            (1..=degree).map(|r| {
+                let mut shell = multi_indices(&vec![r; variables.len()]);
+                shell.retain(|powers| powers.iter().sum::<u32>() == r);
+                shell
+            }),
+        );
+        if constant { library.with_in_every_order(Term::powers(&[])) } else { library }
     }
 
-    /// Powers of each variable alone, vᵢ^n, n ≤ `order` (the thesis' library for the rotary flexible link).
+    /// The separate powers x_k^i, i ≤ `order`, of every variable (thesis §2.3, the flexible link).
     #[must_use]
-    pub fn separate(variables: &[&str], order: u32) -> Self {
-        let count = variables.len();
-        let powers = (1..=order)
-            .flat_map(|n| (0..count).map(move |i| (0..count).map(|q| if q == i { n } else { 0 }).collect()))
-            .collect();
-        Self::by_order(variables, powers, order, |p| p.iter().copied().max().unwrap_or(0))
+    pub fn separate_powers(variables: &[&str], order: u32) -> Self {
+        let n = variables.len();
+        Self::from_shells(
+            variables,
+            (1..=order)
+                .map(|r| (0..n).map(|k| (0..n).map(|i| if i == k { r } else { 0 }).collect()).collect()),
+        )
     }
 
-    /// sin(n vᵢ) and cos(n vᵢ) of each variable; order n adds the harmonic n.
+    /// sin(h x) and cos(h x) of every variable, h ≤ `harmonics`; order r holds h ≤ r.
     #[must_use]
     pub fn trigonometric(variables: &[&str], harmonics: u32) -> Self {
-        let mut library = Self::by_order(variables, Vec::new(), 0, |_| 0);
+        let mut library = Self::empty(variables);
         for harmonic in 1..=harmonics {
             for variable in 0..variables.len() {
-                for function in [Function::Sin { variable, harmonic }, Function::Cos { variable, harmonic }] {
-                    library.terms.push(Term { powers: vec![0; variables.len()], function: Some(function) });
-                }
+                library.terms.push(Term::function(Function::Sin { variable, harmonic }));
+                library.terms.push(Term::function(Function::Cos { variable, harmonic }));
             }
-            library.sizes.push(library.terms.len());
+            library.lengths.push(library.terms.len());
         }
         library
     }
 
-    /// Terms of the caller's choice, all of order 1.
+    /// The given terms, all in order 1; repeated terms are taken once.
     #[must_use]
     pub fn user(variables: &[&str], terms: &[Term]) -> Self {
-        let names = variables.iter().map(|v| (*v).to_owned()).collect();
-        Self { variables: names, terms: terms.to_vec(), sizes: vec![terms.len()] }
+        let mut library = Self::empty(variables);
+        for term in terms {
+            library.push_new(term.clone());
+        }
+        library.lengths.push(library.terms.len());
+        library
     }
 
-    /// The same library with terms put in front that belong to every order, such as sign(theta').
+    /// This library with `term` put first, so that it is in every order (as sign(θ') for Coulomb friction).
     #[must_use]
-    pub fn with_leading(mut self, terms: &[Term]) -> Self {
-        let new: Vec<Term> = terms.iter().filter(|t| !self.terms.contains(t)).cloned().collect();
-        self.sizes.iter_mut().for_each(|s| *s += new.len());
-        if self.sizes.is_empty() {
-            self.sizes.push(new.len());
+    pub fn with_in_every_order(mut self, term: Term) -> Self {
+        let term = self.normal(term);
+        if let Some(at) = self.terms.iter().position(|t| *t == term) {
+            self.terms.remove(at);
+            for length in &mut self.lengths {
+                if *length > at {
+                    *length -= 1;
+                }
+            }
         }
-        self.terms.splice(0..0, new);
+        self.terms.insert(0, term);
+        if self.lengths.is_empty() {
+            self.lengths.push(0);
+        }
+        for length in &mut self.lengths {
+            *length += 1;
+        }
         self
     }
 
-    /// Both libraries order by order: order n holds the terms of order n of either, each once. A library with
-    /// fewer orders stays at its last. Both must be over the same variables.
+    /// Order by order the terms of both libraries (over the same variables), each once. A library with fewer
+    /// orders stays at its last one.
     ///
     /// # Errors
-    /// [`SparseError::Length`] when the numbers of variables differ.
-    pub fn merge(&self, other: &Self) -> Result<Self, SparseError> {
-        if self.variables.len() != other.variables.len() {
+    /// [`SparseError::Length`] if the libraries have different variables.
+    pub fn union(&self, other: &Self) -> Result<Self, SparseError> {
+        if self.variables != other.variables {
             return Err(SparseError::Length {
-                what: "the second library's list of variables".into(),
-                found: other.variables.len(),
-                expected: self.variables.len(),
+                what: "the list of variables both libraries share".into(),
+                found: self.variables.iter().filter(|v| other.variables.contains(v)).count(),
+                expected: self.variables.len().max(other.variables.len()),
             });
         }
-        let mut out = Self { variables: self.variables.clone(), terms: Vec::new(), sizes: Vec::new() };
+        let mut out = Self { variables: self.variables.clone(), terms: Vec::new(), lengths: Vec::new() };
         for order in 1..=self.orders().max(other.orders()) {
-            for term in self.added(order).iter().chain(other.added(order)) {
-                if !out.terms.contains(term) {
-                    out.terms.push(term.clone());
+            for library in [self, other] {
+                for term in &library.terms[..library.len_of_order(order)] {
+                    out.push_new(term.clone());
                 }
             }
-            out.sizes.push(out.terms.len());
+            out.lengths.push(out.terms.len());
         }
         Ok(out)
     }
 
-    /// The terms, those of a higher order behind those of a lower one.
+    /// Number of terms of the highest order.
+    #[must_use]
+    pub fn len(&self) -> usize {
+        self.terms.len()
+    }
+
+    /// Whether there are no terms.
+    #[must_use]
+    pub fn is_empty(&self) -> bool {
+        self.terms.is_empty()
+    }
+
+    /// Number of nested orders; they count from 1.
+    #[must_use]
+    pub fn orders(&self) -> usize {
+        self.lengths.len()
+    }
+
+    /// Number of terms of order `order` (the highest order's beyond it, 0 for order 0).
+    #[must_use]
+    pub fn len_of_order(&self, order: usize) -> usize {
+        match order {
+            0 => 0,
+            _ => self.lengths.get(order - 1).copied().unwrap_or(self.terms.len()),
+        }
+    }
+
+    /// Number of terms of every order, ascending.
+    #[must_use]
+    pub fn lengths(&self) -> &[usize] {
+        &self.lengths
+    }
+
+    /// The terms.
     #[must_use]
     pub fn terms(&self) -> &[Term] {
         &self.terms
     }
 
-    /// Number of orders.
+    /// The variables' names.
     #[must_use]
-    pub fn orders(&self) -> usize {
-        self.sizes.len()
+    pub fn variables(&self) -> &[String] {
+        &self.variables
     }
 
-    /// How many leading terms make up order 1, 2, ….
+    /// The terms as text.
     #[must_use]
-    pub fn sizes(&self) -> &[usize] {
-        &self.sizes
+    pub fn labels(&self) -> Vec<String> {
+        self.terms.iter().map(|t| t.label(&self.variables)).collect()
     }
 
-    /// Every term as text.
-    #[must_use]
-    pub fn names(&self) -> Vec<String> {
-        self.terms.iter().map(|t| t.display(&self.variables).to_string()).collect()
-    }
-
-    /// All columns (one per term) from the variables' samples, each power and product by one multiplication.
-    /// `user` gives the values of [`Function::User`] factors by their text.
+    /// Values of every term, one column each, from the variables' samples and those of the named expressions.
+    /// A monomial costs one multiplication per sample wherever the library holds its factor of one degree less.
     ///
     /// # Errors
-    /// [`SparseError::Length`] for slices of different length or number, [`SparseError::NoUserValues`],
-    /// [`SparseError::NoSuchColumn`] when a function names a variable that is not there.
-    ///
-    /// ```
-    /// use greybox_sparse::Library;
-    /// let library = Library::tensor(&["x", "x'"], &[2, 2]);
-    /// let columns = library.evaluate(&[&[2.0], &[3.0]], &[])?;
-    /// assert_eq!(library.names()[7], "x^2*x'^2");
-    /// assert_eq!(columns[7], [36.0]);
-    /// # Ok::<(), greybox_sparse::SparseError>(())
-    /// ```
+    /// [`SparseError::Length`] for a wrong number of variables or unequal lengths,
+    /// [`SparseError::UnknownExpression`], [`SparseError::NotFinite`] for a variable that is not finite or a
+    /// term that overflows.
     pub fn evaluate(
         &self,
         variables: &[&[f64]],
-        user: &[(&str, &[f64])],
+        expressions: &[(&str, &[f64])],
     ) -> Result<Vec<Vec<f64>>, SparseError> {
-        if variables.len() != self.variables.len() {
+        let n = self.check_variables(variables)?;
+        let mut columns: Vec<Vec<f64>> = Vec::with_capacity(self.terms.len());
+        let mut known: BTreeMap<&[u32], usize> = BTreeMap::new();
+        for (index, term) in self.terms.iter().enumerate() {
+            let mut column = match (&term.function, lowered(&term.powers)) {
+                (None, Some((parent, by))) => match known.get(parent.as_slice()) {
+                    Some(&at) => product(&columns[at], variables[by]),
+                    None => monomial(&term.powers, variables, n),
+                },
+                _ => monomial(&term.powers, variables, n),
+            };
+            if let Some(function) = &term.function {
+                multiply_by(&mut column, function, variables, expressions)?;
+            } else {
+                known.insert(&term.powers, index);
+            }
+            if let Some(row) = first_not_finite(&column) {
+                return Err(SparseError::NotFinite {
+                    what: format!("term {}", term.label(&self.variables)),
+                    row,
+                });
+            }
+            columns.push(column);
+        }
+        Ok(columns)
+    }
+
+    fn check_variables(&self, variables: &[&[f64]]) -> Result<usize, SparseError> {
+        let needed = self
+            .terms
+            .iter()
+            .filter_map(Term::largest_variable)
+            .max()
+            .map_or(0, |v| v + 1)
+            .max(self.variables.len());
+        if variables.len() != needed {
             return Err(SparseError::Length {
                 what: "the list of variables".into(),
                 found: variables.len(),
-                expected: self.variables.len(),
+                expected: needed,
             });
         }
-        let rows = variables.first().map_or_else(|| user.first().map_or(0, |u| u.1.len()), |v| v.len());
-        let lengths = variables.iter().zip(&self.variables).map(|(v, n)| (n.as_str(), v.len()));
-        for (name, found) in lengths.chain(user.iter().map(|u| (u.0, u.1.len()))) {
-            if found != rows {
-                return Err(SparseError::Length { what: name.into(), found, expected: rows });
+        let n = variables.first().map_or(0, |v| v.len());
+        for (i, v) in variables.iter().enumerate() {
+            let what =
+                || self.variables.get(i).map_or_else(|| format!("variable {i}"), |n| format!("variable {n}"));
+            if v.len() != n {
+                return Err(SparseError::Length { what: what(), found: v.len(), expected: n });
+            }
+            if let Some(row) = first_not_finite(v) {
+                return Err(SparseError::NotFinite { what: what(), row });
             }
         }
-        let powers = self.power_tables(variables);
-        self.terms.iter().map(|term| self.column(term, variables, &powers, user, rows)).collect()
+        Ok(n)
     }
 
-    /// `tables[i][e − 2]` = variable i to the power e ≥ 2.
-    fn power_tables(&self, variables: &[&[f64]]) -> Vec<Vec<Vec<f64>>> {
-        variables
-            .iter()
-            .enumerate()
-            .map(|(i, v)| {
-                let highest = self.terms.iter().filter_map(|t| t.powers.get(i)).copied().max().unwrap_or(0);
-                let mut table: Vec<Vec<f64>> = Vec::new();
-                for _ in 2..=highest {
-                    let last: &[f64] = table.last().map_or(v, Vec::as_slice);
-                    table.push(last.iter().zip(*v).map(|(a, b)| a * b).collect());
-                }
-                table
-            })
-            .collect()
+    fn empty(variables: &[&str]) -> Self {
+        let variables = variables.iter().map(|&v| v.to_owned()).collect();
+        Self { variables, terms: Vec::new(), lengths: Vec::new() }
     }
 
-    fn column(
-        &self,
-        term: &Term,
-        variables: &[&[f64]],
-        powers: &[Vec<Vec<f64>>],
-        user: &[(&str, &[f64])],
-        rows: usize,
-    ) -> Result<Vec<f64>, SparseError> {
-        let variable = |i: usize| {
-            variables.get(i).copied().ok_or(SparseError::NoSuchColumn {
-                what: "a term of the library",
-                column: i,
-                columns: variables.len(),
-            })
-        };
-        let mut out: Option<Vec<f64>> = match &term.function {
-            None => None,
-            Some(Function::Sin { variable: v, harmonic }) => {
-                Some(variable(*v)?.iter().map(|x| (f64::from(*harmonic) * x).sin()).collect())
-            }
-            Some(Function::Cos { variable: v, harmonic }) => {
-                Some(variable(*v)?.iter().map(|x| (f64::from(*harmonic) * x).cos()).collect())
-            }
-            Some(Function::Sign { variable: v }) => {
-                Some(variable(*v)?.iter().map(|x| if *x == 0.0 { 0.0 } else { x.signum() }).collect())
-            }
-            Some(Function::Abs { variable: v }) => Some(variable(*v)?.iter().map(|x| x.abs()).collect()),
-            Some(Function::User(name)) => {
-                let values =
-                    user.iter().find(|(n, _)| n == name).ok_or_else(|| SparseError::NoUserValues {
-                        term: term.display(&self.variables).to_string(),
-                        name: name.clone(),
-                    })?;
-                Some(values.1.to_vec())
-            }
-        };
-        for (i, &power) in term.powers.iter().enumerate().filter(|(_, p)| **p > 0) {
-            let values = if power == 1 { variable(i)? } else { powers[i][power as usize - 2].as_slice() };
-            match &mut out {
-                Some(column) => column.iter_mut().zip(values).for_each(|(c, v)| *c *= v),
-                None => out = Some(values.to_vec()),
-            }
-        }
-        Ok(out.unwrap_or_else(|| vec![1.0; rows]))
-    }
-
-    fn by_order(
-        variables: &[&str],
-        powers: Vec<Vec<u32>>,
-        orders: u32,
-        order: impl Fn(&[u32]) -> u32,
-    ) -> Self {
-        let mut library = Self {
-            variables: variables.iter().map(|v| (*v).to_owned()).collect(),
-            terms: Vec::new(),
-            sizes: Vec::new(),
-        };
-        for n in 1..=orders {
-            let new = powers.iter().filter(|p| order(p) == n);
-            library.terms.extend(new.map(|p| Term { powers: p.clone(), function: None }));
-            library.sizes.push(library.terms.len());
+    /// Each shell sorted by degree and then first variable first.
+    fn from_shells(variables: &[&str], shells: impl Iterator<Item = Vec<Vec<u32>>>) -> Self {
+        let mut library = Self::empty(variables);
+        for mut shell in shells {
+            shell.sort_by(|a, b| a.iter().sum::<u32>().cmp(&b.iter().sum()).then(b.cmp(a)));
+            library.terms.extend(shell.iter().map(|powers| Term::powers(powers)));
+            library.lengths.push(library.terms.len());
         }
         library
     }
 
-    /// The terms that `order` (from 1) adds.
-    fn added(&self, order: usize) -> &[Term] {
-        let at = |n: usize| if n == 0 { 0 } else { self.sizes[n - 1] };
-        if order > self.sizes.len() { &[] } else { &self.terms[at(order - 1)..at(order)] }
+    /// The term with one power per variable, so that equal terms compare equal.
+    fn normal(&self, mut term: Term) -> Term {
+        while term.powers.last() == Some(&0) && term.powers.len() > self.variables.len() {
+            term.powers.pop();
+        }
+        if term.powers.len() < self.variables.len() {
+            term.powers.resize(self.variables.len(), 0);
+        }
+        term
+    }
+
+    fn push_new(&mut self, term: Term) {
+        let term = self.normal(term);
+        if !self.terms.iter().any(|t| self.normal(t.clone()) == term) {
+            self.terms.push(term);
+        }
     }
 }
 
-/// Every list with one more exponent 0 ..= limit(list), the last variable slowest, so that of equal order
-/// x stands before x'.
-fn extend(powers: &[Vec<u32>], limit: impl Fn(&[u32]) -> u32) -> Vec<Vec<u32>> {
-    let highest = powers.iter().map(|p| limit(p)).max().unwrap_or(0);
-    (0..=highest)
-        .flat_map(|e| {
-            powers
+impl fmt::Display for Library {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        write!(f, "{}", self.labels().join(", "))
+    }
+}
+
+/// All multi-indices with entry k in 0..=highest[k].
+fn multi_indices(highest: &[u32]) -> Vec<Vec<u32>> {
+    highest.iter().fold(vec![Vec::new()], |found, &top| {
+        found
+            .into_iter()
+            .flat_map(|head| {
+                (0..=top).map(move |p| {
+                    let mut powers = head.clone();
+                    powers.push(p);
+                    powers
+                })
+            })
+            .collect()
+    })
+}
+
+/// The powers with the last non-zero one lowered by one, and whose it was.
+fn lowered(powers: &[u32]) -> Option<(Vec<u32>, usize)> {
+    let by = powers.iter().rposition(|&p| p > 0)?;
+    let mut parent = powers.to_vec();
+    parent[by] -= 1;
+    Some((parent, by))
+}
+
+fn product(a: &[f64], b: &[f64]) -> Vec<f64> {
+    a.iter().zip(b).map(|(a, b)| a * b).collect()
+}
+
+fn monomial(powers: &[u32], variables: &[&[f64]], n: usize) -> Vec<f64> {
+    let mut column: Option<Vec<f64>> = None;
+    for (&p, &v) in powers.iter().zip(variables) {
+        for _ in 0..p {
+            column = Some(match column {
+                None => v.to_vec(),
+                Some(c) => product(&c, v),
+            });
+        }
+    }
+    column.unwrap_or_else(|| vec![1.0; n])
+}
+
+fn multiply_by(
+    column: &mut [f64],
+    function: &Function,
+    variables: &[&[f64]],
+    expressions: &[(&str, &[f64])],
+) -> Result<(), SparseError> {
+    let rows = column.len();
+    let mut apply = |values: &[f64], f: &dyn Fn(f64) -> f64| {
+        for (c, &v) in column.iter_mut().zip(values) {
+            *c *= f(v);
+        }
+    };
+    match function {
+        Function::Sin { variable, harmonic } => {
+            let h = f64::from(*harmonic);
+            apply(variables[*variable], &|v| (h * v).sin());
+        }
+        Function::Cos { variable, harmonic } => {
+            let h = f64::from(*harmonic);
+            apply(variables[*variable], &|v| (h * v).cos());
+        }
+        Function::Sign { variable } => {
+            apply(variables[*variable], &|v| if v == 0.0 { 0.0 } else { v.signum() });
+        }
+        Function::Abs { variable } => apply(variables[*variable], &f64::abs),
+        Function::Expression(name) => {
+            let values = expressions
                 .iter()
-                .filter(|p| e <= limit(p))
-                .map(move |p| p.iter().copied().chain([e]).collect())
-                .collect::<Vec<_>>()
-        })
-        .collect()
+                .find(|(n, _)| n == name)
+                .map(|&(_, v)| v)
+                .ok_or_else(|| SparseError::UnknownExpression { name: name.clone() })?;
+            if values.len() != rows {
+                return Err(SparseError::Length {
+                    what: format!("the expression '{name}'"),
+                    found: values.len(),
+                    expected: rows,
+                });
+            }
+            apply(values, &|v| v);
+        }
+    }
+    Ok(())
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn tensor_counts_and_nesting() {
+        let sizes: Vec<usize> = Library::tensor(&["x", "v"], &[6, 6]).lengths().to_vec();
+        assert_eq!(sizes, [3, 8, 15, 24, 35, 48]);
+        let three = Library::tensor(&["x", "v"], &[3, 3]);
+        let four = Library::tensor(&["x", "v"], &[4, 4]);
+        assert_eq!(three.terms(), &four.terms()[..15]);
+        assert_eq!(Library::tensor(&["x", "v"], &[3, 1]).len(), 7);
+        assert!(!three.labels().contains(&"1".to_owned()));
+    }
+
+    #[test]
+    fn total_degree_and_separate_powers() {
+        let library = Library::total_degree(&["x", "v"], 3, true);
+        assert_eq!(library.lengths(), [3, 6, 10]);
+        assert_eq!(library.labels()[..6], ["1", "x", "v", "x^2", "x*v", "v^2"]);
+        let rig = Library::separate_powers(&["theta", "theta'"], 2)
+            .with_in_every_order(Term::function(Function::Sign { variable: 1 }));
+        assert_eq!(rig.labels(), ["sign(theta')", "theta", "theta'", "theta^2", "theta'^2"]);
+        assert_eq!(rig.lengths(), [3, 5]);
+    }
+
+    #[test]
+    fn values_equal_direct_powers() {
+        let x = [0.5, -1.5, 2.0];
+        let v = [1.0, 3.0, -0.25];
+        for library in [Library::tensor(&["x", "v"], &[4, 3]), Library::total_degree(&["x", "v"], 4, true)] {
+            let columns = library.evaluate(&[&x, &v], &[]).unwrap();
+            for (term, column) in library.terms().iter().zip(&columns) {
+                for i in 0..3 {
+                    let direct = x[i].powi(term.power(0) as i32) * v[i].powi(term.power(1) as i32);
+                    assert!((column[i] - direct).abs() <= 1e-12 * direct.abs().max(1.0));
+                }
+            }
+        }
+    }
+
+    #[test]
+    fn functions_expressions_and_union() {
+        let t = [0.0, 1.0, -2.0];
+        let e = [5.0, 6.0, 7.0];
+        let extra = Library::user(
+            &["q"],
+            &[
+                Term::powers(&[1]).times(Function::Abs { variable: 0 }),
+                Term::function(Function::Expression("drive".into())),
+                Term::function(Function::Sign { variable: 0 }),
+                Term::powers(&[1]),
+            ],
+        );
+        let library = Library::trigonometric(&["q"], 2).union(&extra).unwrap();
+        assert_eq!(
+            library.labels(),
+            ["sin(q)", "cos(q)", "q*abs(q)", "drive", "sign(q)", "q", "sin(2*q)", "cos(2*q)"]
+        );
+        let columns = library.evaluate(&[&t], &[("drive", &e)]).unwrap();
+        assert_eq!(columns[2], [0.0, 1.0, -4.0]);
+        assert_eq!(columns[3], e);
+        assert_eq!(columns[4], [0.0, 1.0, -1.0]);
+        assert!((columns[6][1] - 2f64.sin()).abs() < 1e-15);
+        assert!(matches!(library.evaluate(&[&t], &[]), Err(SparseError::UnknownExpression { .. })));
+    }
+
+    #[test]
+    fn overflow_and_bad_input_are_named() {
+        let library = Library::total_degree(&["x"], 2, false);
+        let error = library.evaluate(&[&[1.0, 1e200]], &[]).unwrap_err();
+        assert_eq!(error, SparseError::NotFinite { what: "term x^2".into(), row: 1 });
+        assert!(matches!(library.evaluate(&[], &[]), Err(SparseError::Length { .. })));
+        let error = library.evaluate(&[&[f64::NAN]], &[]).unwrap_err();
+        assert_eq!(error, SparseError::NotFinite { what: "variable x".into(), row: 0 });
+        let outside = Library::user(&["x"], &[Term::function(Function::Sign { variable: 3 })]);
+        assert!(outside.evaluate(&[&[1.0]], &[]).is_err());
+    }
 }

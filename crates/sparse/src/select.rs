@@ -1,79 +1,68 @@
-//! Thesis Algorithm 1: for every order the penalty by cross-validation, the order by an information criterion.
+//! Algorithm 1 of the thesis for one target: sparse models of nested orders, λ by cross-validation on the
+//! training rows, the order by an information criterion on the test rows.
+//!
+//! The rows are read twice: once to factorise the folds' parts, once for the residuals on the test rows. All
+//! orders, folds and λ work on the triangular factors.
 
 use std::ops::Range;
 
 use rayon::prelude::*;
 
-use crate::SparseError;
-use crate::criteria::{Criterion, effective_rows, smallest};
-use crate::design::{Design, count};
-use crate::folds::{self, Folds, Rule, Split};
-use crate::gram::{Gram, Sample};
-use crate::lasso::{lasso, refit, support};
-use crate::least_squares::least_squares;
-use crate::stlsq::{Threshold, log_grid, stlsq};
-use crate::subset::{backward, best_subsets};
+use crate::criteria::{Criterion, Moment, choose, effective_sample_size};
+use crate::error::{SparseError, check_range};
+use crate::folds::{Split, contiguous, minimum, one_standard_error, random_for_demonstration};
+use crate::lasso::{LassoOptions, lasso_path};
+use crate::protect::checked;
+use crate::rows::{Rows, check_ranges, count};
+use crate::stlsq::{Threshold, stlsq_path};
+use crate::subset::{backward_elimination, best_subsets};
+use crate::triangle::{Fit, Triangle, support};
 
-/// How a sparse model is found for one penalty.
+/// How a sparse model is found for one value of the path parameter.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Selector {
-    /// Sequentially thresholded least squares on the coefficients' own units.
+    /// Thresholded least squares, λ compared with |cⱼ|.
     StlsqRaw,
-    /// The same on |cⱼ| ‖aⱼ‖/‖p‖, free of units.
+    /// Thresholded least squares, λ compared with |cⱼ|‖Pⱼ‖/‖p‖.
     StlsqNormalised,
-    /// LASSO on normalised columns, coefficients as they are (biased towards zero).
+    /// LASSO with its shrunken coefficients. A λ whose descent stops at the sweep limit is used as it stands; call
+    /// [`lasso_path`] to see its duality gap.
     Lasso,
-    /// LASSO for the support, least squares for the coefficients.
+    /// LASSO, its support refitted by least squares.
     LassoRefit,
-    /// Backward elimination; the "penalty" is the number of columns dropped.
+    /// Backward elimination; the path parameter is the number of columns kept.
     Backward,
-    /// Best subset of every size; the "penalty" is the number of columns dropped.
+    /// Best subsets; the path parameter is the number of columns kept.
     BestSubset,
 }
 
-impl Selector {
-    /// Coefficients for every penalty of the grid on the first `columns` columns of a sample. For
-    /// [`Selector::Backward`] and [`Selector::BestSubset`] the grid is ignored: point i has i columns dropped.
-    ///
-    /// # Errors
-    /// Those of the selector: [`stlsq`], [`lasso`], [`backward`], [`best_subsets`].
-    pub fn path(
-        self,
-        sample: &Sample<'_>,
-        columns: usize,
-        grid: &[f64],
-        protected: &[usize],
-    ) -> Result<Vec<Vec<f64>>, SparseError> {
-        sample.check_size(columns)?;
-        Design::check_columns("the protected list", protected, columns)?;
-        let weights = || (0..columns).map(|j| if protected.contains(&j) { 0.0 } else { 1.0 });
-        match self {
-            Self::StlsqRaw => stlsq(sample, columns, grid, Threshold::Raw, protected),
-            Self::StlsqNormalised => stlsq(sample, columns, grid, Threshold::Normalised, protected),
-            Self::Lasso => lasso(sample, columns, grid, &weights().collect::<Vec<_>>()),
-            Self::LassoRefit => refit(sample, &lasso(sample, columns, grid, &weights().collect::<Vec<_>>())?),
-            Self::Backward => backward(sample, columns, protected),
-            Self::BestSubset => best_subsets(sample, columns, protected),
-        }
-    }
-
-    /// Whether the final coefficients are least squares on the support.
-    fn refits(self) -> bool {
-        self != Self::Lasso
-    }
+/// How λ follows from the cross-validation curve.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum Rule {
+    /// The least mean squared error.
+    Minimum,
+    /// The sparsest within one standard error of it.
+    OneStandardError,
 }
 
-/// One target, candidate columns nested by order, and which rows belong to which recording.
-#[derive(Debug, Clone, Copy)]
-pub struct Problem<'a> {
-    /// Candidate columns; order i uses the first `orders[i]` of them.
-    pub columns: &'a [&'a [f64]],
-    /// The target p.
-    pub target: &'a [f64],
-    /// Number of leading columns of every order, ascending.
-    pub orders: &'a [usize],
-    /// Row ranges of separate recordings, in order; empty for one recording.
-    pub pieces: &'a [Range<usize>],
+/// How the folds are made.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum FoldKind {
+    /// Consecutive rows.
+    Contiguous,
+    /// Rows at random with this seed: **wrong for time series**, for demonstration only.
+    RandomForDemonstration(u64),
+}
+
+/// Which sample size the criteria count.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum SampleSize {
+    /// The test rows (thesis Eq 2.17).
+    Rows,
+    /// The effective number of test rows by the autocorrelation of the squared residuals
+    /// ([`Moment::Square`]) of the order with the least test RSS; one number for all orders, since criteria
+    /// with different ones cannot be compared.
+    Effective,
 }
 
 /// Settings of [`search`].
@@ -81,52 +70,46 @@ pub struct Problem<'a> {
 pub struct Options {
     /// How sparse models are found.
     pub selector: Selector,
-    /// Thresholds or penalties to try.
+    /// The λ to try, in any order; not used by [`Selector::Backward`] and [`Selector::BestSubset`].
     pub grid: Vec<f64>,
-    /// Number of contiguous folds K ≥ 2 of the training rows.
+    /// Number of folds K ≥ 2.
     pub folds: usize,
-    /// Draw the folds at random with this seed instead: wrong for time series, see [`folds::random`].
-    pub random_folds: Option<u64>,
-    /// How the penalty is read from the cross-validation curve.
-    pub rule: Rule,
-    /// What decides between the orders.
-    pub criterion: Criterion,
-    /// Use the effective number of test rows ([`effective_rows`]) in the deciding criterion instead of n.
-    pub effective: bool,
-    /// Columns that must stay.
-    pub protected: Vec<usize>,
-    /// Share of the rows, from the start, that trains.
-    pub train_fraction: f64,
-    /// Rows dropped between training and test rows and between folds (the length of a window in rows).
+    /// How the folds are made.
+    pub fold_kind: FoldKind,
+    /// Rows next to a held-out row that are not trained on.
     pub gap: usize,
+    /// How λ is chosen.
+    pub rule: Rule,
+    /// Which criterion chooses the order.
+    pub criterion: Criterion,
+    /// The sample size in the criteria.
+    pub sample_size: SampleSize,
 }
 
 impl Options {
-    /// For coefficients of comparable size: raw thresholds 1e-2 … 1 (40 values), K = 5, minimum of MSE_cv, AIC
-    /// on the second half of the rows (measured on the Duffing oscillator of thesis chapter 2).
+    /// Thresholds on raw coefficients, 40 values in 10⁻²..1, minimum of 5 contiguous folds, AIC: what recovers
+    /// the thesis' Duffing oscillator (coefficients of one size).
     #[must_use]
     pub fn raw() -> Self {
         Self {
             selector: Selector::StlsqRaw,
-            grid: log_grid(1e-2, 1.0, 40),
+            grid: logspace(1e-2, 1.0, 40),
             folds: 5,
-            random_folds: None,
+            fold_kind: FoldKind::Contiguous,
+            gap: 0,
             rule: Rule::Minimum,
             criterion: Criterion::Aic,
-            effective: false,
-            protected: Vec::new(),
-            train_fraction: 0.5,
-            gap: 0,
+            sample_size: SampleSize::Rows,
         }
     }
 
-    /// For coefficients of very different size or unit: normalised thresholds 1e-5 … 1e-1 (50 values), K = 10,
-    /// one-standard-error rule (measured on the rotary flexible link).
+    /// Thresholds on normalised coefficients, 50 values in 10⁻⁵..10⁻¹, one-standard-error rule of 10 contiguous
+    /// folds, AIC: what recovers the thesis' flexible link (coefficients over three decades).
     #[must_use]
     pub fn normalised() -> Self {
         Self {
             selector: Selector::StlsqNormalised,
-            grid: log_grid(1e-5, 1e-1, 50),
+            grid: logspace(1e-5, 1e-1, 50),
             folds: 10,
             rule: Rule::OneStandardError,
             ..Self::raw()
@@ -134,199 +117,482 @@ impl Options {
     }
 }
 
-/// One point of a cross-validation curve.
-#[derive(Debug, Clone, Copy, PartialEq)]
-pub struct PathPoint {
-    /// The penalty (or the number of columns dropped, for subset selectors).
-    pub lambda: f64,
-    /// MSE_cv(λ), thesis Eq 2.15.
-    pub mse: f64,
-    /// Its standard error over the folds: sd of the folds' mean squared errors / √K.
-    pub standard_error: f64,
-    /// Mean number of terms of the folds' models.
-    pub terms: f64,
+/// `count` values from `low` to `high` (both positive) in equal ratios.
+#[must_use]
+pub fn logspace(low: f64, high: f64, count: usize) -> Vec<f64> {
+    let last = count.saturating_sub(1).max(1) as f64;
+    (0..count).map(|i| low * (high / low).powf(i as f64 / last)).collect()
 }
 
-/// The best model of one order.
+/// One target and its nested candidate columns, checked.
+#[derive(Debug, Clone)]
+pub struct Problem<'a> {
+    rows: Rows<'a>,
+    orders: Vec<usize>,
+    protected: Vec<usize>,
+    split: Split,
+}
+
+impl<'a> Problem<'a> {
+    /// `orders[r]` is the number of leading columns that order r + 1 may use
+    /// ([`Library::lengths`](crate::Library::lengths) plus any columns in front of the library). Protected
+    /// columns must be among those of the first order.
+    ///
+    /// # Errors
+    /// [`SparseError::Empty`] without orders, [`SparseError::Length`] if they do not ascend within the columns,
+    /// [`SparseError::NoSuchColumn`] for protected columns outside order 1, [`SparseError::RowRange`] for a
+    /// split outside the rows.
+    pub fn new(
+        rows: Rows<'a>,
+        orders: &[usize],
+        protected: &[usize],
+        split: Split,
+    ) -> Result<Self, SparseError> {
+        let first = *orders.first().ok_or(SparseError::Empty { what: "orders" })?;
+        let mut last = 1;
+        for (r, &length) in orders.iter().enumerate() {
+            if length < last || length > rows.columns() {
+                return Err(SparseError::Length {
+                    what: format!("order {} (orders ascend, up to all {} columns)", r + 1, rows.columns()),
+                    found: length,
+                    expected: length.clamp(last.min(rows.columns()), rows.columns()),
+                });
+            }
+            last = length;
+        }
+        check_ranges(&split.train, rows.rows())?;
+        check_ranges(&split.test, rows.rows())?;
+        Ok(Self { protected: checked(protected, first)?, rows, orders: orders.to_vec(), split })
+    }
+
+    /// The rows.
+    #[must_use]
+    pub fn rows(&self) -> &Rows<'a> {
+        &self.rows
+    }
+
+    /// The split.
+    #[must_use]
+    pub fn split(&self) -> &Split {
+        &self.split
+    }
+
+    /// The protected columns, ascending.
+    #[must_use]
+    pub fn protected(&self) -> &[usize] {
+        &self.protected
+    }
+}
+
+/// What was found for one order.
 #[derive(Debug, Clone, PartialEq)]
-pub struct OrderFit {
-    /// Number of candidate columns.
-    pub columns: usize,
-    /// The cross-validation curve.
-    pub path: Vec<PathPoint>,
-    /// Index of the chosen point in `path`.
+pub struct OrderModel {
+    /// The order, counted from 1.
+    pub order: usize,
+    /// Candidate columns of this order.
+    pub candidates: usize,
+    /// The path parameter from the densest to the sparsest model: λ ascending, or columns kept descending.
+    pub grid: Vec<f64>,
+    /// MSE_cv of every value: mean over the folds of RSS / rows on the held-out rows.
+    pub cv_mean: Vec<f64>,
+    /// Its standard error: standard deviation over the folds / √K.
+    pub cv_error: Vec<f64>,
+    /// Index of the chosen value.
     pub chosen: usize,
-    /// Coefficients on all training rows (refitted by QR unless the selector is [`Selector::Lasso`]).
+    /// Coefficients over all columns of the problem, from all training rows (least squares on the support,
+    /// except for [`Selector::Lasso`]).
     pub coefficients: Vec<f64>,
-    /// Columns whose coefficient is not zero.
-    pub active: Vec<usize>,
+    /// Columns with non-zero coefficients.
+    pub support: Vec<usize>,
     /// Residual sum of squares on the training rows.
     pub train_rss: f64,
-    /// Residual sum of squares on the test rows (not below (64 ε)² Σ p², where only rounding is left).
+    /// Residual sum of squares on the test rows, not below rounding, (64 ε ‖p‖)².
     pub test_rss: f64,
-    /// Number of test rows n.
-    pub test_rows: usize,
-    /// Effective number of test rows.
-    pub effective_rows: f64,
-    /// AIC on the test rows with n (thesis Eq 2.17).
+    /// AIC on the test rows.
     pub aic: f64,
-    /// Corrected AIC with n.
+    /// AICc on the test rows.
     pub aicc: f64,
-    /// BIC with n.
+    /// BIC on the test rows.
     pub bic: f64,
-    /// The value that decides ([`Options::criterion`], [`Options::effective`]).
-    pub criterion: f64,
 }
 
-/// Result of [`search`].
+impl OrderModel {
+    /// The chosen path parameter.
+    #[must_use]
+    pub fn lambda(&self) -> f64 {
+        self.grid[self.chosen]
+    }
+}
+
+/// The models of all orders and the choice among them.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Search {
-    /// One entry per order.
-    pub orders: Vec<OrderFit>,
-    /// Index of the chosen order (of equal criteria the smallest order).
+    /// One per order.
+    pub orders: Vec<OrderModel>,
+    /// Index into `orders` of the least criterion; ties go to the smaller model, then the lower order.
     pub chosen: usize,
-    /// Which rows trained and tested.
-    pub split: Split,
-    /// The folds of the training rows.
-    pub folds: Folds,
+    /// Number of test rows.
+    pub test_rows: usize,
+    /// The sample size the criteria used.
+    pub effective_rows: f64,
 }
 
 impl Search {
     /// The model of the chosen order.
     #[must_use]
-    pub fn best(&self) -> &OrderFit {
+    pub fn model(&self) -> &OrderModel {
         &self.orders[self.chosen]
     }
 }
 
-/// Thesis Algorithm 1 for one target: split, cross-validate every order's path, fit on all training rows,
-/// compare the orders on the test rows. One pass over the rows makes the Gram matrices of the folds; all else
-/// but the final refits comes from them. Orders run in parallel; the result does not depend on threads.
+/// The sparse models along a grid (densest first as ordered by [`ordered_grid`]) from one factor.
 ///
 /// # Errors
-/// Data ([`Design::new`]), rows ([`folds::contiguous`], [`folds::train_test`]), columns and orders
-/// ([`SparseError::NoSuchColumn`]), grid, and rank deficiency of an order's full set of columns.
-pub fn search(problem: &Problem<'_>, options: &Options) -> Result<Search, SparseError> {
-    let design = Design::new(problem.columns, problem.target)?;
-    let whole = [0..design.rows()];
-    let pieces = if problem.pieces.is_empty() { &whole } else { problem.pieces };
-    design.check_rows(pieces)?;
-    let split = folds::train_test(pieces, options.train_fraction, options.gap)?;
-    search_split(&design, problem.orders, split, options)
+/// Those of the selector.
+pub fn path(
+    selector: Selector,
+    triangle: &Triangle,
+    protected: &[usize],
+    grid: &[f64],
+) -> Result<Vec<Fit>, SparseError> {
+    let by_size = |models: Vec<Fit>| -> Vec<Fit> {
+        // Models come largest first, each one column smaller than the one before.
+        let most = models
+            .first()
+            .map_or(0, |m| triangle.independent(protected).map_or(m.coefficients.len(), |i| i.len()));
+        grid.iter()
+            .filter_map(|&size| {
+                let at = most.saturating_sub(size.max(0.0) as usize).min(models.len() - 1);
+                models.get(at).cloned()
+            })
+            .collect()
+    };
+    match selector {
+        Selector::StlsqRaw => stlsq_path(triangle, protected, grid, Threshold::Raw),
+        Selector::StlsqNormalised => stlsq_path(triangle, protected, grid, Threshold::Normalised),
+        Selector::Lasso | Selector::LassoRefit => {
+            let protected = checked(protected, triangle.columns())?;
+            let weights: Vec<f64> = (0..triangle.columns())
+                .map(|j| if protected.binary_search(&j).is_ok() { 0.0 } else { 1.0 })
+                .collect();
+            let fits = lasso_path(triangle, &weights, grid, &LassoOptions::default())?;
+            fits.into_iter()
+                .map(|f| match selector {
+                    Selector::LassoRefit => refit(triangle, &f.fit.support(), &protected),
+                    _ => Ok(f.fit),
+                })
+                .collect()
+        }
+        Selector::Backward => Ok(by_size(backward_elimination(triangle, protected)?)),
+        Selector::BestSubset => Ok(by_size(best_subsets(triangle, protected)?)),
+    }
 }
 
-/// As [`search`] with training and test rows of the caller's choice (for instance two recordings).
+/// Least squares on the support and the protected columns, without columns that depend on those before.
+fn refit(triangle: &Triangle, found: &[usize], protected: &[usize]) -> Result<Fit, SparseError> {
+    let mut active: Vec<usize> = found.iter().chain(protected).copied().collect();
+    active.sort_unstable();
+    active.dedup();
+    let local: Vec<usize> =
+        (0..active.len()).filter(|&i| protected.binary_search(&active[i]).is_ok()).collect();
+    let independent = triangle.select(&active)?.independent(&local)?;
+    triangle.fit(&independent.into_iter().map(|i| active[i]).collect::<Vec<_>>())
+}
+
+/// The path parameter from the densest to the sparsest model, for `candidates` columns.
 ///
 /// # Errors
-/// As [`search`].
-pub fn search_split(
-    design: &Design<'_>,
-    orders: &[usize],
-    split: Split,
-    options: &Options,
-) -> Result<Search, SparseError> {
-    design.check_rows(&split.train)?;
-    design.check_rows(&split.test)?;
-    if orders.is_empty() {
-        return Err(SparseError::Empty { what: "the list of orders".into(), mend: "give at least one size" });
+/// [`SparseError::Empty`] without λ, [`SparseError::Option`] for a negative or non-finite one.
+pub fn ordered_grid(options: &Options, candidates: usize, protected: usize) -> Result<Vec<f64>, SparseError> {
+    if matches!(options.selector, Selector::Backward | Selector::BestSubset) {
+        return Ok((protected..=candidates).rev().map(|k| k as f64).collect());
     }
-    let folds = match options.random_folds {
-        Some(seed) => folds::random(&split.train, options.folds, seed)?,
-        None => folds::contiguous(&split.train, options.folds, options.gap)?,
+    if options.grid.is_empty() {
+        return Err(SparseError::Empty { what: "values of λ" });
+    }
+    for &lambda in &options.grid {
+        check_range("lambda", lambda, 0.0, f64::MAX, "finite and not negative")?;
+    }
+    let mut grid = options.grid.clone();
+    grid.sort_by(f64::total_cmp);
+    Ok(grid)
+}
+
+/// Runs Algorithm 1.
+///
+/// # Errors
+/// Those of the folds, of the selector, and of the criteria.
+pub fn search(problem: &Problem<'_>, options: &Options) -> Result<Search, SparseError> {
+    let train = &problem.split.train;
+    let folds = match options.fold_kind {
+        FoldKind::Contiguous => contiguous(train, options.folds, options.gap)?,
+        FoldKind::RandomForDemonstration(seed) => random_for_demonstration(train, options.folds, seed)?,
     };
-    let grams: Vec<Gram> = folds.par_iter().map(|rows| Gram::new(design, rows)).collect();
-    let total = grams[1..].iter().fold(grams[0].clone(), |sum, g| sum.plus(g));
-    let pairs: Vec<(Sample<'_>, Sample<'_>)> = folds
+    let parts: Vec<Triangle> = folds
+        .parts
+        .par_iter()
+        .map(|ranges| Triangle::of_rows(&problem.rows, ranges))
+        .collect::<Result<_, _>>()?;
+    let stack = |which: &[usize]| Triangle::stacked(&which.iter().map(|&i| &parts[i]).collect::<Vec<_>>());
+    let pairs: Vec<(Triangle, Triangle)> = (0..folds.len())
+        .into_par_iter()
+        .map(|k| Ok((stack(&folds.training[k])?, stack(&folds.held_out[k])?)))
+        .collect::<Result<_, SparseError>>()?;
+    let whole = stack(&(0..parts.len()).collect::<Vec<_>>())?;
+    let mut models: Vec<OrderModel> = (0..problem.orders.len())
+        .into_par_iter()
+        .map(|r| order_model(problem, options, r, &pairs, &whole))
+        .collect::<Result<_, _>>()?;
+    let test_rows = count(&problem.split.test);
+    let effective_rows = effective(problem, options, &models, test_rows)?;
+    for model in &mut models {
+        let value = |criterion: Criterion| {
+            criterion.value(model.test_rss, test_rows, effective_rows, model.support.len())
+        };
+        (model.aic, model.aicc, model.bic) =
+            (value(Criterion::Aic)?, value(Criterion::Aicc)?, value(Criterion::Bic)?);
+    }
+    let values: Vec<f64> = models
         .iter()
-        .zip(&grams)
-        .map(|(rows, gram)| {
-            let others: Vec<_> = folds.iter().filter(|f| *f != rows).flatten().cloned().collect();
-            let train = Sample::from_gram(design, &others, total.minus(gram));
-            (train, Sample::from_gram(design, rows, gram.clone()))
+        .map(|m| match options.criterion {
+            Criterion::Aic => m.aic,
+            Criterion::Aicc => m.aicc,
+            Criterion::Bic => m.bic,
         })
         .collect();
-    let in_folds: Vec<_> = folds.iter().flatten().cloned().collect();
-    let train = Sample::from_gram(design, &in_folds, total);
-    let fits: Result<Vec<OrderFit>, SparseError> =
-        orders.par_iter().map(|&columns| order(design, columns, &pairs, &train, &split, options)).collect();
-    let orders = fits?;
-    let chosen = smallest(&orders.iter().map(|o| o.criterion).collect::<Vec<_>>()).unwrap_or(0);
-    Ok(Search { orders, chosen, split, folds })
+    let sizes: Vec<usize> = models.iter().map(|m| m.support.len()).collect();
+    let chosen = choose(&values, &sizes, effective_rows).unwrap_or(0);
+    Ok(Search { orders: models, chosen, test_rows, effective_rows })
 }
 
-fn order(
-    design: &Design<'_>,
-    columns: usize,
-    pairs: &[(Sample<'_>, Sample<'_>)],
-    train: &Sample<'_>,
-    split: &Split,
-    options: &Options,
-) -> Result<OrderFit, SparseError> {
-    let selector = options.selector;
-    let full = selector.path(train, columns, &options.grid, &options.protected)?;
-    let mut curves = Vec::with_capacity(pairs.len());
-    for (rest, fold) in pairs {
-        let path = selector.path(rest, columns, &options.grid, &options.protected)?;
-        let points: Vec<(f64, usize)> =
-            path.iter().map(|c| (fold.rss(c) / fold.gram().rows(), support(c).len())).collect();
-        curves.push((fold.gram().rows(), points));
-    }
-    // A column of zeros in one fold shortens that fold's path of subsets.
-    let points = curves.iter().map(|(_, c)| c.len()).fold(full.len(), usize::min);
-    let path: Vec<PathPoint> = (0..points).map(|i| point(i, &curves, options)).collect();
-    let mse: Vec<f64> = path.iter().map(|p| p.mse).collect();
-    let se: Vec<f64> = path.iter().map(|p| p.standard_error).collect();
-    let terms: Vec<f64> = path.iter().map(|p| p.terms).collect();
-    let chosen = folds::choose(options.rule, &mse, &se, &terms).unwrap_or(0);
+/// Residuals below this fraction of the target are rounding: models that reach it are equally good, and the
+/// sparser one is taken. Matters only for data without noise.
+const ROUNDING: f64 = 64.0 * f64::EPSILON;
 
-    let active = support(&full[chosen]);
-    let mut coefficients = full[chosen].clone();
-    if selector.refits() {
-        coefficients = least_squares(design, &active, &split.train)?;
-        coefficients.truncate(columns);
+/// Cross-validation and the final fit of one order; the criteria follow once all orders are known.
+fn order_model(
+    problem: &Problem<'_>,
+    options: &Options,
+    r: usize,
+    pairs: &[(Triangle, Triangle)],
+    whole: &Triangle,
+) -> Result<OrderModel, SparseError> {
+    let candidates = problem.orders[r];
+    let grid = ordered_grid(options, candidates, problem.protected.len())?;
+    let errors: Vec<Vec<f64>> = pairs
+        .par_iter()
+        .map(|(train, held)| {
+            let (train, held) = (train.first_columns(candidates), held.first_columns(candidates));
+            let fits = path(options.selector, &train, &problem.protected, &grid)?;
+            let floor = (ROUNDING * held.target_norm()).powi(2);
+            Ok(fits.iter().map(|f| held.rss(&f.coefficients).max(floor) / held.rows() as f64).collect())
+        })
+        .collect::<Result<_, SparseError>>()?;
+    let (cv_mean, cv_error): (Vec<f64>, Vec<f64>) =
+        (0..grid.len()).map(|i| mean_and_error(errors.iter().map(|fold| fold[i]))).unzip();
+    let chosen = match options.rule {
+        Rule::Minimum => minimum(&cv_mean),
+        Rule::OneStandardError => one_standard_error(&cv_mean, &cv_error),
     }
-    let sum = |r: &[f64]| r.iter().map(|e| e * e).sum::<f64>();
-    let residual = design.residual(&coefficients, &split.test);
-    let energy: f64 = split.test.iter().map(|r| sum(&design.target()[r.clone()])).sum();
-    let test_rss = sum(&residual).max((64.0 * f64::EPSILON).powi(2) * energy);
-    let test_rows = count(&split.test);
-    let mut residual_pieces = Vec::new();
-    let mut at = 0;
-    for range in &split.test {
-        residual_pieces.push(&residual[at..at + range.len()]);
-        at += range.len();
-    }
-    let effective = effective_rows(&residual_pieces);
-    let n = test_rows as f64;
-    let value = |criterion: Criterion, rows| criterion.value(test_rss, n, active.len(), rows);
-    Ok(OrderFit {
-        columns,
-        path,
+    .unwrap_or(0);
+    let fit =
+        path(options.selector, &whole.first_columns(candidates), &problem.protected, &grid[chosen..=chosen])?
+            .pop()
+            .ok_or(SparseError::Empty { what: "values of λ" })?;
+    let test = &problem.split.test;
+    let floor = ROUNDING * ROUNDING * sum_of_squares(&problem.rows.residuals(&[], test));
+    let test_rss = sum_of_squares(&problem.rows.residuals(&fit.coefficients, test)).max(floor);
+    let mut coefficients = fit.coefficients;
+    coefficients.resize(problem.rows.columns(), 0.0);
+    Ok(OrderModel {
+        order: r + 1,
+        candidates,
+        grid,
+        cv_mean,
+        cv_error,
         chosen,
-        train_rss: sum(&design.residual(&coefficients, &split.train)),
-        test_rss,
-        test_rows,
-        effective_rows: effective,
-        aic: value(Criterion::Aic, n),
-        aicc: value(Criterion::Aicc, n),
-        bic: value(Criterion::Bic, n),
-        criterion: value(options.criterion, if options.effective { effective } else { n }),
+        support: support(&coefficients),
         coefficients,
-        active,
+        train_rss: fit.rss,
+        test_rss,
+        aic: f64::NAN,
+        aicc: f64::NAN,
+        bic: f64::NAN,
     })
 }
 
-/// Point i of the curve from every fold's (mean squared error, terms).
-fn point(i: usize, curves: &[(f64, Vec<(f64, usize)>)], options: &Options) -> PathPoint {
-    let k = curves.len() as f64;
-    let rows: f64 = curves.iter().map(|(n, _)| n).sum();
-    let mse = curves.iter().map(|(n, c)| n * c[i].0).sum::<f64>() / rows;
-    let mean = curves.iter().map(|(_, c)| c[i].0).sum::<f64>() / k;
-    let variance = curves.iter().map(|(_, c)| (c[i].0 - mean).powi(2)).sum::<f64>() / (k - 1.0);
-    let lambda = match options.selector {
-        Selector::Backward | Selector::BestSubset => i as f64,
-        _ => options.grid[i],
-    };
-    let terms = curves.iter().map(|(_, c)| c[i].1 as f64).sum::<f64>() / k;
-    PathPoint { lambda, mse, standard_error: (variance / k).sqrt(), terms }
+fn effective(
+    problem: &Problem<'_>,
+    options: &Options,
+    models: &[OrderModel],
+    test_rows: usize,
+) -> Result<f64, SparseError> {
+    match options.sample_size {
+        SampleSize::Rows => Ok(test_rows as f64),
+        SampleSize::Effective => {
+            let best = models.iter().min_by(|a, b| a.test_rss.total_cmp(&b.test_rss));
+            let best = best.ok_or(SparseError::Empty { what: "orders" })?;
+            let ranges: &[Range<usize>] = &problem.split.test;
+            effective_sample_size(&problem.rows.residuals(&best.coefficients, ranges), Moment::Square)
+        }
+    }
+}
+
+/// Mean and standard error of the mean.
+fn mean_and_error(values: impl Iterator<Item = f64> + Clone) -> (f64, f64) {
+    let n = values.clone().count() as f64;
+    let mean = values.clone().sum::<f64>() / n;
+    let variance = values.map(|v| (v - mean).powi(2)).sum::<f64>() / (n - 1.0).max(1.0);
+    (mean, (variance / n).sqrt())
+}
+
+fn sum_of_squares(values: &[f64]) -> f64 {
+    values.iter().map(|v| v * v).sum()
+}
+
+#[cfg(test)]
+#[allow(clippy::single_range_in_vec_init)]
+mod tests {
+    use super::*;
+    use crate::folds::train_test;
+    use crate::library::Library;
+    use crate::testing::{ar1, normal};
+
+    /// y = 2x + x v² − 0.5 v³ in a tensor library, rows and noise autocorrelated.
+    fn problem_data(n: usize, seed: u64, noise: f64) -> (Vec<Vec<f64>>, Vec<f64>) {
+        let (x, v) = (ar1(n, 0.97, seed), ar1(n, 0.97, seed + 10_000));
+        let e = ar1(n, 0.9, seed + 20_000);
+        let columns = Library::tensor(&["x", "v"], &[4, 4]).evaluate(&[&x, &v], &[]).unwrap();
+        let y = (0..n).map(|i| 2.0 * x[i] + x[i] * v[i] * v[i] - 0.5 * v[i].powi(3) + noise * e[i]).collect();
+        (columns, y)
+    }
+
+    fn truth() -> Vec<usize> {
+        let labels = Library::tensor(&["x", "v"], &[4, 4]).labels();
+        let mut at: Vec<usize> =
+            ["x", "x*v^2", "v^3"].iter().map(|t| labels.iter().position(|l| l == t).unwrap()).collect();
+        at.sort_unstable();
+        at
+    }
+
+    fn run(columns: &[Vec<f64>], y: &[f64], options: &Options) -> Search {
+        let rows = Rows::from_vecs(columns, y).unwrap();
+        let split = train_test(&[0..y.len()], 0.5, 20).unwrap();
+        let problem = Problem::new(rows, &[3, 8, 15, 24], &[], split).unwrap();
+        search(&problem, options).unwrap()
+    }
+
+    #[test]
+    fn finds_order_three_and_its_terms() {
+        let (columns, y) = problem_data(4000, 1, 0.02);
+        for selector in [Selector::StlsqRaw, Selector::StlsqNormalised, Selector::Backward] {
+            let mut options = Options::raw();
+            options.selector = selector;
+            options.rule = Rule::OneStandardError;
+            let found = run(&columns, &y, &options);
+            assert_eq!(found.model().order, 3, "{selector:?}");
+            assert_eq!(found.model().support, truth(), "{selector:?}");
+            let c = &found.model().coefficients;
+            assert!((c[truth()[0]] - 2.0).abs() < 0.01);
+            let n = found.test_rows as f64;
+            let aic = n * (found.model().test_rss / n).ln() + 6.0;
+            assert!((found.model().aic - aic).abs() < 1e-9 * n);
+            assert!(found.orders[0].test_rss > 10.0 * found.model().test_rss);
+        }
+    }
+
+    #[test]
+    fn data_without_noise_give_the_sparse_model_of_the_lowest_order() {
+        let (columns, y) = problem_data(1000, 3, 0.0);
+        let mut options = Options::raw();
+        options.grid = logspace(1e-16, 1.0, 30);
+        let found = run(&columns, &y, &options);
+        assert_eq!(found.model().support, truth());
+        assert_eq!(found.model().order, 3);
+    }
+
+    #[test]
+    fn contiguous_folds_recover_and_random_folds_do_not() {
+        // The pitfall of the thesis' notes: with correlated rows random folds leak and keep noise terms.
+        let (mut contiguous_hits, mut random_hits) = (0, 0);
+        for seed in 0..20 {
+            let (columns, y) = problem_data(2000, 100 + seed, 0.3);
+            let mut options = Options::raw();
+            options.grid = logspace(1e-3, 1.0, 40);
+            options.gap = 20;
+            contiguous_hits += usize::from(run(&columns, &y, &options).orders[2].support == truth());
+            options.fold_kind = FoldKind::RandomForDemonstration(seed);
+            random_hits += usize::from(run(&columns, &y, &options).orders[2].support == truth());
+        }
+        assert!(contiguous_hits >= 14, "contiguous: {contiguous_hits}");
+        assert!(random_hits <= 4, "random: {random_hits}");
+    }
+
+    #[test]
+    fn every_selector_runs_and_keeps_the_protected_column() {
+        let (columns, y) = problem_data(600, 5, 0.05);
+        let columns: Vec<Vec<f64>> = columns[..8].to_vec();
+        let rows = Rows::from_vecs(&columns, &y).unwrap();
+        let split = train_test(&[0..600], 0.5, 0).unwrap();
+        let problem = Problem::new(rows, &[3, 8], &[2], split).unwrap();
+        for selector in [
+            Selector::StlsqRaw,
+            Selector::StlsqNormalised,
+            Selector::Lasso,
+            Selector::LassoRefit,
+            Selector::Backward,
+            Selector::BestSubset,
+        ] {
+            let mut options = Options::normalised();
+            options.selector = selector;
+            options.grid = logspace(1e-4, 10.0, 12);
+            options.sample_size = SampleSize::Effective;
+            let found = search(&problem, &options).unwrap();
+            for model in &found.orders {
+                assert!(model.support.contains(&2), "{selector:?}");
+                assert_eq!(model.cv_mean.len(), model.grid.len());
+                assert!(model.aic.is_finite() && model.bic.is_finite());
+            }
+            assert!(found.effective_rows < found.test_rows as f64);
+            // Deterministic whatever the threads do.
+            assert_eq!(found, search(&problem, &options).unwrap());
+        }
+    }
+
+    #[test]
+    fn ties_between_orders_go_to_the_lower() {
+        let n = 400;
+        let x = normal(n, 3);
+        let columns = Library::separate_powers(&["x"], 3).evaluate(&[&x], &[]).unwrap();
+        let y: Vec<f64> = x.iter().zip(normal(n, 4)).map(|(x, e)| 3.0 * x + 0.01 * e).collect();
+        let split = train_test(&[0..n], 0.5, 0).unwrap();
+        let problem = Problem::new(Rows::from_vecs(&columns, &y).unwrap(), &[1, 2, 3], &[], split).unwrap();
+        let mut options = Options::raw();
+        options.grid = vec![0.5];
+        let found = search(&problem, &options).unwrap();
+        assert_eq!(found.orders[2].support, [0]);
+        assert_eq!(found.model().order, 1);
+    }
+
+    #[test]
+    fn bad_problems_are_errors() {
+        let (columns, y) = problem_data(50, 5, 0.1);
+        let rows = || Rows::from_vecs(&columns, &y).unwrap();
+        let split = || train_test(&[0..50], 0.5, 0).unwrap();
+        assert!(matches!(Problem::new(rows(), &[], &[], split()), Err(SparseError::Empty { .. })));
+        assert!(matches!(Problem::new(rows(), &[8, 3], &[], split()), Err(SparseError::Length { .. })));
+        assert!(matches!(Problem::new(rows(), &[99], &[], split()), Err(SparseError::Length { .. })));
+        assert!(matches!(Problem::new(rows(), &[3], &[5], split()), Err(SparseError::NoSuchColumn { .. })));
+        let outside = Split { train: vec![0..10], test: vec![40..51] };
+        assert!(matches!(Problem::new(rows(), &[3], &[], outside), Err(SparseError::RowRange { .. })));
+        let problem = Problem::new(rows(), &[3], &[], split()).unwrap();
+        let mut options = Options::raw();
+        options.grid.clear();
+        assert!(matches!(search(&problem, &options), Err(SparseError::Empty { .. })));
+        options = Options::raw();
+        options.folds = 1;
+        assert!(matches!(search(&problem, &options), Err(SparseError::Option { .. })));
+        options.folds = 30;
+        assert!(matches!(search(&problem, &options), Err(SparseError::TooFewRows { .. })));
+    }
 }

@@ -1,183 +1,192 @@
-//! Subset selection on the triangular factor: backward elimination and the best subset of every size.
+//! Subset selection on the triangular factor: backward elimination and exhaustive best subsets.
 
-use crate::SparseError;
-use crate::design::Design;
-use crate::gram::Sample;
-use crate::least_squares::cholesky;
-use crate::stlsq::live_columns;
+use crate::error::SparseError;
+use crate::protect::checked;
+use crate::triangle::{Fit, Triangle};
 
-/// Most optional columns for which [`best_subsets`] enumerates.
-pub const EXHAUSTIVE_LIMIT: usize = 16;
+/// The most optional columns [`best_subsets`] takes.
+pub const MOST_OPTIONAL: usize = 16;
 
-/// Subset of every size, from all columns down to the protected ones: at every step the column goes whose
-/// loss raises the residual sum of squares least. The coefficients are refitted.
-///
-/// # Errors
-/// [`SparseError::RankDeficient`], [`SparseError::NoSuchColumn`].
-pub fn backward(
-    sample: &Sample<'_>,
-    columns: usize,
-    protected: &[usize],
-) -> Result<Vec<Vec<f64>>, SparseError> {
-    let mut triangle = Triangle::new(sample, columns, protected)?;
-    let mut supports = vec![triangle.names.clone()];
-    while let Some(at) = triangle.cheapest(protected) {
-        triangle.delete(at);
-        supports.push(triangle.names.clone());
-    }
-    fit(sample, columns, &supports)
+/// A factor of some of a problem's columns, with their numbers.
+#[derive(Clone)]
+struct Model {
+    triangle: Triangle,
+    columns: Vec<usize>,
 }
 
-/// Best subset of every size (smallest residual sum of squares), from all columns down to the protected ones,
-/// by the dropping-column tree with bounds (Gatu, Kontoghiorghes 2006, doi:10.1198/106186006X100290).
+impl Model {
+    /// The largest independent model, the protected columns first.
+    fn start(triangle: &Triangle, protected: &[usize]) -> Result<Self, SparseError> {
+        let independent = triangle.independent(protected)?;
+        let mut columns = protected.to_vec();
+        columns.extend(independent.into_iter().filter(|j| protected.binary_search(j).is_err()));
+        Ok(Self { triangle: triangle.select(&columns)?, columns })
+    }
+
+    fn without(&self, at: usize) -> Result<Self, SparseError> {
+        let mut columns = self.columns.clone();
+        let triangle = self.triangle.without(at)?;
+        columns.remove(at);
+        Ok(Self { triangle, columns })
+    }
+
+    fn fit(&self, all: usize) -> Result<Fit, SparseError> {
+        let fit = self.triangle.solve()?;
+        let mut coefficients = vec![0.0; all];
+        for (&j, &c) in self.columns.iter().zip(&fit.coefficients) {
+            coefficients[j] = c;
+        }
+        Ok(Fit { coefficients, rss: fit.rss })
+    }
+}
+
+/// Backward elimination: from all independent columns down to the protected ones, always without the column
+/// whose removal increases the residual sum of squares least, cⱼ² / [(PᵀP)⁻¹]ⱼⱼ. Free of column scales.
+/// Returns the nested models, the largest first.
 ///
 /// # Errors
-/// [`SparseError::TooManyColumns`] beyond [`EXHAUSTIVE_LIMIT`] optional columns; as [`backward`].
-pub fn best_subsets(
-    sample: &Sample<'_>,
-    columns: usize,
-    protected: &[usize],
-) -> Result<Vec<Vec<f64>>, SparseError> {
-    let triangle = Triangle::new(sample, columns, protected)?;
-    let (all, fixed) = (triangle.names.len(), triangle.fixed);
-    if all - fixed > EXHAUSTIVE_LIMIT {
-        return Err(SparseError::TooManyColumns { found: all - fixed, limit: EXHAUSTIVE_LIMIT });
+/// [`SparseError::NoSuchColumn`], [`SparseError::RankDeficient`] for the protected columns.
+pub fn backward_elimination(triangle: &Triangle, protected: &[usize]) -> Result<Vec<Fit>, SparseError> {
+    let protected = checked(protected, triangle.columns())?;
+    let mut model = Model::start(triangle, &protected)?;
+    let mut path = vec![model.fit(triangle.columns())?];
+    while model.columns.len() > protected.len() {
+        let k = model.columns.len();
+        let fit = model.triangle.solve()?;
+        let inverse = model.triangle.inverse_gram()?;
+        let increase = |at: usize| fit.coefficients[at].powi(2) / inverse[at * k + at];
+        let Some(weakest) = (protected.len()..k).min_by(|&a, &b| increase(a).total_cmp(&increase(b))) else {
+            break;
+        };
+        model = model.without(weakest)?;
+        path.push(model.fit(triangle.columns())?);
     }
-    let mut best: Vec<(f64, Vec<usize>)> = vec![(f64::INFINITY, Vec::new()); all + 1];
-    descend(&triangle, fixed, &mut best);
-    let supports: Vec<_> = (fixed..=all)
+    Ok(path)
+}
+
+/// The model of least residual sum of squares of every size, the largest first: exhaustive in effect, by
+/// branch and bound on the tree of single deletions (Furnival & Wilson 1974; Gatu & Kontoghiorghes 2006). A
+/// branch is left when even its largest model is no better than what is known for all its sizes.
+///
+/// # Errors
+/// [`SparseError::TooManyColumns`] over [`MOST_OPTIONAL`] optional columns, [`SparseError::NoSuchColumn`],
+/// [`SparseError::RankDeficient`] for the protected columns.
+pub fn best_subsets(triangle: &Triangle, protected: &[usize]) -> Result<Vec<Fit>, SparseError> {
+    let protected = checked(protected, triangle.columns())?;
+    let start = Model::start(triangle, &protected)?;
+    let optional = start.columns.len() - protected.len();
+    if optional > MOST_OPTIONAL {
+        return Err(SparseError::TooManyColumns { optional, most: MOST_OPTIONAL });
+    }
+    // Entry s: the best model with s optional columns.
+    let mut best: Vec<Option<(f64, Vec<usize>)>> = vec![None; optional + 1];
+    branch(&start, protected.len(), protected.len(), &mut best)?;
+    best.into_iter()
         .rev()
-        .map(|size| {
-            let mut names = std::mem::take(&mut best[size].1);
-            names.sort_unstable();
-            names
-        })
-        .collect();
-    fit(sample, columns, &supports)
-}
-
-fn fit(sample: &Sample<'_>, columns: usize, supports: &[Vec<usize>]) -> Result<Vec<Vec<f64>>, SparseError> {
-    let normalised = sample.normalised(columns);
-    supports
-        .iter()
-        .map(|active| {
-            let mut full = vec![0.0; columns];
-            for (&j, c) in active.iter().zip(sample.solve(active, &normalised)?) {
-                full[j] = c;
-            }
-            Ok(full)
+        .flatten()
+        .map(|(_, mut columns)| {
+            columns.sort_unstable();
+            triangle.fit(&columns)
         })
         .collect()
 }
 
-/// Visit the node and every node got by deleting a column at position `from` or later. The leading parts of a
-/// triangle are models of their own: their RSS is the tail of the rotated target.
-fn descend(node: &Triangle, from: usize, best: &mut [(f64, Vec<usize>)]) {
-    let m = node.names.len();
-    let mut rss = node.rest;
-    for size in (node.fixed..=m).rev() {
-        if rss < best[size].0 {
-            best[size] = (rss, node.names[..size].to_vec());
+/// Visits the sub-models that keep the first `fixed` columns of `model`.
+fn branch(
+    model: &Model,
+    fixed: usize,
+    protected: usize,
+    best: &mut [Option<(f64, Vec<usize>)>],
+) -> Result<(), SparseError> {
+    // The leading part of a triangle is the triangle of the leading columns.
+    let k = model.columns.len();
+    let head = model.triangle.head(k, k);
+    let bound = model.triangle.last_square();
+    let mut rss = bound;
+    for size in (fixed..=k).rev() {
+        let known = &mut best[size - protected];
+        if known.as_ref().is_none_or(|(value, _)| rss < *value) {
+            *known = Some((rss, model.columns[..size].to_vec()));
         }
         if size > 0 {
-            rss += node.target[size - 1].powi(2);
+            rss += head[size - 1] * head[size - 1];
         }
     }
-    // Below this node sizes from+1 .. m−1 occur (sizes ≤ from were leading parts); none fits better than the node.
-    for at in from..m.saturating_sub(1) {
-        if (at.max(node.fixed)..m).all(|size| best[size].0 <= node.rest) {
-            return;
+    for at in (fixed..k).rev() {
+        // Sizes at .. k−1 come from deleting position `at` or later ones before it.
+        let hopeless =
+            (at..k).all(|size| best[size - protected].as_ref().is_some_and(|(value, _)| *value <= bound));
+        if !hopeless {
+            branch(&model.without(at)?, at, protected, best)?;
         }
-        let mut child = node.clone();
-        child.delete(at);
-        descend(&child, at, best);
     }
+    Ok(())
 }
 
-/// Upper triangular R and rotated target q of the columns `names`: RSS = rest + 0, and ‖q − R β‖² the loss.
-#[derive(Debug, Clone)]
-struct Triangle {
-    names: Vec<usize>,
-    /// Leading columns never deleted.
-    fixed: usize,
-    /// Column c has its entries 0 ..= c (a few more while a rotation is under way).
-    columns: Vec<Vec<f64>>,
-    target: Vec<f64>,
-    rest: f64,
-}
+#[cfg(test)]
+#[allow(clippy::single_range_in_vec_init)]
+mod tests {
+    use super::*;
+    use crate::rows::Rows;
+    use crate::testing::{design, normal};
 
-impl Triangle {
-    fn new(sample: &Sample<'_>, columns: usize, protected: &[usize]) -> Result<Self, SparseError> {
-        sample.check_size(columns)?;
-        Design::check_columns("the protected list", protected, columns)?;
-        let normalised = sample.normalised(columns);
-        let live = live_columns(&normalised, protected)?;
-        let mut names: Vec<usize> = live.iter().copied().filter(|j| protected.contains(j)).collect();
-        let fixed = names.len();
-        names.extend(live.iter().copied().filter(|j| !protected.contains(j)));
-        let m = names.len();
-        if let Some(l) = cholesky(&normalised.correlation, normalised.columns, &names) {
-            let columns = (0..m).map(|i| l[i * (i + 1) / 2..(i + 1) * (i + 2) / 2].to_vec()).collect();
-            let mut target: Vec<f64> = names.iter().map(|&j| normalised.cross[j]).collect();
-            for i in 0..m {
-                let row = i * (i + 1) / 2;
-                let dot: f64 = (0..i).map(|j| l[row + j] * target[j]).sum();
-                target[i] = (target[i] - dot) / l[row + i];
-            }
-            let rest = (1.0 - target.iter().map(|q| q * q).sum::<f64>()).max(0.0);
-            if rest > 1e-9 {
-                return Ok(Self { names, fixed, columns, target, rest });
-            }
+    fn correlated(k: usize, seed: u64) -> Triangle {
+        let (mut columns, y) = design(80, k, seed);
+        let common = normal(80, seed + 500);
+        for (j, c) in columns.iter_mut().enumerate() {
+            let scale = 10f64.powi(j as i32 % 5 - 2);
+            c.iter_mut().zip(&common).for_each(|(v, u)| *v = scale * (*v + u));
         }
-        let (mut columns, mut target, _) = sample.reduced().triangle(&names)?;
-        for (i, column) in columns.iter_mut().enumerate() {
-            column.truncate(i + 1);
-        }
-        let rest = target.pop().map_or(0.0, |r| r * r);
-        Ok(Self { names, fixed, columns, target, rest })
+        Triangle::of_rows(&Rows::from_vecs(&columns, &y).unwrap(), &[0..80]).unwrap()
     }
 
-    /// Position of the optional column whose deletion costs least: βᵢ²/[(RᵀR)⁻¹]ᵢᵢ.
-    fn cheapest(&self, protected: &[usize]) -> Option<usize> {
-        let m = self.names.len();
-        let mut best: Option<(f64, usize)> = None;
-        // Rows of R⁻¹ from unit vectors: Rᵀ y = eᵢ gives column i of R⁻ᵀ, whose entries start at i.
-        for i in 0..m {
-            let mut y = vec![0.0; m];
-            y[i] = 1.0 / self.columns[i][i];
-            for c in i + 1..m {
-                let dot: f64 = (i..c).map(|r| self.columns[c][r] * y[r]).sum();
-                y[c] = -dot / self.columns[c][c];
-            }
-            let beta: f64 = y.iter().zip(&self.target).map(|(y, q)| y * q).sum();
-            let cost = beta * beta / y.iter().map(|v| v * v).sum::<f64>();
-            if !protected.contains(&self.names[i]) && best.is_none_or(|(least, _)| cost < least) {
-                best = Some((cost, i));
+    #[test]
+    fn best_subsets_equal_the_full_enumeration() {
+        for seed in 0..6 {
+            let t = correlated(8, seed);
+            for protected in [vec![], vec![3], vec![0, 5]] {
+                let found = best_subsets(&t, &protected).unwrap();
+                assert_eq!(found.len(), 9 - protected.len());
+                for (i, fit) in found.iter().enumerate() {
+                    let size = 8 - i;
+                    let mut least = f64::INFINITY;
+                    for mask in 0..256_u32 {
+                        let set: Vec<usize> = (0..8).filter(|j| mask >> j & 1 == 1).collect();
+                        if set.len() == size && protected.iter().all(|p| set.contains(p)) {
+                            least = least.min(t.fit(&set).unwrap().rss);
+                        }
+                    }
+                    assert_eq!(fit.support().len(), size);
+                    assert!((fit.rss - least).abs() < 1e-10 * least, "seed {seed}, size {size}");
+                }
             }
         }
-        best.map(|(_, i)| i)
     }
 
-    /// Delete the column at a position and restore the triangle by Givens rotations.
-    fn delete(&mut self, at: usize) {
-        self.names.remove(at);
-        self.columns.remove(at);
-        for row in at..self.names.len() {
-            let (a, b) = (self.columns[row][row], self.columns[row][row + 1]);
-            let h = a.hypot(b);
-            let (c, s) = (a / h, b / h);
-            for column in &mut self.columns[row..] {
-                let (u, v) = (column[row], column[row + 1]);
-                column[row] = c * u + s * v;
-                column[row + 1] = c * v - s * u;
-            }
-            self.columns[row].truncate(row + 1);
-            let (u, v) = (self.target[row], self.target[row + 1]);
-            self.target[row] = c * u + s * v;
-            self.target[row + 1] = c * v - s * u;
+    #[test]
+    fn each_elimination_is_the_cheapest() {
+        let t = correlated(9, 11);
+        let path = backward_elimination(&t, &[2]).unwrap();
+        assert_eq!(path.len(), 9);
+        for pair in path.windows(2) {
+            let set = pair[0].support();
+            let least = set
+                .iter()
+                .filter(|&&j| j != 2)
+                .map(|&out| {
+                    let rest: Vec<usize> = set.iter().copied().filter(|&j| j != out).collect();
+                    t.fit(&rest).unwrap().rss
+                })
+                .fold(f64::INFINITY, f64::min);
+            assert!((pair[1].rss - least).abs() < 1e-10 * least);
+            assert!(pair[1].support().contains(&2));
         }
-        if let Some(lost) = self.target.pop() {
-            self.rest += lost * lost;
-        }
+    }
+
+    #[test]
+    fn too_many_columns_is_an_error() {
+        let t = correlated(18, 1);
+        assert!(matches!(best_subsets(&t, &[]), Err(SparseError::TooManyColumns { optional: 18, .. })));
+        assert!(best_subsets(&t, &[0, 1]).is_ok());
     }
 }
