@@ -4,6 +4,7 @@
 //! `report.json`. Nothing here knows how greybox works.
 
 mod cases;
+mod identify;
 mod table;
 
 use std::path::{Path, PathBuf};
@@ -23,6 +24,15 @@ pub(crate) struct Arguments {
     /// Folder of the real recordings (else the environment variable GREYBOX_RECORDINGS)
     #[arg(long, value_name = "DIR")]
     recordings: Option<PathBuf>,
+    /// Measure identification over seeds on virtual rigs instead
+    #[arg(long)]
+    identify: bool,
+    /// First seed of --identify
+    #[arg(long, value_name = "N", default_value_t = 1)]
+    seed: u64,
+    /// Seeds per case of --identify, at most (its full count otherwise)
+    #[arg(long, value_name = "N")]
+    count: Option<usize>,
     /// Write the figures as JSON
     #[arg(long, value_name = "FILE")]
     json: Option<PathBuf>,
@@ -81,6 +91,10 @@ pub(crate) struct Outcome {
 /// # Errors
 /// When a recording is missing, greybox does not build, or a file cannot be written.
 pub(crate) fn run(root: &Path, arguments: &Arguments) -> Result<Ending> {
+    if arguments.identify {
+        let outcomes = identify::run(arguments.seed, arguments.count, arguments.only.as_deref())?;
+        return conclude(&outcomes, arguments.json.as_deref());
+    }
     let from_environment = std::env::var_os("GREYBOX_RECORDINGS").map(PathBuf::from);
     let folder = match (&arguments.recordings, from_environment) {
         (Some(given), _) if given.is_dir() => given.clone(),
@@ -118,9 +132,14 @@ pub(crate) fn run(root: &Path, arguments: &Arguments) -> Result<Ending> {
         let out = target(root).join("prove").join(&case.name);
         outcomes.push(measure(&binary, &folder, case, &out, Duration::from_secs(arguments.timeout))?);
     }
-    print!("{}", table::render(&outcomes));
-    if let Some(path) = &arguments.json {
-        let text = serde_json::to_string_pretty(&to_json(&outcomes))? + "\n";
+    conclude(&outcomes, arguments.json.as_deref())
+}
+
+/// Prints the table, writes the JSON, and judges.
+fn conclude(outcomes: &[Outcome], json: Option<&Path>) -> Result<Ending> {
+    print!("{}", table::render(outcomes));
+    if let Some(path) = json {
+        let text = serde_json::to_string_pretty(&to_json(outcomes))? + "\n";
         std::fs::write(path, text).with_context(|| format!("{} cannot be written", path.display()))?;
     }
     let judged = outcomes.iter().flat_map(|o| &o.figures).filter_map(|f| f.met);

@@ -418,10 +418,42 @@ fn delayed_case(seeds: &[u64], seconds: f64, gain: Option<f64>, goal: Option<(f6
     ])
 }
 
+/// The joint of thesis chapter 3 under V = kₚ (r − θ(t − τ)): with the reference r as input and every equation divided by
+/// a kₚ, the delayed feedback has the known gain −1.
+pub(crate) fn joint_recording(seed: u64, seconds: f64, sigma: f64) -> Result<Recording> {
+    let mut random = Pcg64Mcg::seed_from_u64(seed);
+    let normal = Normal::new(0.0, sigma)?;
+    let dt = 0.001;
+    let n = (seconds / dt).round() as usize;
+    let reference = |t: f64| 2.0 * (std::f64::consts::TAU * 0.66 * t).sin();
+    let run =
+        RotaryFlexibleJoint::WITH_FRICTION.run(Sampling { dt, substeps: 2 }, [0.0; 4], n, reference)?;
+    let time = times(n, dt);
+    let mut noisy = |i: usize| run.states.iter().map(|s| s[i] + normal.sample(&mut random)).collect();
+    let columns = vec![
+        channel("r", time.iter().map(|t| reference(*t)).collect()),
+        channel("theta", noisy(0)),
+        channel("alpha", noisy(1)),
+    ];
+    Ok(Recording::from_columns("joint.csv", time, columns)?)
+}
+
 fn joint_case(seeds: &[u64]) -> Result<Vec<Figure>> {
-    let _ = RotaryFlexibleJoint::WITH_FRICTION;
-    let _ = seeds;
-    Ok(Vec::new())
+    let options = Options {
+        library: Library { monomials: Monomials::Separate, friction: true, ..Library::default() },
+        order: 1,
+        hold: Some(Hold::Zero),
+        replicates: 0,
+        delay: Some(DelayedState { state: "theta".to_string(), gain: Some(-1.0), longest: 0.4 }),
+        ..Options::new(&["theta", "alpha"], &["r"])
+    };
+    let make = |seed| Ok(vec![joint_recording(seed, 20.0, 1e-3)?]);
+    let trials = run_seeds(seeds, make, &options, &[&[], &[]], Some(0.2))?;
+    let errors: Vec<f64> = trials.iter().filter_map(|t| t.delay.map(|d| 100.0 * d.0.abs())).collect();
+    let worst = errors.iter().copied().fold(0.0, f64::max);
+    let name = "error of tau: median, worst";
+    let text = format!("{:.2} %, {worst:.2} %", median(errors));
+    Ok(vec![Figure::judged(name, text, "<= 1.5 %", worst <= 1.5)])
 }
 
 /// Runs the cases whose name contains `only` with `share` of their seeds; `first` shifts all seeds.
