@@ -1,4 +1,5 @@
-//! Governing equations from recordings alone.
+#![doc = include_str!("../README.md")]
+
 mod choose;
 mod error;
 mod identify;
