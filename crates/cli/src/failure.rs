@@ -252,10 +252,8 @@ impl From<IdentifyError> for Failure {
             }
             IdentifyError::Data(error) => error.into(),
             IdentifyError::Model(error) => {
-                let failure = Failure::input(format!(
-                    "the recordings' channels make no equation: {}",
-                    error.problem()
-                ));
+                let failure =
+                    Failure::input(format!("the recordings' channels make no equation: {}", error.problem()));
                 match error.help() {
                     Some(help) => failure.mend(help),
                     None => failure.mend("check names and units in the headers of the recordings"),

@@ -354,9 +354,8 @@ fn recordings(
                 .iter()
                 .enumerate()
                 .map(|(c, info)| {
-                    let [nominal, calibrated, improved] = runs.map(|run| {
-                        run.map_or_else(Vec::new, |run| output(data, run, r, c, info.factor))
-                    });
+                    let [nominal, calibrated, improved] =
+                        runs.map(|run| run.map_or_else(Vec::new, |run| output(data, run, r, c, info.factor)));
                     page::Channel {
                         name: info.name.clone(),
                         unit: info.unit.clone(),

@@ -165,8 +165,7 @@ fn results(
         out = study.out.display()
     );
     let html = convert::page(found, report).to_html().map_err(unwritten)?;
-    let files =
-        [("report.json", json_text), ("report.html", html), (MODEL_FILE, convert::model_toml(found))];
+    let files = [("report.json", json_text), ("report.html", html), (MODEL_FILE, convert::model_toml(found))];
     Ok((files, Answer::new(text, json)))
 }
 

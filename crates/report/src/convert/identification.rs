@@ -10,7 +10,9 @@ use greybox_recording::Recording;
 use super::{health_findings, interval, names, recordings, residual, scores, spectra, state_map, times};
 use crate::contract::{Fit, FitSet, InputHold, ModelId, Ordered, Producer, RecordingFit};
 use crate::format;
-use crate::identified::{Delay, Doubtful, Equation, IdentifyReport, Order, OrderValue, Term, Variable, VariableRole};
+use crate::identified::{
+    Delay, Doubtful, Equation, IdentifyReport, Order, OrderValue, Term, Variable, VariableRole,
+};
 use crate::page::{self, IdentifyPage, Residual};
 use crate::sentence;
 
@@ -106,12 +108,7 @@ fn equation(found: &FoundEquation, written: &greybox_model::Equation, model: &Mo
             inclusion: term.inclusion,
         })
         .collect();
-    Equation {
-        input: found.input.clone(),
-        expression: written.to_string(),
-        terms,
-        doubtful,
-    }
+    Equation { input: found.input.clone(), expression: written.to_string(), terms, doubtful }
 }
 
 /// States and inputs, with the unit of their channel and the one in which the equations count.
@@ -121,9 +118,10 @@ fn variables(model: &Model, sources: &Sources<'_>) -> Ordered<Variable> {
         let variable = Variable { role, channel_unit: stated.unwrap_or_default(), unit: coherent(unit) };
         (name.to_owned(), variable)
     };
-    let states = model.states.iter().filter_map(|s| {
-        Some(entry(&s.name, s.channel.as_deref()?, &s.unit, VariableRole::State))
-    });
+    let states = model
+        .states
+        .iter()
+        .filter_map(|s| Some(entry(&s.name, s.channel.as_deref()?, &s.unit, VariableRole::State)));
     let inputs = model.inputs.iter().map(|i| entry(&i.name, &i.channel, &i.unit, VariableRole::Input));
     states.chain(inputs).collect()
 }
@@ -211,14 +209,17 @@ pub fn model_toml(found: &Identification) -> String {
 
 /// The page: the report and what its plots show.
 pub fn page(found: &Identification, report: IdentifyReport) -> IdentifyPage {
-    let roles = [Some((&found.train, page::Role::Train)), found.holdout.as_ref().map(|h| (h, page::Role::Holdout))];
+    let roles =
+        [Some((&found.train, page::Role::Train)), found.holdout.as_ref().map(|h| (h, page::Role::Holdout))];
     let states: Vec<&str> = found.equations.iter().map(|e| e.state.as_str()).collect();
     IdentifyPage {
         title: format!("Equations of {}", sentence::joined(&states, "and")),
         recordings: roles
             .into_iter()
             .flatten()
-            .flat_map(|(role, kind)| recordings(&role.data, &found.model, kind, [None, None, Some(&role.run)]))
+            .flat_map(|(role, kind)| {
+                recordings(&role.data, &found.model, kind, [None, None, Some(&role.run)])
+            })
             .collect(),
         residuals: residuals(found),
         model_text: model_toml(found),

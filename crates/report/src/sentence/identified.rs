@@ -13,8 +13,11 @@ const INCOMPLETE: f64 = 1.3;
 
 /// The summary: the equations first, then how well they predict, then every doubt.
 pub fn summary(report: &IdentifyReport) -> Vec<String> {
-    let mut out: Vec<String> =
-        report.equations.iter().map(|(state, e)| format!("Equation of {state}: {}.", with_values(e, &report.delay))).collect();
+    let mut out: Vec<String> = report
+        .equations
+        .iter()
+        .map(|(state, e)| format!("Equation of {state}: {}.", with_values(e, &report.delay)))
+        .collect();
     out.extend(prediction(report));
     out.extend(report.misfit.iter().filter(|(_, misfit)| **misfit > INCOMPLETE).map(|(channel, misfit)| {
         format!(
@@ -159,8 +162,11 @@ pub fn delay_warning(d: &Delay) -> Option<String> {
         ));
     }
     if none {
-        parts.push("the interval of the delay holds zero or is unknown: a feedback without delay explains these \
-                    recordings as well".to_owned());
+        parts.push(
+            "the interval of the delay holds zero or is unknown: a feedback without delay explains these \
+                    recordings as well"
+                .to_owned(),
+        );
     }
     if parts.is_empty() {
         return None;
