@@ -1,4 +1,4 @@
-//! Developer commands: `cargo xtask prove | docs | ci`.
+//! Developer commands: `cargo xtask prove | reproduce | docs | ci`.
 
 // This is a command: its answers go to standard output, its complaints to standard error.
 #![allow(clippy::print_stdout, clippy::print_stderr)]
@@ -7,6 +7,7 @@ mod docs;
 mod process;
 mod prove;
 mod readme;
+mod reproduce;
 #[cfg(test)]
 mod tidy;
 
@@ -27,6 +28,8 @@ struct Arguments {
 enum Task {
     /// Measure greybox against its goals on real recordings
     Prove(prove::Arguments),
+    /// Make the tables and figures of the thesis again, beside its numbers
+    Reproduce(reproduce::Arguments),
     /// Write the generated pages of the book
     Docs {
         /// Change nothing; exit 1 when a page is stale
@@ -56,6 +59,7 @@ enum Ending {
 fn main() -> ExitCode {
     let ending = match Arguments::parse().command {
         Task::Prove(arguments) => prove::run(&root(), &arguments),
+        Task::Reproduce(arguments) => reproduce::run(&root(), &arguments),
         Task::Docs { check } => docs::run(&root(), check),
         Task::Ci => ci(&root()),
         Task::ReadmeCommand { marker } => print_command(&root(), &marker),

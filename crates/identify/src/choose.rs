@@ -4,7 +4,7 @@ use greybox_calibrate::qr;
 
 /// min ‖z − R θ‖² + rest, the reduced form of a regression with `samples` rows.
 #[derive(Debug, Clone)]
-pub struct Reduced {
+pub(crate) struct Reduced {
     /// Number of columns.
     pub columns: usize,
     /// Upper triangular factor, `columns × columns`, row major.
@@ -21,7 +21,7 @@ pub struct Reduced {
 
 /// A least-squares solution on some of the columns.
 #[derive(Debug, Clone)]
-pub struct Solution {
+pub(crate) struct Solution {
     /// The columns used.
     pub columns: Vec<usize>,
     /// Their coefficients.
@@ -34,7 +34,7 @@ pub struct Solution {
 
 impl Reduced {
     /// Least squares on `columns`.
-    pub fn solve(&self, columns: &[usize]) -> Solution {
+    pub(crate) fn solve(&self, columns: &[usize]) -> Solution {
         let (p, k) = (self.columns, columns.len());
         let mut a = vec![0.0; p * (k + 1)];
         let mut norm = vec![1.0; k];
@@ -78,7 +78,7 @@ impl Reduced {
     }
 
     /// Squared t-statistics of the columns of a solution.
-    pub fn t_squared(&self, solution: &Solution) -> Vec<f64> {
+    pub(crate) fn t_squared(&self, solution: &Solution) -> Vec<f64> {
         let variance = (solution.rss / self.samples + self.floor).max(1e-300);
         solution
             .values
@@ -100,7 +100,7 @@ impl Reduced {
     /// true terms stand a hundred standard errors clear of the noise, one at three is doubted; where they
     /// are barely visible, it is believed. The lower limit pays for looking at q candidates (risk
     /// inflation, Foster & George, Ann. Statist. 22, 1994), the upper is Schwarz's.
-    pub fn choose(&self, kept: &[usize], allowed: &[usize], even: &[usize]) -> Solution {
+    pub(crate) fn choose(&self, kept: &[usize], allowed: &[usize], even: &[usize]) -> Solution {
         let schwarz = self.samples.ln();
         let least = 2.0 * (allowed.len().max(2) as f64).ln();
         let mut solution = self.search(allowed, &Price { kept, even, term: schwarz });

@@ -57,7 +57,7 @@ impl Options {
     }
 }
 
-/// A feedback k_p q(t − τ) on the left side of the equation of the state q.
+/// A feedback k_p q(t − τ) that is added to the first input, on the right side of every equation (thesis Eq 3.3).
 #[derive(Debug, Clone, PartialEq)]
 pub struct DelayedState {
     /// The state.
@@ -260,7 +260,7 @@ fn split(train: &[Recording], holdout: &[Recording]) -> (Vec<Recording>, Vec<Rec
 }
 
 /// The candidates that a request describes, with names and units from the recordings.
-pub fn structure(recordings: &[Recording], options: &Options) -> Result<Structure, IdentifyError> {
+pub(crate) fn structure(recordings: &[Recording], options: &Options) -> Result<Structure, IdentifyError> {
     if options.states.is_empty() {
         return Err(IdentifyError::NoStates);
     }
@@ -307,12 +307,12 @@ pub fn structure(recordings: &[Recording], options: &Options) -> Result<Structur
     }
     let mut extras = Vec::new();
     if let Some(delay) = &options.delay {
-        let Some(equation) = options.states.iter().position(|s| *s == delay.state) else {
+        if !options.states.contains(&delay.state) {
             return Err(IdentifyError::DelayedState {
                 name: delay.state.clone(),
                 states: options.states.join(", "),
             });
-        };
+        }
         if options.inputs.is_empty() {
             return Err(IdentifyError::DelayWithoutInput);
         }
@@ -321,8 +321,7 @@ pub fn structure(recordings: &[Recording], options: &Options) -> Result<Structur
             return Err(IdentifyError::Range { what: "the longest delay", found, range: "(0, ∞) s" });
         }
         extras.push(Extra {
-            equation,
-            expression: format!("kp*delay({}, tau)", delay.state),
+            expression: format!("-kp*delay({}, tau)", delay.state),
             parameters: vec![
                 ("kp".to_string(), delay.gain.unwrap_or(1.0), delay.gain.is_some()),
                 ("tau".to_string(), 0.25 * delay.longest, false),
@@ -403,45 +402,143 @@ fn first_estimates(
     let longest = data.pieces.iter().map(|p| p.len).max().unwrap_or(0);
     let dt = data.pieces.iter().map(|p| p.dt).fold(f64::INFINITY, f64::min);
     let values = weak::evaluate(structure, model, data, hats).ok_or(IdentifyError::NoFit)?;
-    let extras: Vec<f64> = structure.extras.iter().flat_map(|e| &e.parameters).map(|p| p.1).collect();
-    let mut starts = Vec::new();
-    let mut by_order = Vec::new();
-    for share in WINDOWS {
-        let window = (share * period).clamp(16.0 * dt, 0.2 * longest as f64 * dt);
-        let mut state = State {
-            active: structure.terms.iter().map(|t| !t.optional).collect(),
-            values: structure.terms.iter().map(|t| if t.optional { 0.0 } else { 1.0 }).collect(),
-            extras: extras.clone(),
-        };
-        let mut complete = true;
-        for equation in 0..structure.equations.len() {
-            let Some(rows) = weak::rows(structure, model, data, &values, equation, window) else {
-                complete = false;
-                break;
-            };
-            let (reduced, terms) = weak::reduce(structure, &rows);
-            let pick = |wanted: &dyn Fn(usize) -> bool| -> Vec<usize> {
-                (0..terms.len()).filter(|&c| wanted(terms[c])).collect()
-            };
-            let kept = pick(&|t| !structure.terms[t].optional);
-            let optional = pick(&|t| structure.terms[t].optional);
-            let even = pick(&|t| structure.terms[t].even);
-            let solution = reduced.choose(&kept, &optional, &even);
-            for (&c, &v) in solution.columns.iter().zip(&solution.values) {
-                state.active[terms[c]] = true;
-                state.values[terms[c]] = v;
-            }
+    let window = |share: f64| (share * period).clamp(16.0 * dt, 0.2 * longest as f64 * dt);
+    let everything = vec![true; structure.terms.len()];
+    let trials = trials(options);
+    let best = |allowed: &[bool]| -> Vec<(f64, State)> {
+        let mut starts: Vec<(f64, State)> = WINDOWS
+            .iter()
+            .flat_map(|share| trials.iter().map(move |t| (window(*share), *t)))
+            .filter_map(|(window, trial)| estimate(structure, model, data, &values, window, trial, allowed))
+            .collect();
+        // Without a delay one start per window; with one, the most probable delays.
+        if !structure.extras.is_empty() {
+            starts.sort_by(|a, b| a.0.total_cmp(&b.0));
+            starts.truncate(WINDOWS.len());
         }
-        if complete {
-            starts.push(state);
-        }
-    }
-    by_order.push((options.order, 0.0));
+        starts
+    };
+    let trial = match trials.as_slice() {
+        [None] => None,
+        _ => best(&everything).first().and_then(|s| trials[0].map(|t| weak::Trial { delay: s.1.extras[1], ..t })),
+    };
+    let by_order = order_search(structure, model, data, &values, window(WINDOWS[1]), trial, options);
+    let chosen = by_order.iter().min_by(|a, b| a.1.total_cmp(&b.1)).map_or(options.order, |o| o.0);
+    // One order more than the first estimate asks for: its errors hide weak terms.
+    let allowed: Vec<bool> = structure.terms.iter().map(|t| t.order <= chosen + 1).collect();
+    let starts: Vec<State> = best(&allowed).into_iter().map(|s| s.1).collect();
     if starts.is_empty() {
         return Err(IdentifyError::TooShort { samples: longest });
     }
-    let allowed = structure.terms.iter().map(|t| t.order <= options.order).collect();
     Ok(First { starts, allowed, by_order })
+}
+
+/// Thesis Algorithm 1 on the weak form: AIC on the second half of the windows for every order of the library, summed
+/// over the equations.
+fn order_search(
+    structure: &Structure,
+    model: &Model,
+    data: &Data,
+    values: &[Vec<Vec<f64>>],
+    window: f64,
+    trial: Option<weak::Trial>,
+    options: &Options,
+) -> Vec<(usize, f64)> {
+    let mut total: Vec<(usize, f64)> = (1..=options.order).map(|n| (n, 0.0)).collect();
+    for equation in 0..structure.equations.len() {
+        let Some(rows) = weak::rows(structure, model, data, values, equation, window, trial) else { continue };
+        let (target, columns, protected) = weak::regression(structure, &rows, trial.and_then(|t| t.gain));
+        let views: Vec<&[f64]> = columns.iter().map(|c| c.1.as_slice()).collect();
+        let sizes: Vec<usize> = (1..=options.order)
+            .map(|n| columns.iter().filter(|c| c.0.is_none_or(|t| structure.terms[t].order <= n)).count())
+            .collect();
+        let settings = greybox_sparse::select::Options {
+            protected,
+            gap: rows.overlap,
+            effective: true,
+            folds: 5,
+            ..greybox_sparse::select::Options::normalised()
+        };
+        // Too many columns for the windows there are: the orders below are still searched.
+        let mut last = sizes.len();
+        while last > 0 {
+            let problem = greybox_sparse::select::Problem {
+                columns: &views[..sizes[last - 1]],
+                target: &target,
+                orders: &sizes[..last],
+                pieces: &rows.pieces,
+            };
+            if let Ok(search) = greybox_sparse::select::search(&problem, &settings) {
+                for (sum, order) in total.iter_mut().zip(&search.orders) {
+                    sum.1 += order.criterion;
+                }
+                break;
+            }
+            last -= 1;
+        }
+        total.truncate(last);
+    }
+    total
+}
+
+/// Delays to try, where one is asked for.
+fn trials(options: &Options) -> Vec<Option<weak::Trial>> {
+    const DELAYS: usize = 16;
+    let Some(delay) = &options.delay else { return vec![None] };
+    let state = options.states.iter().position(|s| *s == delay.state).unwrap_or(0);
+    (1..=DELAYS)
+        .map(|i| {
+            let share = i as f64 / DELAYS as f64;
+            Some(weak::Trial { state, delay: share * delay.longest, gain: delay.gain })
+        })
+        .collect()
+}
+
+/// The weak form's choice with windows of one length, and how well it does.
+fn estimate(
+    structure: &Structure,
+    model: &Model,
+    data: &Data,
+    values: &[Vec<Vec<f64>>],
+    window: f64,
+    trial: Option<weak::Trial>,
+    allowed: &[bool],
+) -> Option<(f64, State)> {
+    let mut state = State {
+        active: structure.terms.iter().map(|t| !t.optional).collect(),
+        values: structure.terms.iter().map(|t| if t.optional { 0.0 } else { 1.0 }).collect(),
+        extras: structure.extras.iter().flat_map(|e| &e.parameters).map(|p| p.1).collect(),
+    };
+    let mut badness = 0.0;
+    for equation in 0..structure.equations.len() {
+        let rows = weak::rows(structure, model, data, values, equation, window, trial)?;
+        let gain = trial.and_then(|t| t.gain);
+        let (reduced, terms) = weak::reduce(structure, &rows, gain);
+        let pick = |wanted: &dyn Fn(usize) -> bool| -> Vec<usize> {
+            (0..terms.len()).filter(|&c| terms[c].is_some_and(wanted)).collect()
+        };
+        let mut kept = pick(&|t| !structure.terms[t].optional);
+        kept.extend((0..terms.len()).filter(|&c| terms[c].is_none()));
+        let optional = pick(&|t| structure.terms[t].optional && allowed[t]);
+        let even = pick(&|t| structure.terms[t].even);
+        let solution = reduced.choose(&kept, &optional, &even);
+        badness += reduced.samples * (solution.rss / reduced.samples).ln()
+            + solution.columns.len() as f64 * reduced.samples.ln();
+        for (&c, &v) in solution.columns.iter().zip(&solution.values) {
+            match terms[c] {
+                Some(t) => {
+                    state.active[t] = true;
+                    state.values[t] = v;
+                }
+                // The delayed state stands on the left as −k_p.
+                None => state.extras[0] = -v,
+            }
+        }
+        if let Some(t) = trial {
+            state.extras[1] = t.delay;
+        }
+    }
+    Some((badness, state))
 }
 
 fn best_refined(structure: &Structure, data: &Arc<Data>, first: &First) -> Option<Refined> {
@@ -522,6 +619,18 @@ fn conclude(
                     }
                 })
                 .collect();
+            let mut terms: Vec<FoundTerm> = terms;
+            if let Some(delay) = &options.delay {
+                let gain = state.extras[0];
+                terms.push(FoundTerm {
+                    expression: format!("delay({}, tau)", delay.state),
+                    parameter: "kp".to_string(),
+                    powers: Vec::new(),
+                    value: -gain,
+                    ci95: precision.extra_interval(0, gain).map(|(a, b)| (-b, -a)),
+                    inclusion: None,
+                });
+            }
             let doubtful = of_equation()
                 .filter(|&i| structure.terms[i].optional)
                 .filter_map(|i| {

@@ -16,11 +16,11 @@ use crate::choose::Reduced;
 use crate::structure::Structure;
 
 /// Misfit, relative to a channel's spread, that counts as numerical: integration, rounding in the file.
-pub const NUMERICAL: f64 = 1e-5;
+pub(crate) const NUMERICAL: f64 = 1e-5;
 
 /// A model under refinement.
 #[derive(Debug, Clone)]
-pub struct State {
+pub(crate) struct State {
     /// Which candidates are in.
     pub active: Vec<bool>,
     /// Coefficients of all candidates (zero outside).
@@ -31,7 +31,7 @@ pub struct State {
 
 /// The fit of the active terms.
 #[derive(Debug, Clone)]
-pub struct Refined {
+pub(crate) struct Refined {
     /// The model.
     pub state: State,
     /// Compiled with its data.
@@ -321,7 +321,7 @@ fn block_grams(projected: &[Projected], np: usize, share: f64, blocks: usize) ->
 
 impl Refined {
     /// −2 ln likelihood with Schwarz's price for every parameter; smaller is better.
-    pub fn score(&self) -> f64 {
+    pub(crate) fn score(&self) -> f64 {
         let data = &self.setup.data;
         let total: f64 = self.fit.count.iter().sum::<usize>() as f64;
         let fit: f64 = (0..self.fit.rss.len())
@@ -364,7 +364,7 @@ fn levels(structure: &Structure) -> &'static [usize] {
 }
 
 /// A first fit of `start` on short segments.
-pub fn begin(structure: &Structure, data: &Arc<Data>, start: State) -> Option<Refined> {
+pub(crate) fn begin(structure: &Structure, data: &Arc<Data>, start: State) -> Option<Refined> {
     let setup = setup(structure, data, &start, None)?;
     let level = setup.level(levels(structure)[0]);
     let scale: Vec<f64> = data.sigma.iter().zip(&data.spread).map(|(s, d)| s.max(1e-6 * d)).collect();
@@ -375,7 +375,7 @@ pub fn begin(structure: &Structure, data: &Arc<Data>, start: State) -> Option<Re
 }
 
 /// The same terms fitted again under another structure (other holds).
-pub fn refit(structure: &Structure, refined: &Refined) -> Option<Refined> {
+pub(crate) fn refit(structure: &Structure, refined: &Refined) -> Option<Refined> {
     let next = setup(structure, &refined.setup.data, &refined.state, Some(&refined.setup))?;
     let point = Point { parameters: next.values(), starts: refined.fit.point.starts.clone() };
     let fit = next.with_problem(&refined.level, &refined.scale, |p| {
@@ -424,7 +424,7 @@ fn round(structure: &Structure, refined: &Refined, allowed: &[bool], seen: &[Vec
 
 /// Refines a first fit, choosing among the candidates in `allowed`; segments grow until they are whole
 /// records, or as long as a fit still follows.
-pub fn refine(structure: &Structure, begun: Refined, allowed: &[bool]) -> Refined {
+pub(crate) fn refine(structure: &Structure, begun: Refined, allowed: &[bool]) -> Refined {
     let mut refined = begun;
     for &count in levels(structure) {
         let level = refined.setup.level(count);

@@ -11,11 +11,9 @@ use crate::structure::Structure;
 
 /// Standard errors and inclusion probabilities.
 #[derive(Debug, Clone, Default)]
-pub struct Precision {
+pub(crate) struct Precision {
     /// Half-width of the 95 % interval per candidate; none where it is not estimated.
     pub half: Vec<Option<f64>>,
-    /// Cramér–Rao standard deviation per candidate.
-    pub bound: Vec<Option<f64>>,
     /// The same for the parameters of the extras.
     pub extra_half: Vec<Option<f64>>,
     /// The same for the parameters of the extras.
@@ -24,23 +22,21 @@ pub struct Precision {
     pub extra_correlation: Option<f64>,
     /// Share of bootstrap replicates that choose each candidate.
     pub inclusion: Vec<f64>,
-    /// Whether the residuals are correlated, so that the sandwich covariance was taken.
-    pub correlated: bool,
 }
 
 impl Precision {
     /// 95 % interval of a candidate's coefficient.
-    pub fn interval(&self, term: usize, value: f64) -> Option<(f64, f64)> {
+    pub(crate) fn interval(&self, term: usize, value: f64) -> Option<(f64, f64)> {
         self.half.get(term).copied().flatten().map(|h| (value - h, value + h))
     }
 
     /// 95 % interval of a parameter of the extras.
-    pub fn extra_interval(&self, index: usize, value: f64) -> Option<(f64, f64)> {
+    pub(crate) fn extra_interval(&self, index: usize, value: f64) -> Option<(f64, f64)> {
         self.extra_half.get(index).copied().flatten().map(|h| (value - h, value + h))
     }
 
     /// Cramér–Rao standard deviation of a parameter of the extras.
-    pub fn extra_bound(&self, index: usize) -> Option<f64> {
+    pub(crate) fn extra_bound(&self, index: usize) -> Option<f64> {
         self.extra_bound.get(index).copied().flatten()
     }
 }
@@ -49,7 +45,7 @@ impl Precision {
 const BLOCKS: usize = 60;
 
 /// Covariances at the fit, and the bootstrap of the choice.
-pub fn assess(
+pub(crate) fn assess(
     structure: &Structure,
     refined: &Refined,
     allowed: &[bool],
@@ -88,7 +84,15 @@ pub fn assess(
     let count: usize = refined.fit.count.iter().sum();
     let freedom = (count as f64 - np as f64 - starts as f64).max(1.0);
     let rss: f64 = projected.iter().map(|p| qr::dot(p.1, p.1)).sum();
-    let variance = rss / freedom;
+    // Integration is right to about 10⁻⁶ of the signal; such errors repeat from sample to sample, so that they do
+    // not average out over rows.
+    let numerical = refined
+        .scale
+        .iter()
+        .zip(&setup.data.spread)
+        .map(|(scale, spread)| (1e-6 * spread / scale).powi(2))
+        .fold(0.0, f64::max);
+    let variance = rss / freedom + numerical * count as f64;
     let covariance = |i: usize, j: usize| -> f64 {
         variance * (0..np).map(|k| inverse[i * np + k] * inverse[j * np + k]).sum::<f64>()
     };
@@ -123,12 +127,10 @@ pub fn assess(
     };
     Precision {
         half: of_terms(&width),
-        bound: of_terms(&gauss),
         extra_half: of_extras(&width),
         extra_bound: of_extras(&gauss),
         extra_correlation,
         inclusion: inclusion(structure, refined, allowed, options),
-        correlated,
     }
 }
 

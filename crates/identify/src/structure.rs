@@ -4,7 +4,7 @@ use greybox_model::{Hold, Model, ModelError};
 
 /// A candidate term of one equation.
 #[derive(Debug, Clone, PartialEq)]
-pub struct Term {
+pub(crate) struct Term {
     /// Index of the equation.
     pub equation: usize,
     /// The term in the model language, without its coefficient.
@@ -23,18 +23,16 @@ pub struct Term {
 
 /// An input or a state of the structure.
 #[derive(Debug, Clone, PartialEq)]
-pub struct Signal {
+pub(crate) struct Signal {
     /// Name, also the recording's channel.
     pub name: String,
     /// Unit, as the recording's header writes it.
     pub unit: Option<String>,
 }
 
-/// A part of an equation that is not a coefficient times a term: a delayed feedback.
+/// A part of every equation that is not a coefficient times a term: a delayed feedback beside the input.
 #[derive(Debug, Clone, PartialEq)]
-pub struct Extra {
-    /// Index of the equation.
-    pub equation: usize,
+pub(crate) struct Extra {
     /// Expression in the model language.
     pub expression: String,
     /// Its parameters: name, first value, whether known.
@@ -43,7 +41,7 @@ pub struct Extra {
 
 /// One equation: Σ coefficient × term + extras = input.
 #[derive(Debug, Clone, PartialEq)]
-pub struct Equation {
+pub(crate) struct Equation {
     /// Name (that of the state it governs).
     pub name: String,
     /// The input on the right; none: zero, and the leading coefficient is one.
@@ -52,7 +50,7 @@ pub struct Equation {
 
 /// Everything a search may choose from.
 #[derive(Debug, Clone, PartialEq)]
-pub struct Structure {
+pub(crate) struct Structure {
     /// Title of the model.
     pub title: String,
     /// Inputs with their hold.
@@ -72,12 +70,12 @@ impl Structure {
     ///
     /// # Errors
     /// What the model language refuses: a channel's name that is no name there, units that do not fit.
-    pub fn model(&self, active: &[bool], values: &[f64], extras: &[f64]) -> Result<Model, ModelError> {
+    pub(crate) fn model(&self, active: &[bool], values: &[f64], extras: &[f64]) -> Result<Model, ModelError> {
         Model::from_toml(&self.toml(active, values, extras), "model.toml")
     }
 
     /// The text of [`model`](Self::model).
-    pub fn toml(&self, active: &[bool], values: &[f64], extras: &[f64]) -> String {
+    pub(crate) fn toml(&self, active: &[bool], values: &[f64], extras: &[f64]) -> String {
         use std::fmt::Write;
         let mut text = String::new();
         let quote = |s: &str| toml_string(s);
@@ -120,16 +118,17 @@ impl Structure {
                     (true, expression) => format!("{}*{expression}", t.parameter),
                 })
                 .collect();
-            left.extend(self.extras.iter().filter(|x| x.equation == e).map(|x| x.expression.clone()));
+            left.extend(self.extras.iter().map(|x| x.expression.clone()));
+            let left = left.join(" + ").replace("+ -", "- ");
             let right = equation.input.as_deref().unwrap_or("0");
-            let _ = writeln!(text, "{} = \"{} = {right}\"", equation.name, left.join(" + "));
+            let _ = writeln!(text, "{} = \"{left} = {right}\"", equation.name);
         }
         text
     }
 
     /// Whether a candidate has a coefficient to estimate: all but the leading term of an equation without
     /// input, which sets the scale.
-    pub fn has_coefficient(&self, term: usize) -> bool {
+    pub(crate) fn has_coefficient(&self, term: usize) -> bool {
         let t = &self.terms[term];
         t.optional || self.equations[t.equation].input.is_some()
     }

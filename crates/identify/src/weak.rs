@@ -21,10 +21,38 @@ pub(crate) struct Rows {
     pub target: Vec<f64>,
     /// Index of each candidate among the structure's terms.
     pub terms: Vec<usize>,
+    /// The delayed state's column, where the equation has one.
+    pub delayed: Option<Vec<f64>>,
     /// Windows without overlap among the rows.
     pub independent: f64,
-    /// Rows per window without overlap.
+    /// Rows that share samples with one row, on one side.
     pub overlap: usize,
+    /// Row ranges of the pieces.
+    pub pieces: Vec<std::ops::Range<usize>>,
+}
+
+/// A delayed feedback, its delay held at a trial value.
+#[derive(Debug, Clone, Copy)]
+pub(crate) struct Trial {
+    /// The delayed state.
+    pub state: usize,
+    /// The delay, s.
+    pub delay: f64,
+    /// The gain where it is known.
+    pub gain: Option<f64>,
+}
+
+/// `signal` a time `delay` earlier, its first sample held before the start.
+fn earlier(signal: &[f64], dt: f64, delay: f64) -> Vec<f64> {
+    let shift = delay / dt;
+    (0..signal.len())
+        .map(|k| {
+            let at = (k as f64 - shift).max(0.0);
+            let (i, w) = (at.floor() as usize, at.fract());
+            let next = signal[(i + 1).min(signal.len() - 1)];
+            signal[i] + w * (next - signal[i])
+        })
+        .collect()
 }
 
 /// Values of all candidate terms along the smoothed states, `[piece][term][sample]`.
@@ -84,6 +112,7 @@ pub(crate) fn rows(
     values: &[Vec<Vec<f64>>],
     equation: usize,
     window: f64,
+    trial: Option<Trial>,
 ) -> Option<Rows> {
     let dt = data.pieces.iter().map(|p| p.dt).fold(f64::INFINITY, f64::min);
     let order = model.states[equation].order;
@@ -93,6 +122,12 @@ pub(crate) fn rows(
     let terms: Vec<usize> =
         (0..structure.terms.len()).filter(|&i| structure.terms[i].equation == equation).collect();
     let input = structure.equations[equation].input.as_ref().and_then(|name| model.input(name));
+    let late: Vec<Vec<f64>> = match trial {
+        Some(t) => {
+            data.pieces.iter().map(|p| earlier(&p.smooth[t.state].value, p.dt, t.delay)).collect()
+        }
+        None => Vec::new(),
+    };
     let zeros: Vec<Vec<f64>> = data.pieces.iter().map(|p| vec![0.0; p.len]).collect();
     let state_of = |expression: &str| -> Option<(usize, usize)> {
         let name = expression.trim_end_matches('\'');
@@ -113,6 +148,9 @@ pub(crate) fn rows(
                     None => Column { signal: &values[i][t], order: 0, hold: Join::Smooth },
                 })
                 .collect();
+            if let Some(signal) = late.get(i) {
+                columns.push(Column { signal, order: 0, hold: Join::Linear });
+            }
             columns.push(match input {
                 Some(u) => Column {
                     signal: &piece.inputs[u],
@@ -130,24 +168,54 @@ pub(crate) fn rows(
         .collect();
     let mut rows = rows_of_pieces(&kernel, &pieces, hop).ok()?;
     let target = rows.columns.pop()?;
+    let delayed = if trial.is_some() { rows.columns.pop() } else { None };
     let overlap = intervals.div_ceil(hop);
     let independent = (target.len() as f64 / overlap as f64).max(1.0);
-    Some(Rows { columns: rows.columns, target, terms, independent, overlap })
+    let mut pieces: Vec<std::ops::Range<usize>> = Vec::new();
+    for (row, piece) in rows.pieces.iter().enumerate() {
+        match pieces.last_mut() {
+            Some(range) if rows.pieces[range.start] == *piece => range.end = row + 1,
+            _ => pieces.push(row..row + 1),
+        }
+    }
+    Some(Rows { columns: rows.columns, target, terms, delayed, independent, overlap, pieces })
 }
 
-/// The regression in triangular form; returns the columns' candidates with it. Without input the leading
-/// derivative moves to the right.
-pub(crate) fn reduce(structure: &Structure, rows: &Rows) -> (Reduced, Vec<usize>) {
-    let n = rows.target.len();
-    let free: Vec<usize> = (0..rows.terms.len()).filter(|&c| structure.has_coefficient(rows.terms[c])).collect();
+/// Target, columns with the candidates they stand for (none: the delayed feedback), and the columns that must stay.
+/// Without input the leading derivative moves to the right; a delayed feedback does where its gain is known.
+pub(crate) fn regression(
+    structure: &Structure,
+    rows: &Rows,
+    gain: Option<f64>,
+) -> (Vec<f64>, Vec<(Option<usize>, Vec<f64>)>, Vec<usize>) {
     let mut target = rows.target.clone();
-    for c in (0..rows.terms.len()).filter(|c| !free.contains(c)) {
-        target.iter_mut().zip(&rows.columns[c]).for_each(|(t, v)| *t -= v);
+    let mut columns: Vec<(Option<usize>, Vec<f64>)> = Vec::new();
+    if let Some(delayed) = &rows.delayed {
+        match gain {
+            Some(gain) => target.iter_mut().zip(delayed).for_each(|(t, v)| *t += gain * v),
+            None => columns.push((None, delayed.clone())),
+        }
     }
-    let k = free.len();
+    for (&term, column) in rows.terms.iter().zip(&rows.columns) {
+        if structure.has_coefficient(term) {
+            columns.push((Some(term), column.clone()));
+        } else {
+            target.iter_mut().zip(column).for_each(|(t, v)| *t -= v);
+        }
+    }
+    let stays = |t: &Option<usize>| t.is_none_or(|t| !structure.terms[t].optional);
+    let protected = (0..columns.len()).filter(|&c| stays(&columns[c].0)).collect();
+    (target, columns, protected)
+}
+
+/// The regression in triangular form, and the candidates of its columns (none: the delayed feedback).
+pub(crate) fn reduce(structure: &Structure, rows: &Rows, gain: Option<f64>) -> (Reduced, Vec<Option<usize>>) {
+    let (target, columns, _) = regression(structure, rows, gain);
+    let n = target.len();
+    let k = columns.len();
     let mut a = Vec::with_capacity(n * (k + 1));
-    for &c in &free {
-        a.extend_from_slice(&rows.columns[c]);
+    for (_, column) in &columns {
+        a.extend_from_slice(column);
     }
     a.extend_from_slice(&target);
     let t = qr::triangle(&mut a, n, k + 1);
@@ -170,7 +238,7 @@ pub(crate) fn reduce(structure: &Structure, rows: &Rows) -> (Reduced, Vec<usize>
         samples: rows.independent.max(k as f64 + 2.0),
         floor: 1e-10 * target.iter().map(|v| v * v).sum::<f64>() / n.max(1) as f64,
     };
-    (reduced, free.into_iter().map(|c| rows.terms[c]).collect())
+    (reduced, columns.into_iter().map(|c| c.0).collect())
 }
 
 fn z_scaled(z: Vec<f64>, factor: f64) -> Vec<f64> {

@@ -17,6 +17,10 @@
 //! assert!(run.states.iter().all(|[theta, ..]| theta.abs() < 30_f64.to_radians()));
 //! # Ok::<(), greybox_simulate::rigs::RigError>(())
 //! ```
+mod delayed;
+
+pub use delayed::{DelayedDuffing, JointRun, RotaryFlexibleJoint};
+
 use std::f64::consts::{PI, TAU};
 
 /// Why a rig stopped.
@@ -46,6 +50,14 @@ pub enum RigError {
         value: f64,
         /// Largest magnitude allowed.
         limit: f64,
+    },
+    /// The delay of a feedback is negative, not finite, or shorter than an integration step.
+    #[error("a delay of {delay} s cannot be stepped over in {step} s: give zero, or at least one substep")]
+    Delay {
+        /// Delay, s.
+        delay: f64,
+        /// Integration step, s.
+        step: f64,
     },
     /// The command of the caller is not a finite number.
     #[error("the command at t = {time} s is {value}: a rig needs a finite one")]
@@ -240,59 +252,88 @@ impl RotaryFlexibleLink {
             }
             run.voltages.push(voltage);
             run.states.push(x);
+            let driven = DrivenLink { link: self, voltage };
             if k == 0 || contact == Contact::Stick {
-                contact = self.contact(x, voltage);
+                contact = driven.contact(x);
             }
             for _ in 0..sampling.substeps {
-                (x, contact) = self.step(x, contact, voltage, h);
+                (x, contact) = driven.step(x, contact, h);
             }
         }
         Ok(run)
     }
+}
 
-    /// The value of sign(θ̇) that keeps a resting hub at rest; it can stay when the magnitude is at most 1.
-    fn holding_sign(&self, x: [f64; 4], voltage: f64) -> f64 {
-        (voltage - self.hub.smooth(x)) / self.hub.coulomb
+/// The link under a held voltage.
+struct DrivenLink<'a> {
+    link: &'a RotaryFlexibleLink,
+    voltage: f64,
+}
+
+impl Frictional<4> for DrivenLink<'_> {
+    const VELOCITY: usize = 2;
+
+    fn coulomb(&self) -> f64 {
+        self.link.hub.coulomb
     }
 
-    /// What the hub does next at the state `x`.
-    fn contact(&self, x: [f64; 4], voltage: f64) -> Contact {
-        if self.hub.coulomb == 0.0 {
-            return Contact::Slip(if x[2] == 0.0 { 0.0 } else { x[2].signum() });
+    fn holding_sign(&self, x: [f64; 4]) -> f64 {
+        (self.voltage - self.link.hub.smooth(x)) / self.link.hub.coulomb
+    }
+
+    fn rate(&self, x: [f64; 4], contact: Contact) -> [f64; 4] {
+        let sign = match contact {
+            Contact::Slip(sign) => sign,
+            Contact::Stick => self.holding_sign(x),
+        };
+        let acceleration =
+            |row: &VoltageBalance| (self.voltage - row.smooth(x) - row.coulomb * sign) / row.acceleration;
+        let hub = if contact == Contact::Stick { 0.0 } else { acceleration(&self.link.hub) };
+        [x[2], x[3], hub, acceleration(&self.link.link)]
+    }
+}
+
+/// A plant with true Coulomb friction on one of its velocities: sign(0) is any value in [−1, 1].
+trait Frictional<const N: usize> {
+    /// Which component of the state is the velocity under friction.
+    const VELOCITY: usize;
+
+    /// Level of the friction; zero for none.
+    fn coulomb(&self) -> f64;
+
+    /// The value of the sign that keeps a resting body at rest; it can stay when the magnitude is at most 1.
+    fn holding_sign(&self, x: [f64; N]) -> f64;
+
+    /// ẋ in the given contact.
+    fn rate(&self, x: [f64; N], contact: Contact) -> [f64; N];
+
+    /// What the body does next at the state `x`.
+    fn contact(&self, x: [f64; N]) -> Contact {
+        let speed = x[Self::VELOCITY];
+        if self.coulomb() == 0.0 {
+            return Contact::Slip(if speed == 0.0 { 0.0 } else { speed.signum() });
         }
-        if x[2] != 0.0 {
-            return Contact::Slip(x[2].signum());
+        if speed != 0.0 {
+            return Contact::Slip(speed.signum());
         }
-        let sign = self.holding_sign(x, voltage);
+        let sign = self.holding_sign(x);
         if sign.abs() <= 1.0 { Contact::Stick } else { Contact::Slip(sign.signum()) }
     }
 
-    /// ẋ in the given contact.
-    fn rate(&self, x: [f64; 4], contact: Contact, voltage: f64) -> [f64; 4] {
-        let sign = match contact {
-            Contact::Slip(sign) => sign,
-            Contact::Stick => self.holding_sign(x, voltage),
-        };
-        let acceleration =
-            |row: &VoltageBalance| (voltage - row.smooth(x) - row.coulomb * sign) / row.acceleration;
-        let hub = if contact == Contact::Stick { 0.0 } else { acceleration(&self.hub) };
-        [x[2], x[3], hub, acceleration(&self.link)]
-    }
-
-    /// One substep; the instants where the hub stops or breaks loose are found by bisection, and the rest of
+    /// One substep; the instants where the body stops or breaks loose are found by bisection, and the rest of
     /// the substep continues in the new contact.
-    fn step(&self, mut x: [f64; 4], mut contact: Contact, voltage: f64, h: f64) -> ([f64; 4], Contact) {
+    fn step(&self, mut x: [f64; N], mut contact: Contact, h: f64) -> ([f64; N], Contact) {
         // One contact changes at most a few times in a substep; the bound only stops a loop on rounding.
         const CHANGES: usize = 8;
         let mut left = h;
         for _ in 0..CHANGES {
-            let ahead = |h: f64| runge_kutta(x, h, |x| self.rate(x, contact, voltage));
-            let stays = |x: [f64; 4]| match contact {
-                Contact::Slip(sign) => sign * x[2] >= 0.0,
-                Contact::Stick => self.holding_sign(x, voltage).abs() <= 1.0,
+            let ahead = |h: f64| runge_kutta(x, h, |x| self.rate(x, contact));
+            let stays = |x: [f64; N]| match contact {
+                Contact::Slip(sign) => sign * x[Self::VELOCITY] >= 0.0,
+                Contact::Stick => self.holding_sign(x).abs() <= 1.0,
             };
             let end = ahead(left);
-            if self.hub.coulomb == 0.0 || stays(end) || !end.iter().all(|x| x.is_finite()) {
+            if self.coulomb() == 0.0 || stays(end) || !end.iter().all(|x| x.is_finite()) {
                 return (end, contact);
             }
             let (mut before, mut after) = (0.0, left);
@@ -301,18 +342,18 @@ impl RotaryFlexibleLink {
                 if stays(ahead(middle)) { before = middle } else { after = middle }
             }
             x = ahead(after);
-            x[2] = 0.0;
+            x[Self::VELOCITY] = 0.0;
             left -= after;
-            contact = self.contact(x, voltage);
+            contact = self.contact(x);
             if left <= 0.0 {
                 return (x, contact);
             }
         }
-        (runge_kutta(x, left, |x| self.rate(x, contact, voltage)), contact)
+        (runge_kutta(x, left, |x| self.rate(x, contact)), contact)
     }
 }
 
-/// What the hub does: it moves in the direction of the sign, or rests.
+/// What a body under Coulomb friction does: it moves in the direction of the sign, or rests.
 #[derive(Debug, Clone, Copy, PartialEq)]
 enum Contact {
     Slip(f64),

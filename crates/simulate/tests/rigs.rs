@@ -1,7 +1,7 @@
 //! The virtual rigs against the thesis, an independent reference and themselves at other step sizes.
 use greybox_simulate::rigs::{
-    Duffing, ENCODER_4096, LinkRun, ProportionalController, RigError, RotaryFlexibleLink, Sampling, Sine,
-    multisine, quantise, square_wave,
+    DelayedDuffing, Duffing, ENCODER_4096, LinkRun, ProportionalController, RigError, RotaryFlexibleJoint,
+    RotaryFlexibleLink, Sampling, Sine, multisine, quantise, square_wave,
 };
 
 #[path = "../examples/make_demo.rs"]
@@ -284,4 +284,120 @@ fn demo_model_is_the_linear_model_of_the_maker() {
     near(p("Beq") / torque + p("Kg") * p("km"), quanser.hub.rate);
     near(-p("ks") / torque, quanser.hub.deflection);
     near(-p("ks") / torque * (p("Jl") + p("Jeq")) / p("Jl"), quanser.link.deflection);
+}
+
+#[test]
+fn delayed_duffing_agrees_with_an_independent_simulation() {
+    let run = |substeps| {
+        DelayedDuffing::THESIS
+            .run(
+                Sampling { dt: 0.001, substeps },
+                DelayedDuffing::TRAINING_START,
+                5001,
+                DelayedDuffing::training_force,
+            )
+            .unwrap()
+    };
+    let (coarse, fine) = (run(1), run(4));
+    // NumPy, RK4 with a Hermite midpoint.
+    let expected = [
+        (1000, 1.927_410_413_435_836_5, -3.257_522_433_816_412),
+        (2000, 0.969_669_719_873_208_3, 2.159_003_278_288_193),
+        (5000, -0.236_992_334_469_873, 0.125_643_563_467_443),
+    ];
+    for (k, x, v) in expected {
+        assert!((coarse[k][0] - x).abs() < 1e-9 && (coarse[k][1] - v).abs() < 1e-9, "{k} {:?}", coarse[k]);
+        assert!((fine[k][0] - x).abs() < 1e-8 && (fine[k][1] - v).abs() < 1e-8, "{k} {:?}", fine[k]);
+    }
+}
+
+#[test]
+fn delayed_feedback_keeps_the_order_of_the_integrator() {
+    // A delay that is no multiple of the step: every history value is interpolated.
+    let plant = DelayedDuffing { delay: 0.2137, ..DelayedDuffing::THESIS };
+    let end = |substeps| {
+        let sampling = Sampling { dt: 0.02, substeps };
+        plant.run(sampling, [1.0, 0.0], 101, DelayedDuffing::training_force).unwrap()[100][0]
+    };
+    let exact = end(256);
+    let errors: Vec<f64> = [4, 8, 16].map(|n| (end(n) - exact).abs()).to_vec();
+    assert!(convergence(&errors).iter().all(|&p| p > 3.5), "{errors:?}");
+}
+
+#[test]
+fn without_delay_the_feedback_is_a_negative_spring() {
+    let late = DelayedDuffing { delay: 0.0, ..DelayedDuffing::THESIS };
+    let plain = Duffing { m: 1.0, k1: 4.0, k3: 2.0, c1: 1.0, c2: 1.0, c3: 1.0 };
+    let sampling = Sampling { dt: 0.01, substeps: 2 };
+    let a = late.run(sampling, [1.0, 0.0], 300, DelayedDuffing::test_force).unwrap();
+    let b = plain.run(sampling, [1.0, 0.0], 300, DelayedDuffing::test_force).unwrap();
+    assert!(largest(a.iter().zip(&b).map(|(a, b)| a[0] - b[0])) < 1e-12);
+}
+
+fn sine(t: f64) -> f64 {
+    multisine(&[Sine { amplitude: 2.0, frequency: 0.66, phase: 0.0 }], t)
+}
+
+#[test]
+fn flexible_joint_agrees_with_an_independent_simulation() {
+    let run =
+        RotaryFlexibleJoint::LINEAR.run(Sampling { dt: 0.001, substeps: 1 }, [0.0; 4], 20_001, sine).unwrap();
+    let expected = [
+        (1000, -1.196_945_704_822_101_3, -0.007_675_481_167_542_115),
+        (5000, 4.484_102_248_429_411, 0.230_778_034_388_722_96),
+        (20000, 3.824_366_866_287_694, 0.202_416_930_173_430_63),
+    ];
+    for (k, theta, alpha) in expected {
+        let x = run.states[k];
+        assert!((x[0] - theta).abs() < 1e-7 && (x[1] - alpha).abs() < 1e-8, "{k} {x:?}");
+    }
+    // The largest excursions after 5 s; the first swings go further (notes: 4.6 to 5.3 rad).
+    let settled = &run.states[5000..];
+    assert!((largest(settled.iter().map(|x| x[0])) - 4.642_030_400_314_191).abs() < 1e-8);
+    assert!((largest(settled.iter().map(|x| x[1])) - 0.246_692_267_580_074_18).abs() < 1e-8);
+    assert!((largest(run.states.iter().map(|x| x[0])) - 5.3).abs() < 0.01);
+}
+
+#[test]
+fn flexible_joint_linearisation_is_its_motion() {
+    // One short step from a state with a known past: (x(h) - x(0))/h against A0 x + A1 x(-tau).
+    let plant = RotaryFlexibleJoint { link_damping: 0.003, ..RotaryFlexibleJoint::LINEAR };
+    let start = [0.3, 0.1, -0.2, 0.4];
+    let h = 1e-7;
+    let run = plant.run(Sampling { dt: h, substeps: 1 }, start, 2, |_| 0.0).unwrap();
+    let [a0, a1] = plant.linearised();
+    for i in 0..4 {
+        let slope = (run.states[1][i] - start[i]) / h;
+        let expected: f64 = (0..4).map(|j| (a0[i][j] + a1[i][j]) * start[j]).sum();
+        assert!((slope - expected).abs() < 1e-3 * (1.0 + expected.abs()), "{i}: {slope} {expected}");
+    }
+    assert_eq!(run.voltages[0], -plant.gain * start[0]);
+}
+
+#[test]
+fn flexible_joint_sticks_within_its_friction() {
+    let plant = RotaryFlexibleJoint::WITH_FRICTION;
+    // The torque a kp theta_d stays below 0.02 N m for |theta_d| < 0.0493 rad.
+    let sampling = Sampling { dt: 0.001, substeps: 2 };
+    let held = plant.run(sampling, [0.0; 4], 1000, |_| 0.04).unwrap();
+    assert!(held.states.iter().all(|x| x[0] == 0.0 && x[2] == 0.0));
+    let loose = plant.run(sampling, [0.0; 4], 1000, |_| 0.06).unwrap();
+    assert!(loose.states[999][0] > 0.0);
+    // Friction bounds the growth that too much gain gives the linear loop.
+    let sharp = RotaryFlexibleJoint { gain: 4.5, ..RotaryFlexibleJoint::LINEAR };
+    let ring = |plant: RotaryFlexibleJoint| {
+        let run = plant.run(sampling, [0.01, 0.0, 0.0, 0.0], 20_000, |_| 0.0).unwrap();
+        largest(run.states[19_000..].iter().map(|x| x[0]))
+    };
+    assert!(ring(sharp) > 0.05);
+    assert!(ring(RotaryFlexibleJoint { coulomb: 0.02, ..sharp }) < 0.02);
+}
+
+#[test]
+fn a_delay_that_cannot_be_stepped_is_refused() {
+    for delay in [-0.1, 1e-5, f64::NAN, f64::INFINITY] {
+        let plant = DelayedDuffing { delay, ..DelayedDuffing::THESIS };
+        let error = plant.run(Sampling { dt: 0.001, substeps: 1 }, [0.0; 2], 3, |_| 0.0).unwrap_err();
+        assert!(matches!(error, RigError::Delay { .. }), "{error}");
+    }
 }

@@ -1,0 +1,437 @@
+//! `cargo xtask prove --identify`: identification over seeds, on virtual rigs whose equations are known.
+//!
+//! Every case makes recordings from a seed, identifies, and compares with the equation that made them. The
+//! rigs integrate on their own and know nothing of the model language.
+
+use anyhow::{Context, Result};
+use greybox_identify::{
+    DelayedState, FoundEquation, Identification, Library, Monomials, Options, Quiet, identify,
+};
+use greybox_model::Hold;
+use greybox_recording::{Channel, Recording};
+use greybox_simulate::rigs::{
+    DelayedDuffing, Duffing, ProportionalController, RotaryFlexibleJoint, RotaryFlexibleLink, Sampling, Sine,
+    multisine, square_wave,
+};
+use rand::{RngExt, SeedableRng};
+use rand_distr::{Distribution, Normal};
+use rand_pcg::Pcg64Mcg;
+use rayon::prelude::*;
+
+use super::{Figure, Outcome};
+
+/// Terms of an equation with their true coefficients.
+type Truth = &'static [(&'static str, f64)];
+
+/// Thesis Eq 2.18.
+const DUFFING: Truth =
+    &[("x''", 2.0), ("x", 6.0), ("x^3", 0.1), ("x'", 1.0), ("x^2*x'", 0.2), ("x'^3", 1.0)];
+/// Thesis Eq 2.24 with the identified column of Table 2.3.
+const HUB: Truth = &[
+    ("theta''", 0.0190),
+    ("theta'", 0.6623),
+    ("theta'^3", -0.0065),
+    ("theta", 0.4151),
+    ("theta^2", 0.0933),
+    ("theta^3", -1.5354),
+    ("alpha'", -0.0420),
+    ("alpha", -6.3840),
+    ("alpha^2", 5.8953),
+    ("sign(theta')", 0.1151),
+];
+/// Thesis Eq 2.25, likewise.
+const LINK: Truth = &[
+    ("alpha''", -0.0118),
+    ("theta'", 0.5890),
+    ("theta", 0.7113),
+    ("theta^2", 0.0935),
+    ("theta^3", -2.7442),
+    ("alpha'", -0.0872),
+    ("alpha", -13.1712),
+    ("alpha^2", 6.2922),
+    ("sign(theta')", 0.1474),
+];
+
+/// One seed's result.
+#[derive(Debug, Clone)]
+struct Trial {
+    /// Whether the terms of each equation are exactly the true ones.
+    exact: Vec<bool>,
+    /// Relative errors of the true coefficients, equation by equation; 1 for a missing term.
+    errors: Vec<Vec<f64>>,
+    /// Error over standard error, for the coefficients of exact equations.
+    scores: Vec<Vec<f64>>,
+    /// Intervals that hold the truth, and all of them.
+    covered: (usize, usize),
+    /// Relative error of the delay and its bound.
+    delay: Option<(f64, f64)>,
+    /// False terms and missed terms that are named as doubtful, and all of them.
+    doubted: (usize, usize),
+}
+
+fn compare(found: &Identification, truth: &[Truth], delay: Option<f64>) -> Trial {
+    let mut trial = Trial {
+        exact: Vec::new(),
+        errors: Vec::new(),
+        scores: Vec::new(),
+        covered: (0, 0),
+        delay: None,
+        doubted: (0, 0),
+    };
+    for (equation, truth) in found.equations.iter().zip(truth) {
+        let terms: Vec<_> = equation.terms.iter().filter(|t| !t.expression.starts_with("delay(")).collect();
+        let of = |name: &str| terms.iter().find(|t| t.expression == name);
+        let exact = terms.len() == truth.len() && truth.iter().all(|t| of(t.0).is_some());
+        trial.exact.push(exact);
+        trial.errors.push(truth.iter().map(|t| of(t.0).map_or(1.0, |f| (f.value / t.1 - 1.0).abs())).collect());
+        let mut scores = Vec::new();
+        for (name, value) in truth.iter().copied() {
+            if let Some(term) = of(name)
+                && let Some((low, high)) = term.ci95
+            {
+                trial.covered.1 += 1;
+                trial.covered.0 += usize::from(low <= value && value <= high);
+                scores.push((term.value - value) / ((high - low) / (2.0 * 1.96)));
+            }
+        }
+        trial.scores.push(if exact { scores } else { Vec::new() });
+        let wrong = wrong_terms(equation, truth);
+        trial.doubted.1 += wrong.len();
+        trial.doubted.0 +=
+            wrong.iter().filter(|w| equation.doubtful.iter().any(|d| d.expression == **w)).count();
+    }
+    if let (Some(truth), Some(found)) = (delay, found.delays.first()) {
+        trial.delay = Some((found.value / truth - 1.0, found.bound.unwrap_or(f64::NAN) / truth));
+    }
+    trial
+}
+
+fn wrong_terms(equation: &FoundEquation, truth: Truth) -> Vec<String> {
+    let is_true = |name: &str| truth.iter().any(|t| t.0 == name);
+    let found = |name: &str| equation.terms.iter().any(|t| t.expression == name);
+    let extra = equation
+        .terms
+        .iter()
+        .filter(|t| !is_true(&t.expression) && !t.expression.starts_with("delay("))
+        .map(|t| t.expression.clone());
+    extra.chain(truth.iter().filter(|t| !found(t.0)).map(|t| t.0.to_string())).collect()
+}
+
+fn times(samples: usize, dt: f64) -> Vec<f64> {
+    (0..samples).map(|k| k as f64 * dt).collect()
+}
+
+fn channel(name: &str, values: Vec<f64>) -> Channel {
+    Channel { name: name.to_string(), unit: None, values }
+}
+
+/// The oscillator of thesis Eq 2.18 under Eq 2.19, whose noisy force drives it, linear between samples.
+pub(crate) fn duffing_recording(seed: u64, dt: f64, seconds: f64, sigma: f64, start: [f64; 2]) -> Result<Recording> {
+    let mut random = Pcg64Mcg::seed_from_u64(seed);
+    let normal = Normal::new(0.0, 1.0)?;
+    let n = (seconds / dt).round() as usize + 1;
+    let time = times(n, dt);
+    let force: Vec<f64> =
+        time.iter().map(|t| Duffing::thesis_force(*t) + 0.01 * normal.sample(&mut random)).collect();
+    let linear = |t: f64| {
+        let at = (t / dt).clamp(0.0, (n - 1) as f64);
+        let i = (at.floor() as usize).min(n - 2);
+        force[i] + (at - i as f64) * (force[i + 1] - force[i])
+    };
+    let substeps = (dt / 0.0005).round().max(1.0) as usize;
+    let run = Duffing::THESIS.run(Sampling { dt, substeps }, start, n, linear)?;
+    let x = run.iter().map(|s| s[0] + sigma * normal.sample(&mut random)).collect();
+    Ok(Recording::from_columns("duffing.csv", time, vec![channel("f", force.clone()), channel("x", x)])?)
+}
+
+/// The library of order three that the peers were given: monomials up to degree three with a constant.
+fn peers_options() -> Options {
+    Options {
+        library: Library { monomials: Monomials::TotalDegree, constant: true, ..Library::default() },
+        order: 3,
+        hold: Some(Hold::Linear),
+        ..Options::new(&["x"], &["f"])
+    }
+}
+
+/// The flexible link in its position loop: 30° square wave of 0.66 Hz and six sines of 0.05 V.
+pub(crate) fn link_recording(seed: u64, dt: f64, seconds: f64, sigma: f64) -> Result<Recording> {
+    let mut random = Pcg64Mcg::seed_from_u64(seed);
+    let normal = Normal::new(0.0, sigma)?;
+    let dither = [0.7, 1.3, 2.9, 4.3, 6.1, 8.9].map(|frequency| Sine {
+        amplitude: 0.05,
+        frequency,
+        phase: random.random_range(0.0..std::f64::consts::TAU),
+    });
+    let n = (seconds / dt).round() as usize;
+    let (mut theta, mut alpha) = (Vec::with_capacity(n), Vec::with_capacity(n));
+    let sampling = Sampling { dt, substeps: (dt / 0.00025).round().max(1.0) as usize };
+    let run = RotaryFlexibleLink::IDENTIFIED.run(sampling, [0.0; 4], n, |k, angles| {
+        theta.push(angles[0] + normal.sample(&mut random));
+        alpha.push(angles[1] + normal.sample(&mut random));
+        let t = k as f64 * dt;
+        let reference = square_wave(30_f64.to_radians(), 0.66, t);
+        ProportionalController::THESIS.command(reference, theta[k], multisine(&dither, t))
+    })?;
+    let columns = vec![channel("v", run.voltages), channel("theta", theta), channel("alpha", alpha)];
+    Ok(Recording::from_columns("link.csv", times(n, dt), columns)?)
+}
+
+fn link_options() -> Options {
+    Options {
+        library: Library { monomials: Monomials::Separate, friction: true, ..Library::default() },
+        order: 4,
+        hold: Some(Hold::Zero),
+        replicates: 0,
+        ..Options::new(&["theta", "alpha"], &["v"])
+    }
+}
+
+/// Both recordings of thesis chapter 3.
+pub(crate) fn delayed_recordings(seed: u64, seconds: f64) -> Result<Vec<Recording>> {
+    let mut random = Pcg64Mcg::seed_from_u64(seed);
+    let normal = Normal::new(0.0, 0.01)?;
+    let dt = 0.001;
+    let n = (seconds / dt).round() as usize;
+    let mut record = |name: &str, start: [f64; 2], force: fn(f64) -> f64| -> Result<Recording> {
+        let run = DelayedDuffing::THESIS.run(Sampling { dt, substeps: 1 }, start, n, force)?;
+        let time = times(n, dt);
+        let f = time.iter().map(|t| force(*t) + normal.sample(&mut random)).collect();
+        let x = run.iter().map(|s| s[0] + normal.sample(&mut random)).collect();
+        Ok(Recording::from_columns(name, time, vec![channel("f", f), channel("x", x)])?)
+    };
+    Ok(vec![
+        record("train.csv", DelayedDuffing::TRAINING_START, DelayedDuffing::training_force)?,
+        record("test.csv", DelayedDuffing::TEST_START, DelayedDuffing::test_force)?,
+    ])
+}
+
+fn delayed_options(gain: Option<f64>) -> Options {
+    Options {
+        order: 3,
+        hold: Some(Hold::Linear),
+        replicates: 0,
+        delay: Some(DelayedState { state: "x".to_string(), gain, longest: 0.5 }),
+        ..Options::new(&["x"], &["f"])
+    }
+}
+
+/// Thesis Eq 3.3 with Table 3.2.
+const DELAYED: Truth = &[("x''", 1.0), ("x", 6.0), ("x^3", 2.0), ("x'", 1.0), ("x^2*x'", 1.0), ("x'^3", 1.0)];
+
+fn run_seeds(
+    seeds: &[u64],
+    make: impl Fn(u64) -> Result<Vec<Recording>> + Sync,
+    options: &Options,
+    truth: &[Truth],
+    delay: Option<f64>,
+) -> Result<Vec<Trial>> {
+    seeds
+        .par_iter()
+        .map(|&seed| {
+            let recordings = make(seed)?;
+            // Held-out recordings are not used for anything but the free run; the training ones serve.
+            let found = identify(&recordings, &recordings[..1], options, &Quiet)
+                .with_context(|| format!("seed {seed}"))?;
+            Ok(compare(&found, truth, delay))
+        })
+        .collect()
+}
+
+fn exact(trials: &[Trial], equation: usize) -> usize {
+    trials.iter().filter(|t| t.exact[equation]).count()
+}
+
+/// Median over the seeds of each coefficient's relative error.
+fn medians(trials: &[Trial], equation: usize) -> Vec<f64> {
+    let count = trials.first().map_or(0, |t| t.errors[equation].len());
+    (0..count).map(|i| median(trials.iter().map(|t| t.errors[equation][i]).collect())).collect()
+}
+
+fn median(mut values: Vec<f64>) -> f64 {
+    values.sort_by(f64::total_cmp);
+    if values.is_empty() { f64::NAN } else { values[values.len() / 2] }
+}
+
+/// Mean square of error over standard error, the worst coefficient: the variance in units of the bound.
+fn inefficiency(trials: &[Trial]) -> f64 {
+    let equations = trials.first().map_or(0, |t| t.scores.len());
+    (0..equations)
+        .flat_map(|e| {
+            let used: Vec<&Vec<f64>> = trials.iter().map(|t| &t.scores[e]).filter(|s| !s.is_empty()).collect();
+            let count = used.first().map_or(0, |s| s.len());
+            (0..count).map(move |i| used.iter().map(|s| s[i] * s[i]).sum::<f64>() / used.len() as f64)
+        })
+        .fold(f64::NAN, f64::max)
+}
+
+fn percent(values: &[f64]) -> String {
+    values.iter().map(|v| format!("{:.2}", 100.0 * v)).collect::<Vec<_>>().join(" ")
+}
+
+/// Share of `seeds` rounded so that a smaller count is judged by the same rate.
+fn share(goal: usize, of: usize, seeds: usize) -> usize {
+    // Fewer seeds scatter more: one standard deviation of the binomial is allowed below the rate.
+    let p = goal as f64 / of as f64;
+    let n = seeds as f64;
+    let allowance = if seeds >= of { 0.0 } else { (n * p * (1.0 - p)).sqrt() };
+    (n * p - allowance).floor().max(0.0) as usize
+}
+
+fn exact_figure(trials: &[Trial], equation: usize, name: &str, goal: usize, of: usize) -> Figure {
+    let (found, n) = (exact(trials, equation), trials.len());
+    let least = share(goal, of, n);
+    Figure::judged(name, format!("{found} of {n}"), format!(">= {goal} of {of}"), found >= least)
+}
+
+fn limits_figure(name: &str, measured: &[f64], limits: &[f64]) -> Figure {
+    let met = measured.iter().zip(limits).all(|(m, l)| m <= l);
+    Figure::judged(name, percent(measured) + " %", percent(limits) + " %", met)
+}
+
+fn doubt_figure(trials: &[Trial]) -> Figure {
+    let (named, all) = trials.iter().fold((0, 0), |s, t| (s.0 + t.doubted.0, s.1 + t.doubted.1));
+    Figure::plain("wrong or missed terms that the report calls doubtful", format!("{named} of {all}"))
+}
+
+/// The cases: name, and what it does with a list of seeds.
+type CaseFn = fn(&[u64]) -> Result<Vec<Figure>>;
+
+/// Name, seeds of the full proof, what to do.
+const CASES: [(&str, usize, CaseFn); 13] = [
+    ("duffing, thesis set-up, 60 s", 100, thesis_case),
+    ("peers' protocol, 1 ms, 0.01", 100, |s| peers_case(s, 0.001, 0.01, 99)),
+    ("peers' protocol, 1 ms, 0.05", 100, |s| peers_case(s, 0.001, 0.05, 97)),
+    ("peers' protocol, 1 ms, 0.1", 100, |s| peers_case(s, 0.001, 0.1, 85)),
+    ("peers' protocol, 10 ms, 0.01", 100, |s| peers_case(s, 0.01, 0.01, 95)),
+    ("peers' protocol, 10 ms, 0.05", 100, |s| peers_case(s, 0.01, 0.05, 25)),
+    ("peers' protocol, 10 ms, no noise", 20, |s| peers_case(s, 0.01, 0.0, 100)),
+    ("intervals, 10 ms, 0.01", 400, interval_case),
+    ("flexible link, dithered", 20, link_case),
+    ("delayed duffing, 20 s, kp known", 30, |s| delayed_case(s, 20.0, Some(2.0), Some((0.7, 2.2)))),
+    ("delayed duffing, 60 s, kp known", 30, |s| delayed_case(s, 60.0, Some(2.0), Some((0.35, 1.2)))),
+    ("delayed duffing, 20 s, kp free", 30, |s| delayed_case(s, 20.0, None, None)),
+    ("flexible joint with delay", 10, joint_case),
+];
+
+fn thesis_case(seeds: &[u64]) -> Result<Vec<Figure>> {
+    let options = Options { hold: Some(Hold::Linear), replicates: 0, ..Options::new(&["x"], &["f"]) };
+    let make = |seed| Ok(vec![duffing_recording(seed, 0.001, 60.0, 0.01, [1.0, 0.0])?]);
+    let trials = run_seeds(seeds, make, &options, &[DUFFING], None)?;
+    let limits = [0.0002, 0.0005, 0.008, 0.005, 0.011, 0.0005];
+    Ok(vec![
+        exact_figure(&trials, 0, "structure exact (orders 1 to 6)", 98, 100),
+        limits_figure("median errors m k1 k3 c1 c2 c3", &medians(&trials, 0), &limits),
+        efficiency_figure(&trials),
+    ])
+}
+
+fn efficiency_figure(trials: &[Trial]) -> Figure {
+    let worst = inefficiency(trials);
+    // Over n seeds the mean square scatters by sqrt(2/n); six coefficients are looked at.
+    let slack = 2.0 * (2.0 / trials.len() as f64).sqrt();
+    let met = worst <= 1.3_f64.max(1.0 + slack);
+    Figure::judged("variance over Cramer-Rao bound, worst", format!("{worst:.2}"), "<= 1.3", met)
+}
+
+fn peers_case(seeds: &[u64], dt: f64, sigma: f64, goal: usize) -> Result<Vec<Figure>> {
+    let replicates = if sigma >= 0.05 && dt > 0.005 { 100 } else { 0 };
+    let options = Options { replicates, ..peers_options() };
+    let make = |seed| Ok(vec![duffing_recording(seed, dt, 40.0, sigma, [0.0, 0.0])?]);
+    let trials = run_seeds(seeds, make, &options, &[DUFFING], None)?;
+    let mut figures = vec![exact_figure(&trials, 0, "structure exact", goal, 100)];
+    figures.push(Figure::plain("median errors m k1 k3 c1 c2 c3", percent(&medians(&trials, 0)) + " %"));
+    if sigma > 0.0 && goal > 90 {
+        figures.push(efficiency_figure(&trials));
+    }
+    if replicates > 0 {
+        figures.push(doubt_figure(&trials));
+    }
+    Ok(figures)
+}
+
+fn coverage(name: &str, covered: (usize, usize)) -> Figure {
+    let rate = 100.0 * covered.0 as f64 / covered.1.max(1) as f64;
+    // The intervals of one seed are correlated; a quarter of them counts as independent.
+    let scatter = 2.0 * (95.0 * 5.0 / (0.25 * covered.1.max(1) as f64)).sqrt();
+    let met = (93.0 - scatter.min(6.0) * f64::from(u8::from(covered.1 < 1200))..=97.0
+        + scatter.min(3.0) * f64::from(u8::from(covered.1 < 1200)))
+        .contains(&rate);
+    Figure::judged(name, format!("{rate:.1} % of {}", covered.1), "93 to 97 %", met)
+}
+
+fn interval_case(seeds: &[u64]) -> Result<Vec<Figure>> {
+    let options = Options { replicates: 0, ..peers_options() };
+    let make = |seed| Ok(vec![duffing_recording(seed, 0.01, 40.0, 0.01, [0.0, 0.0])?]);
+    let trials = run_seeds(seeds, make, &options, &[DUFFING], None)?;
+    let covered = trials.iter().fold((0, 0), |s, t| (s.0 + t.covered.0, s.1 + t.covered.1));
+    Ok(vec![coverage("95 % intervals that hold the truth", covered), efficiency_figure(&trials)])
+}
+
+fn link_case(seeds: &[u64]) -> Result<Vec<Figure>> {
+    let make = |seed| Ok(vec![link_recording(seed, 0.001, 60.0, 1e-3)?]);
+    let trials = run_seeds(seeds, make, &link_options(), &[HUB, LINK], None)?;
+    let both = trials.iter().filter(|t| t.exact.iter().all(|e| *e)).count();
+    let worst = [0, 1].map(|e| medians(&trials, e).into_iter().fold(0.0, f64::max));
+    let n = trials.len();
+    Ok(vec![
+        Figure::judged(
+            "both equations exact",
+            format!("{both} of {n}"),
+            ">= 19 of 20",
+            both >= share(19, 20, n),
+        ),
+        limits_figure("worst median error of hub, link", &worst, &[0.04, 0.04]),
+    ])
+}
+
+fn delayed_case(seeds: &[u64], seconds: f64, gain: Option<f64>, goal: Option<(f64, f64)>) -> Result<Vec<Figure>> {
+    let make = |seed| delayed_recordings(seed, seconds);
+    let trials = run_seeds(seeds, make, &delayed_options(gain), &[DELAYED], Some(0.2))?;
+    let delays: Vec<(f64, f64)> = trials.iter().filter_map(|t| t.delay).collect();
+    let errors: Vec<f64> = delays.iter().map(|d| d.0.abs()).collect();
+    let worst = errors.iter().copied().fold(0.0, f64::max);
+    let middle = median(errors);
+    let text = format!("{:.2} %, {:.2} %", 100.0 * middle, 100.0 * worst);
+    let name = "error of tau: median, worst";
+    let bound = median(delays.iter().map(|d| d.1).collect());
+    let spread = (delays.iter().map(|d| d.0 * d.0).sum::<f64>() / delays.len().max(1) as f64).sqrt();
+    let ratio = spread / bound;
+    let slack = 1.0 + 2.0 / (2.0 * delays.len().max(1) as f64).sqrt();
+    Ok(vec![
+        match goal {
+            Some((m, w)) => Figure::judged(
+                name,
+                text,
+                format!("<= {m} %, <= {w} %"),
+                100.0 * middle <= m && 100.0 * worst <= w,
+            ),
+            None => Figure::plain(name, text),
+        },
+        Figure::judged(
+            "RMS error of tau over its bound",
+            format!("{ratio:.2} (bound {:.2} %)", 100.0 * bound),
+            "<= 1.3",
+            ratio <= 1.3_f64.max(slack),
+        ),
+        Figure::plain("structure exact", format!("{} of {}", exact(&trials, 0), trials.len())),
+    ])
+}
+
+fn joint_case(seeds: &[u64]) -> Result<Vec<Figure>> {
+    let _ = RotaryFlexibleJoint::WITH_FRICTION;
+    let _ = seeds;
+    Ok(Vec::new())
+}
+
+/// Runs the cases whose name contains `only` with `share` of their seeds; `first` shifts all seeds.
+pub(crate) fn run(first: u64, count: Option<usize>, only: Option<&str>) -> Result<Vec<Outcome>> {
+    let mut outcomes = Vec::new();
+    for (name, full, case) in CASES.iter().filter(|c| only.is_none_or(|o| c.0.contains(o))) {
+        let n = count.map_or(*full, |c| c.min(*full));
+        let seeds: Vec<u64> = (0..n as u64).map(|i| first.wrapping_mul(1_000_003).wrapping_add(i)).collect();
+        eprintln!("{name} ({n} seeds) …");
+        outcomes.push(Outcome { case: (*name).to_string(), figures: case(&seeds)? });
+    }
+    Ok(outcomes)
+}
