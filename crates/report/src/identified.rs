@@ -84,7 +84,8 @@ pub struct Term {
     /// Exponents of the variables, for a monomial: `{"x": 2, "x'": 1}` is x²x′.
     #[serde(default, skip_serializing_if = "Ordered::is_empty")]
     pub powers: Ordered<u32>,
-    /// Name of the coefficient in `model.toml`; the leading term of an equation without input has none.
+    /// Name of the coefficient in `model.toml`. Absent for the leading term of an equation without input, whose
+    /// coefficient is one, and for a delayed feedback, whose coefficient is minus its gain.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub parameter: Option<String>,
     /// The coefficient.
@@ -185,7 +186,8 @@ impl JsonSchema for OrderValue {
     }
 }
 
-/// A delayed feedback gain · q(t − value) on the left side of the equation of the state q.
+/// A delayed feedback of the state q: gain · q(t − value) is added to the first input, so that it stands on the
+/// left side of every equation as the term `delay(q, tau)` with the value −gain (thesis Eq 3.3).
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize, JsonSchema)]
 pub struct Delay {
     /// The delay.

@@ -74,8 +74,8 @@ pub(crate) struct Arguments {
     longest: f64,
 
     /// Resampled data sets behind the inclusion probabilities
-    #[arg(long, value_name = "N", default_value_t = 100)]
-    replicates: usize,
+    #[arg(long, value_name = "N", default_value_t = 100, value_parser = clap::value_parser!(u16).range(1..))]
+    replicates: u16,
 
     /// Seed of every random choice
     #[arg(long, value_name = "N", default_value_t = 0)]
@@ -186,7 +186,7 @@ fn options(arguments: &Arguments) -> Result<Options, Failure> {
         order: arguments.order.unwrap_or(usual.order),
         hold: arguments.hold.map(Hold::from),
         delay,
-        replicates: arguments.replicates,
+        replicates: usize::from(arguments.replicates),
         seed: arguments.seed,
         ..usual
     })

@@ -33,6 +33,8 @@ pub const MODEL_FILE: &str = "model.toml";
 /// The contract's report.
 pub fn report(found: &Identification, sources: &Sources<'_>) -> IdentifyReport {
     let channels = names(&found.train.data);
+    let variables = variables(&found.model, sources);
+    let units = units_stated(&variables);
     let mut report = IdentifyReport {
         greybox: Producer { version: env!("CARGO_PKG_VERSION").to_owned(), seed: found.seed },
         model: ModelId { name: found.model.name.clone(), file: MODEL_FILE.to_owned() },
@@ -41,9 +43,9 @@ pub fn report(found: &Identification, sources: &Sources<'_>) -> IdentifyReport {
             .equations
             .iter()
             .zip(&found.model.equations)
-            .map(|(e, written)| (e.state.clone(), equation(e, written, &found.model)))
+            .map(|(e, written)| (e.state.clone(), equation(e, written, &found.model, units)))
             .collect(),
-        variables: variables(&found.model, sources),
+        variables,
         order: Order {
             chosen: found.order.chosen,
             criterion: found.order.criterion.to_owned(),
@@ -54,7 +56,7 @@ pub fn report(found: &Identification, sources: &Sources<'_>) -> IdentifyReport {
                 .map(|&(order, value)| OrderValue { order, value })
                 .collect(),
         },
-        delay: found.delays.iter().map(|d| (d.state.clone(), delay(d, &found.model))).collect(),
+        delay: found.delays.iter().map(|d| (d.state.clone(), delay(d, &found.model, units))).collect(),
         fit: fit(found),
         noise_floor: channels.iter().cloned().zip(found.noise_floor.iter().copied()).collect(),
         misfit: channels.into_iter().zip(found.misfit.iter().copied()).collect(),
@@ -81,20 +83,32 @@ fn unit_of<'a>(model: &'a Model, parameter: &str) -> Option<&'a Unit> {
     model.parameter(parameter).and_then(|index| model.parameters[index].unit.as_ref())
 }
 
-fn equation(found: &FoundEquation, written: &greybox_model::Equation, model: &Model) -> Equation {
+/// Whether every state and input has a unit in the recordings. Where one has none, its unit counts as 1 in the
+/// model, but the unit of a coefficient cannot be said.
+fn units_stated(variables: &Ordered<Variable>) -> bool {
+    variables.values().all(|variable| !variable.channel_unit.is_empty())
+}
+
+fn equation(
+    found: &FoundEquation,
+    written: &greybox_model::Equation,
+    model: &Model,
+    units: bool,
+) -> Equation {
     let terms = found
         .terms
         .iter()
         .map(|term| {
             let unit = unit_of(model, &term.parameter);
             let factor = unit.map_or(1.0, |u| u.factor);
+            let own = model.parameter(&term.parameter).is_some() && term.parameter != DELAY_GAIN;
             Term {
                 expression: term.expression.clone(),
                 powers: term.powers.iter().cloned().collect(),
-                parameter: model.parameter(&term.parameter).map(|_| term.parameter.clone()),
+                parameter: own.then(|| term.parameter.clone()),
                 value: term.value / factor,
                 ci95: interval(term.ci95, factor),
-                unit: unit.map(|u| u.text.clone()),
+                unit: unit.filter(|_| units).map(|u| u.text.clone()),
                 inclusion: term.inclusion,
             }
         })
@@ -115,7 +129,11 @@ fn equation(found: &FoundEquation, written: &greybox_model::Equation, model: &Mo
 fn variables(model: &Model, sources: &Sources<'_>) -> Ordered<Variable> {
     let entry = |name: &str, channel: &str, unit: &Unit, role: VariableRole| {
         let stated = sources.train.iter().find_map(|r| r.channel(channel)?.unit.clone());
-        let variable = Variable { role, channel_unit: stated.unwrap_or_default(), unit: coherent(unit) };
+        let variable = Variable {
+            role,
+            unit: stated.as_ref().map_or_else(String::new, |_| coherent(unit)),
+            channel_unit: stated.unwrap_or_default(),
+        };
         (name.to_owned(), variable)
     };
     let states = model
@@ -138,7 +156,7 @@ fn coherent(unit: &Unit) -> String {
     Unit::si(unit.dimension).text
 }
 
-fn delay(found: &FoundDelay, model: &Model) -> Delay {
+fn delay(found: &FoundDelay, model: &Model, units: bool) -> Delay {
     let gain_unit = unit_of(model, DELAY_GAIN);
     let factor = gain_unit.map_or(1.0, |u| u.factor);
     let mut delay = Delay {
@@ -148,7 +166,7 @@ fn delay(found: &FoundDelay, model: &Model) -> Delay {
         bound: found.bound,
         gain: found.gain / factor,
         gain_ci95: interval(found.gain_ci95, factor),
-        gain_unit: gain_unit.map(|u| u.text.clone()),
+        gain_unit: gain_unit.filter(|_| units).map(|u| u.text.clone()),
         correlation: found.correlation,
         warning: None,
     };
@@ -156,8 +174,9 @@ fn delay(found: &FoundDelay, model: &Model) -> Delay {
     delay
 }
 
-/// Name of the feedback's gain in the identified model.
+/// Names of the feedback's gain and delay in the identified model.
 const DELAY_GAIN: &str = "kp";
+const DELAY: &str = "tau";
 
 /// The identified model alone: it stands where a diagnosis has its improved one.
 fn fit_set(role: &RoleRun, of: &[greybox_calibrate::Score]) -> FitSet {
@@ -193,15 +212,17 @@ fn fit(found: &Identification) -> Fit {
 
 /// The identified model in the model language, each coefficient with its interval.
 pub fn model_toml(found: &Identification) -> String {
-    let comments: Vec<(String, String)> = found
-        .equations
-        .iter()
-        .flat_map(|e| &e.terms)
-        .filter_map(|term| {
-            let factor = unit_of(&found.model, &term.parameter).map_or(1.0, |u| u.factor);
-            let ci = interval(term.ci95, factor)?;
+    let terms = found.equations.iter().flat_map(|e| &e.terms);
+    let coefficients =
+        terms.filter(|t| t.parameter != DELAY_GAIN).map(|t| (t.parameter.as_str(), t.ci95));
+    let feedback = found.delays.iter().flat_map(|d| [(DELAY_GAIN, d.gain_ci95), (DELAY, d.ci95)]);
+    let comments: Vec<(String, String)> = coefficients
+        .chain(feedback)
+        .filter_map(|(name, ci95)| {
+            let factor = unit_of(&found.model, name).map_or(1.0, |u| u.factor);
+            let ci = interval(ci95, factor)?;
             let (low, high) = (format::significant(ci.low, 4), format::significant(ci.high, 4));
-            Some((term.parameter.clone(), format!("95 % interval {low} to {high}")))
+            Some((name.to_owned(), format!("95 % interval {low} to {high}")))
         })
         .collect();
     found.model.to_toml(&WriteOptions { original: None, comments: &comments })

@@ -166,12 +166,15 @@ fn values_html(equation: &Equation, delays: &Ordered<Delay>) -> String {
         out.push_str(factor);
     };
     for term in &equation.terms {
-        let factor = if term.expression == "1" { String::new() } else { expression::html(&term.expression) };
+        let factor = match (sentence::identified::delayed(term, delays), term.expression.as_str()) {
+            (Some((state, d)), _) => {
+                let seconds = escape(&format::significant(d.value, 4));
+                format!("{}(<var>t</var> − {seconds}\u{202f}s)", expression::html(state))
+            }
+            (None, "1") => String::new(),
+            (None, expression) => expression::html(expression),
+        };
         push(term.value, &factor);
-    }
-    for (state, d) in delays.iter().filter(|(state, _)| sentence::identified::leads(equation, state)) {
-        let seconds = escape(&format::significant(d.value, 4));
-        push(d.gain, &format!("{}(<var>t</var> − {seconds}\u{202f}s)", expression::html(state)));
     }
     let right = equation.input.as_deref().map_or_else(|| "0".to_owned(), expression::html);
     format!("{out} = {right}")

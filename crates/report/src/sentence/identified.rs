@@ -32,27 +32,28 @@ pub fn summary(report: &IdentifyReport) -> Vec<String> {
     out
 }
 
-/// `2 x″ + 0.9 x′ + 1.2 x³ = f`, values to four digits; a delayed feedback stands at the end.
+/// `2 x″ + 0.9 x′ + 1.2 x³ = f`, values to four digits.
 pub fn with_values(equation: &Equation, delays: &Ordered<Delay>) -> String {
     let mut text = String::new();
     for term in &equation.terms {
-        push_signed(&mut text, term.value, &factor(term));
-    }
-    for (state, d) in delays.iter().filter(|(state, _)| leads(equation, state)) {
-        let name = expression::text(state);
-        push_signed(&mut text, d.gain, &format!("{name}(t − {} s)", format::significant(d.value, 4)));
+        let factor = match (delayed(term, delays), term.expression.as_str()) {
+            (Some((state, d)), _) => {
+                format!("{}(t − {} s)", expression::text(state), format::significant(d.value, 4))
+            }
+            (None, "1") => String::new(),
+            (None, expression) => expression::text(expression),
+        };
+        push_signed(&mut text, term.value, &factor);
     }
     let right = equation.input.as_deref().map_or_else(|| "0".to_owned(), expression::text);
     format!("{text} = {right}")
 }
 
-/// Whether the leading term of the equation is a derivative of `state`.
-pub(crate) fn leads(equation: &Equation, state: &str) -> bool {
-    equation.terms.first().is_some_and(|t| t.expression.trim_end_matches('\'') == state)
-}
-
-fn factor(term: &Term) -> String {
-    if term.expression == "1" { String::new() } else { expression::text(&term.expression) }
+/// The state and the delay of a term `delay(q, tau)`.
+pub(crate) fn delayed<'a>(term: &Term, delays: &'a Ordered<Delay>) -> Option<(&'a str, &'a Delay)> {
+    let inside = term.expression.strip_prefix("delay(")?;
+    let state = inside.split(',').next()?.trim();
+    delays.get_key_value(state).map(|(state, d)| (state.as_str(), d))
 }
 
 fn push_signed(text: &mut String, value: f64, factor: &str) {
