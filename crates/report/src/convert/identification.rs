@@ -213,8 +213,7 @@ fn fit(found: &Identification) -> Fit {
 /// The identified model in the model language, each coefficient with its interval.
 pub fn model_toml(found: &Identification) -> String {
     let terms = found.equations.iter().flat_map(|e| &e.terms);
-    let coefficients =
-        terms.filter(|t| t.parameter != DELAY_GAIN).map(|t| (t.parameter.as_str(), t.ci95));
+    let coefficients = terms.filter(|t| t.parameter != DELAY_GAIN).map(|t| (t.parameter.as_str(), t.ci95));
     let feedback = found.delays.iter().flat_map(|d| [(DELAY_GAIN, d.gain_ci95), (DELAY, d.ci95)]);
     let comments: Vec<(String, String)> = coefficients
         .chain(feedback)

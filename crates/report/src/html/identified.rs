@@ -54,7 +54,6 @@ struct EquationView {
     /// With the values in their place.
     values_html: String,
     terms: Vec<TermView>,
-    doubts: Vec<String>,
 }
 
 struct TermView {
@@ -100,21 +99,20 @@ impl View {
             inputs: inputs(&report.inputs),
             ..scene.common(&report.greybox, island)
         };
-        // The equations and their doubts stand in sections of their own.
+        // The equations come first and are typeset.
         let all = if report.summary.is_empty() {
             sentence::identified::summary(report)
         } else {
             report.summary.clone()
         };
         let sentences = all.iter().skip(report.equations.len()).map(|text| format::tie(text)).collect();
-        let several = report.equations.len() > 1;
         View {
             common,
             sentences,
             equations: report
                 .equations
                 .iter()
-                .map(|(state, e)| equation_view(state, e, &report.delay, several))
+                .map(|(state, e)| equation_view(state, e, &report.delay))
                 .collect(),
             variables: variables(report),
             orders: report
@@ -135,16 +133,12 @@ impl View {
     }
 }
 
-fn equation_view(state: &str, equation: &Equation, delays: &Ordered<Delay>, several: bool) -> EquationView {
+fn equation_view(state: &str, equation: &Equation, delays: &Ordered<Delay>) -> EquationView {
     EquationView {
         state_html: expression::html(state),
         symbols_html: expression::html(&equation.expression),
         values_html: values_html(equation, delays),
         terms: equation.terms.iter().map(term_view).collect(),
-        doubts: sentence::identified::doubts(state, equation, several)
-            .iter()
-            .map(|text| format::tie(text))
-            .collect(),
     }
 }
 

@@ -153,19 +153,24 @@ fn delay(state: &str, d: &Delay) -> String {
 /// stiffness and the product k_p τ (with the damping) show in the recordings.
 pub fn delay_warning(d: &Delay) -> Option<String> {
     let entangled = d.correlation.filter(|rho| rho.abs() > ENTANGLED);
-    let none = d.ci95.is_none_or(|ci| !(ci.low > 0.0)) && d.value.is_finite();
     let mut parts = Vec::new();
     if let Some(rho) = entangled {
+        let rho = if rho.abs() < 0.9995 { format::significant(rho, 3) } else { "beyond ±0.999".to_owned() };
         parts.push(format!(
-            "delay and gain move together (correlation {}): these recordings hardly separate them; give the gain \
-             with --gain, or record faster motion",
-            format::significant(rho, 3)
+            "delay and gain move together (correlation {rho}): these recordings hardly separate them; give the gain \
+             with --gain, or record faster motion"
         ));
     }
-    if none {
+    if d.ci95.is_none_or(|ci| !(ci.low > 0.0)) {
         parts.push(
-            "the interval of the delay holds zero or is unknown: a feedback without delay explains these \
-                    recordings as well"
+            "the interval of the delay holds zero or is unknown: a feedback without delay may explain these \
+             recordings as well"
+                .to_owned(),
+        );
+    }
+    if d.gain_ci95.is_some_and(|ci| ci.low <= 0.0 && ci.high >= 0.0) {
+        parts.push(
+            "the interval of the gain holds zero: these recordings do not show that there is such a feedback"
                 .to_owned(),
         );
     }
