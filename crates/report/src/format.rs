@@ -99,8 +99,8 @@ pub fn interval(ci95: Option<Interval>) -> String {
     match ci95 {
         Some(ci) if ci.low.is_finite() && ci.high.is_finite() => {
             let size = ci.low.abs().max(ci.high.abs());
-            let ratio = (size / (ci.high - ci.low).abs()).log10();
-            let digits = if ratio.is_finite() { (ratio.ceil() as i32 + 2).clamp(3, 8) as usize } else { 3 };
+            let decades = size.log10().floor() - (ci.high - ci.low).abs().log10().floor();
+            let digits = if decades.is_finite() { (decades as i32 + 2).clamp(3, 8) as usize } else { 3 };
             format!("{} … {}", significant(ci.low, digits), significant(ci.high, digits))
         }
         _ => UNKNOWN.to_owned(),
