@@ -1,13 +1,18 @@
 //! The command line.
 
 use std::ffi::OsString;
+use std::path::PathBuf;
 
 use clap::error::ErrorKind;
-use clap::{Parser, Subcommand};
+use clap::{Args, Parser, Subcommand};
 
 use crate::answer::Answer;
-use crate::commands::{calibrate, check, demo, diagnose, simulate};
+use crate::commands::{calibrate, check, demo, diagnose, identify, simulate};
 use crate::failure::Failure;
+use crate::loading::{self, LoadedModel};
+use crate::output::OutputFolder;
+use greybox_calibrate::Data;
+use greybox_recording::Recording;
 
 /// Give greybox a recording and the simulation you believe in: it tells you what physics is missing,
 /// where it acts, how sure it is, and hands back a simulation that fits.
@@ -21,6 +26,7 @@ use crate::failure::Failure;
   greybox check run1.csv --model link.toml
   greybox diagnose link.toml run1.csv run2.csv --holdout run3.csv --out result
   greybox simulate result/improved.toml run3.csv --out simulated.csv
+  greybox identify run1.csv --states x --inputs f --holdout run2.csv --out found
 
 Exit status: 0 finished, whatever the verdict; 2 bad usage or bad input; 1 internal failure."
 )]
@@ -33,9 +39,91 @@ pub(crate) struct Cli {
     json: bool,
 }
 
+/// The recordings of a command that learns from some and is judged on others, and where its results go.
+#[derive(Debug, Args)]
+pub(crate) struct Study {
+    /// Recordings to choose and fit with (CSV)
+    #[arg(value_name = "TRAIN.csv", required = true)]
+    pub(crate) train: Vec<PathBuf>,
+
+    /// Recordings that only judge the result
+    #[arg(long, value_name = "TEST.csv", num_args = 1..)]
+    pub(crate) holdout: Vec<PathBuf>,
+
+    /// Folder for the results; made where it is missing
+    #[arg(long, value_name = "DIR")]
+    pub(crate) out: PathBuf,
+}
+
+/// What a [`Study`] reads.
+#[derive(Debug)]
+pub(crate) struct Recordings {
+    pub(crate) train: Vec<Recording>,
+    pub(crate) holdout: Vec<Recording>,
+}
+
+impl Study {
+    /// Reads the recordings.
+    ///
+    /// # Errors
+    /// As [`loading::train_and_holdout`].
+    pub(crate) fn recordings(&self) -> Result<Recordings, Failure> {
+        let (train, holdout) = loading::train_and_holdout(&self.train, &self.holdout)?;
+        Ok(Recordings { train, holdout })
+    }
+
+    /// The folder for `results`, none of which may replace an input.
+    ///
+    /// # Errors
+    /// As [`OutputFolder::prepare`] and [`OutputFolder::spares`].
+    pub(crate) fn folder<'a>(
+        &'a self,
+        results: &[&str],
+        others: impl IntoIterator<Item = &'a PathBuf>,
+    ) -> Result<OutputFolder, Failure> {
+        let out = OutputFolder::prepare(&self.out)?;
+        out.spares(results, self.train.iter().chain(&self.holdout).chain(others))?;
+        Ok(out)
+    }
+}
+
+/// A [`Study`] of a model.
+#[derive(Debug, Args)]
+pub(crate) struct ModelStudy {
+    /// Nominal model (TOML)
+    #[arg(value_name = "MODEL.toml")]
+    pub(crate) model: PathBuf,
+
+    #[command(flatten)]
+    pub(crate) study: Study,
+}
+
+impl ModelStudy {
+    /// Reads the model and the recordings, and sees that they fit each other.
+    ///
+    /// # Errors
+    /// Bad input: a file that cannot be read, or a recording that lacks what the model needs.
+    pub(crate) fn read(&self) -> Result<(LoadedModel, Recordings), Failure> {
+        let loaded = loading::model(&self.model)?;
+        let recordings = self.study.recordings()?;
+        Data::new(&loaded.model, &recordings.train)?;
+        Data::new(&loaded.model, &recordings.holdout)?;
+        Ok((loaded, recordings))
+    }
+
+    /// As [`Study::folder`]; the model is an input too.
+    ///
+    /// # Errors
+    /// As [`Study::folder`].
+    pub(crate) fn folder(&self, results: &[&str]) -> Result<OutputFolder, Failure> {
+        self.study.folder(results, [&self.model])
+    }
+}
+
 #[derive(Debug, Subcommand)]
 pub(crate) enum Command {
     Diagnose(diagnose::Arguments),
+    Identify(identify::Arguments),
     Calibrate(calibrate::Arguments),
     Simulate(simulate::Arguments),
     Check(check::Arguments),
@@ -46,6 +134,7 @@ impl Command {
     pub(crate) fn run(&self) -> Result<Answer, Failure> {
         match self {
             Command::Diagnose(arguments) => diagnose::run(arguments),
+            Command::Identify(arguments) => identify::run(arguments),
             Command::Calibrate(arguments) => calibrate::run(arguments),
             Command::Simulate(arguments) => simulate::run(arguments),
             Command::Check(arguments) => check::run(arguments),
@@ -64,7 +153,7 @@ impl Cli {
             }
             Err(e) if e.kind() == ErrorKind::DisplayHelpOnMissingArgumentOrSubcommand => {
                 Err(Failure::input("no command is given").mend(
-                    "name one: `greybox diagnose`, `calibrate`, `simulate`, `check` or `demo`; \
+                    "name one: `greybox diagnose`, `identify`, `calibrate`, `simulate`, `check` or `demo`; \
                      `greybox --help` explains them",
                 ))
             }

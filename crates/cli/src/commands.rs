@@ -4,4 +4,5 @@ pub(crate) mod calibrate;
 pub(crate) mod check;
 pub(crate) mod demo;
 pub(crate) mod diagnose;
+pub(crate) mod identify;
 pub(crate) mod simulate;

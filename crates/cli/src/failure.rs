@@ -8,6 +8,7 @@ use std::process::ExitCode;
 
 use greybox_calibrate::DataError;
 use greybox_diagnose::DiagnoseError;
+use greybox_identify::IdentifyError;
 use greybox_model::ModelError;
 use greybox_recording::RecordingError;
 use serde_json::{Map, Value, json};
@@ -233,6 +234,36 @@ impl From<DiagnoseError> for Failure {
             DiagnoseError::Data(error) => error.into(),
             DiagnoseError::Mechanism(error) => Failure::internal(error.to_string()),
             other => Failure::input(other.to_string()),
+        }
+    }
+}
+
+/// The message holds its own mend. A model error here is about equations that greybox wrote, so that there is
+/// no file to point at: what it says of names and units comes from the recordings' headers.
+impl From<IdentifyError> for Failure {
+    fn from(error: IdentifyError) -> Failure {
+        let message = error.to_string();
+        match error {
+            IdentifyError::Data(DataError::MissingChannel { file, channel, available, .. }) => {
+                let message = format!("there is no channel `{channel}`; the file has {available}");
+                Failure::file(Path::new(&file), message)
+                    .mend("name channels of the recordings after --states and --inputs")
+                    .at("channel", channel)
+            }
+            IdentifyError::Data(error) => error.into(),
+            IdentifyError::Model(error) => {
+                let failure =
+                    Failure::input(format!("the recordings' channels make no equation: {}", error.problem()));
+                match error.help() {
+                    Some(help) => failure.mend(help),
+                    None => failure.mend("check names and units in the headers of the recordings"),
+                }
+            }
+            IdentifyError::Twice { name, .. }
+            | IdentifyError::Name { name, .. }
+            | IdentifyError::DelayedState { name, .. }
+            | IdentifyError::Still { name } => Failure::input(message).at("channel", name),
+            _ => Failure::input(message),
         }
     }
 }

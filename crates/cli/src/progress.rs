@@ -78,6 +78,20 @@ impl Observer for Progress {
     }
 }
 
+impl greybox_identify::Observer for Progress {
+    fn stage(&self, name: &str) {
+        Progress::stage(
+            self,
+            match name {
+                "weak form" => "first estimates (weak form)",
+                "output error" => "choosing and fitting terms on simulated outputs",
+                "precision" => "intervals and resampled choices",
+                other => other,
+            },
+        );
+    }
+}
+
 impl Drop for Progress {
     fn drop(&mut self) {
         if let Some((stop, thread)) = self.waiting.take() {

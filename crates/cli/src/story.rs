@@ -5,6 +5,7 @@ use std::fmt::Write as _;
 use greybox_report::contract::{
     Finding, Fit, FitSet, Mechanism, Ordered, Parameter, Report, Score, Severity,
 };
+use greybox_report::identified::{Equation, IdentifyReport};
 use greybox_report::{expression, format, sentence};
 
 /// The story of a diagnosis: the conclusion, the mechanisms with their rivals, the fit, and what to know.
@@ -22,6 +23,53 @@ pub(crate) fn diagnosis(report: &Report) -> String {
     text.push_str(&fit_table(&report.fit, &report.noise_floor));
     text.push_str(&notes(&report.findings));
     text
+}
+
+/// The story of an identification: the equations, how well they predict, the doubts, and every term.
+pub(crate) fn identification(report: &IdentifyReport) -> String {
+    let mut text = String::new();
+    for line in &report.summary {
+        let _ = writeln!(text, "{line}");
+    }
+    for (state, equation) in &report.equations {
+        text.push('\n');
+        text.push_str(&term_table(state, equation));
+    }
+    let rows: Vec<Vec<String>> = [("training", &report.fit.train), ("held out", &report.fit.holdout)]
+        .into_iter()
+        .flat_map(|(role, set)| set.improved.iter().map(move |(channel, score)| (role, channel, score)))
+        .map(|(role, channel, score)| {
+            let floor = report.noise_floor.get(channel).copied().unwrap_or(f64::NAN);
+            let name = format!("{role}, {}", expression::text(channel));
+            vec![name, format::percent(score.nrmse), format::percent(floor)]
+        })
+        .collect();
+    let header = ["", "identified", "noise"].map(str::to_owned).to_vec();
+    let _ = write!(text, "\nFree-run error (nrmse):\n{}", aligned(&[vec![header], rows].concat()));
+    text.push_str(&held_out(&report.fit));
+    text.push_str(&notes(&report.findings));
+    text
+}
+
+/// The terms of one equation, as they stand in the model.
+fn term_table(state: &str, equation: &Equation) -> String {
+    let mut rows = vec![["", "value", "95 % interval", "chosen in", "unit"].map(str::to_owned).to_vec()];
+    for term in &equation.terms {
+        rows.push(vec![
+            term.expression.clone(),
+            format::with_interval(term.value, term.ci95),
+            format::interval(term.ci95),
+            term.inclusion.map_or_else(|| "always".to_owned(), format::probability),
+            term.unit.as_deref().map(format::unit).unwrap_or_default(),
+        ]);
+    }
+    format!("{state}: {}\n{}", equation.expression, aligned(&rows))
+}
+
+/// Where the held-out data came from.
+fn held_out(fit: &Fit) -> String {
+    let source = fit.holdout_source.trim_start_matches("recordings held out: ");
+    format!("Held out: {}.\n", source.trim_end_matches('.'))
 }
 
 fn mechanism_in_words(number: usize, mechanism: &Mechanism) -> String {
@@ -60,11 +108,7 @@ pub(crate) fn fit_table(fit: &Fit, noise_floor: &Ordered<f64>) -> String {
             rows.push(row);
         }
     }
-    format!(
-        "Free-run error (nrmse):\n{}Held out: {}.\n",
-        aligned(&rows),
-        fit.holdout_source.trim_start_matches("recordings held out: ").trim_end_matches('.')
-    )
+    format!("Free-run error (nrmse):\n{}{}", aligned(&rows), held_out(fit))
 }
 
 fn models(set: &FitSet, improved: bool) -> Vec<&Ordered<Score>> {

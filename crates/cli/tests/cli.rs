@@ -5,11 +5,11 @@
 
 use std::fmt::Write as _;
 use std::fs;
-use std::path::{Path, PathBuf};
 
-use assert_cmd::Command;
+use common::{Bench, names};
 use serde_json::Value;
-use tempfile::TempDir;
+
+mod common;
 
 const MODEL: &str = r#"name = "Mass on a spring"
 
@@ -32,91 +32,12 @@ body = "m*x'' + b*x' + k*x = f"
 const TRUTH: (f64, f64) = (0.8, 25.0);
 
 /// A folder with `model.toml`, `run1.csv` and `run2.csv`.
-struct Bench {
-    folder: TempDir,
-}
-
-/// What a run of the command left.
-struct Outcome {
-    code: i32,
-    stdout: String,
-    stderr: String,
-}
-
-impl Bench {
-    fn new() -> Bench {
-        let bench = Bench { folder: tempfile::tempdir().unwrap() };
-        bench.write("model.toml", MODEL);
-        bench.write("run1.csv", &recording(1200, 0.0));
-        bench.write("run2.csv", &recording(900, 1.0));
-        bench
-    }
-
-    fn path(&self, name: &str) -> PathBuf {
-        self.folder.path().join(name)
-    }
-
-    fn write(&self, name: &str, content: &str) {
-        fs::write(self.path(name), content).unwrap();
-    }
-
-    fn read(&self, name: &str) -> String {
-        fs::read_to_string(self.path(name)).unwrap()
-    }
-
-    fn names(&self) -> Vec<String> {
-        names(self.folder.path())
-    }
-
-    /// Runs `greybox` in the folder.
-    fn greybox(&self, arguments: &[&str]) -> Outcome {
-        self.greybox_with(arguments, &[])
-    }
-
-    fn greybox_with(&self, arguments: &[&str], environment: &[(&str, &str)]) -> Outcome {
-        let mut command = Command::cargo_bin("greybox").unwrap();
-        command.current_dir(self.folder.path()).args(arguments).envs(environment.iter().copied());
-        let output = command.output().unwrap();
-        Outcome {
-            code: output.status.code().unwrap(),
-            stdout: String::from_utf8(output.stdout).unwrap(),
-            stderr: String::from_utf8(output.stderr).unwrap(),
-        }
-    }
-
-    fn json(&self, arguments: &[&str]) -> Value {
-        let outcome = self.greybox(&[arguments, &["--json"]].concat());
-        assert_eq!(outcome.code, 0, "{}", outcome.stderr);
-        serde_json::from_str(&outcome.stdout).unwrap()
-    }
-
-    /// Runs `greybox`, which must refuse with exit 2, one error that holds all of `expected`, and nothing
-    /// written; the same error must come as JSON.
-    #[track_caller]
-    fn refuses(&self, arguments: &[&str], expected: &[&str]) {
-        let before = self.names();
-        let outcome = self.greybox(arguments);
-        let error = outcome.stderr;
-        assert_eq!(outcome.code, 2, "{arguments:?}: {error}");
-        assert_eq!(error.matches("error: ").count(), 1, "{error}");
-        for part in expected {
-            assert!(error.contains(part), "{arguments:?}: `{part}` is not in: {error}");
-        }
-        assert!(outcome.stdout.is_empty(), "{}", outcome.stdout);
-        let outcome = self.greybox(&[arguments, &["--json"]].concat());
-        assert_eq!(outcome.code, 2);
-        let json: Value = serde_json::from_str(&outcome.stdout).unwrap();
-        assert_eq!(json["error"]["exit_code"], 2, "{json}");
-        assert!(json["error"]["message"].is_string(), "{json}");
-        assert_eq!(self.names(), before, "{arguments:?} left something behind");
-    }
-}
-
-fn names(folder: &Path) -> Vec<String> {
-    let mut names: Vec<String> =
-        fs::read_dir(folder).unwrap().map(|e| e.unwrap().file_name().into_string().unwrap()).collect();
-    names.sort();
-    names
+fn bench() -> Bench {
+    let bench = Bench::empty();
+    bench.write("model.toml", MODEL);
+    bench.write("run1.csv", &recording(1200, 0.0));
+    bench.write("run2.csv", &recording(900, 1.0));
+    bench
 }
 
 /// `t, f [N], x [mm]` of a mass on a spring that starts at rest, simulated finely (semi-implicit Euler), with a
@@ -155,10 +76,11 @@ fn column(csv: &str, index: usize) -> Vec<Option<f64>> {
 
 #[test]
 fn every_help_has_an_example() {
-    let bench = Bench::new();
+    let bench = bench();
     for command in [&["--help"] as &[&str], &["diagnose", "--help"], &["calibrate", "--help"]]
         .into_iter()
         .chain([&["simulate", "--help"] as &[&str], &["check", "--help"], &["demo", "--help"]])
+        .chain([&["identify", "--help"] as &[&str]])
     {
         let outcome = bench.greybox(command);
         assert_eq!(outcome.code, 0);
@@ -173,7 +95,7 @@ fn every_help_has_an_example() {
 
 #[test]
 fn check_says_what_each_channel_feeds() {
-    let bench = Bench::new();
+    let bench = bench();
     let outcome = bench.greybox(&["check", "run1.csv", "--model", "model.toml"]);
     assert_eq!(outcome.code, 0, "{}", outcome.stderr);
     assert!(outcome.stdout.starts_with("run1.csv: healthy\n"), "{}", outcome.stdout);
@@ -187,7 +109,7 @@ fn check_says_what_each_channel_feeds() {
 
 #[test]
 fn check_names_the_gap_and_still_exits_0() {
-    let bench = Bench::new();
+    let bench = bench();
     let whole = recording(600, 0.0);
     let holed: Vec<&str> =
         whole.lines().enumerate().filter(|(i, _)| !(200..260).contains(i)).map(|l| l.1).collect();
@@ -203,7 +125,7 @@ fn check_names_the_gap_and_still_exits_0() {
 
 #[test]
 fn calibrate_finds_the_parameters_and_keeps_comments() {
-    let bench = Bench::new();
+    let bench = bench();
     let json = bench.json(&["calibrate", "model.toml", "run1.csv", "--holdout", "run2.csv", "--out", "a/b"]);
     assert!((json["parameters"]["k"]["value"].as_f64().unwrap() - TRUTH.1).abs() < 0.1, "{json}");
     assert!((json["parameters"]["b"]["value"].as_f64().unwrap() - TRUTH.0).abs() < 0.02, "{json}");
@@ -221,7 +143,7 @@ fn calibrate_finds_the_parameters_and_keeps_comments() {
 
 #[test]
 fn what_calibrate_writes_simulates_as_well_as_it_says() {
-    let bench = Bench::new();
+    let bench = bench();
     let json = bench.json(&["calibrate", "model.toml", "run1.csv", "--holdout", "run2.csv", "--out", "out"]);
     let said = json["fit"]["holdout"]["calibrated"]["x"]["nrmse"].as_f64().unwrap();
     let run = bench.json(&["simulate", "out/model.toml", "run2.csv", "--out", "simulated.csv"]);
@@ -232,7 +154,7 @@ fn what_calibrate_writes_simulates_as_well_as_it_says() {
 
 #[test]
 fn without_a_holdout_the_last_fifth_is_held_out() {
-    let bench = Bench::new();
+    let bench = bench();
     let json = bench.json(&["calibrate", "model.toml", "run1.csv", "--out", "out"]);
     let source = json["fit"]["holdout_source"].as_str().unwrap();
     assert!(source.starts_with("the last fifth of each"), "{source}");
@@ -241,7 +163,7 @@ fn without_a_holdout_the_last_fifth_is_held_out() {
 
 #[test]
 fn simulate_keeps_names_units_and_rows() {
-    let bench = Bench::new();
+    let bench = bench();
     let input = bench.read("run1.csv");
     let truth = MODEL.replace("0.5", "0.8").replace("30.0", "25.0");
     bench.write("truth.toml", &truth);
@@ -259,7 +181,7 @@ fn simulate_keeps_names_units_and_rows() {
 
 #[test]
 fn rows_outside_the_pieces_stay_empty() {
-    let bench = Bench::new();
+    let bench = bench();
     let whole = recording(600, 0.0);
     // Rows 300 … 303 stand alone between two gaps.
     let keep = |i: usize| i < 201 || (301..305).contains(&i) || i > 400;
@@ -275,7 +197,7 @@ fn rows_outside_the_pieces_stay_empty() {
 
 #[test]
 fn results_do_not_depend_on_the_number_of_threads() {
-    let bench = Bench::new();
+    let bench = bench();
     let without_damping =
         MODEL.replace("b*x' + ", "").replace("b = { value = 0.5, unit = \"N s/m\" } # a guess\n", "");
     bench.write("model.toml", &without_damping);
@@ -308,7 +230,7 @@ fn with_both<'a>(model: &'a str, recording: &'a str) -> [Vec<&'a str>; 4] {
 
 #[test]
 fn a_bad_model_is_shown_with_its_line_and_mend() {
-    let bench = Bench::new();
+    let bench = bench();
     let cases: [(&str, &str, &[&str]); 5] = [
         (
             "k*x = f",
@@ -330,7 +252,7 @@ fn a_bad_model_is_shown_with_its_line_and_mend() {
 
 #[test]
 fn a_bad_recording_is_named_with_line_and_column() {
-    let bench = Bench::new();
+    let bench = bench();
     let good = recording(100, 0.0);
     let line4: Vec<&str> = good.lines().nth(3).unwrap().split(',').collect();
     let with_cell =
@@ -353,7 +275,7 @@ fn a_bad_recording_is_named_with_line_and_column() {
 
 #[test]
 fn paths_that_lead_to_the_wrong_thing() {
-    let bench = Bench::new();
+    let bench = bench();
     fs::create_dir(bench.path("folder")).unwrap();
     for arguments in with_both("model.toml", "nowhere.csv") {
         bench.refuses(&arguments, &["nowhere.csv", "no such file"]);
@@ -382,7 +304,7 @@ fn paths_that_lead_to_the_wrong_thing() {
 
 #[test]
 fn outputs_that_cannot_be_written() {
-    let bench = Bench::new();
+    let bench = bench();
     bench.write("file", "mine");
     for command in ["diagnose", "calibrate"] {
         bench.refuses(
@@ -415,7 +337,7 @@ fn outputs_that_cannot_be_written() {
 #[cfg(target_os = "linux")]
 #[test]
 fn a_place_that_nobody_may_write_to() {
-    let bench = Bench::new();
+    let bench = bench();
     bench.refuses(
         &["calibrate", "model.toml", "run1.csv", "--out", "/proc/greybox"],
         &["/proc/greybox", "cannot be written", "mend"],
@@ -424,7 +346,7 @@ fn a_place_that_nobody_may_write_to() {
 
 #[test]
 fn bad_usage() {
-    let bench = Bench::new();
+    let bench = bench();
     bench.refuses(
         &["diagnose", "model.toml", "run1.csv", "--out", "out", "--sead", "1"],
         &["--sead", "--seed"],
@@ -439,7 +361,7 @@ fn bad_usage() {
 
 #[test]
 fn nothing_free_to_calibrate_is_an_error_with_its_mend() {
-    let bench = Bench::new();
+    let bench = bench();
     let fixed = MODEL
         .replace("\"N s/m\" }", "\"N s/m\", fixed = true }")
         .replace("\"N/m\" }", "\"N/m\", fixed = true }");
@@ -452,7 +374,7 @@ fn nothing_free_to_calibrate_is_an_error_with_its_mend() {
 
 #[test]
 fn a_json_error_has_its_place_in_fields() {
-    let bench = Bench::new();
+    let bench = bench();
     bench.write("bad.toml", &MODEL.replace("k*x = f", "kk*x = f"));
     let outcome = bench.greybox(&["check", "run1.csv", "--model", "bad.toml", "--json"]);
     let json: Value = serde_json::from_str(&outcome.stdout).unwrap();
@@ -466,7 +388,7 @@ fn a_json_error_has_its_place_in_fields() {
 
 #[test]
 fn demo_tells_the_story_and_writes_what_it_shows() {
-    let bench = Bench::new();
+    let bench = bench();
     let outcome = bench.greybox(&["demo"]);
     assert_eq!(outcome.code, 0, "{}", outcome.stderr);
     assert!(outcome.stdout.contains("Coulomb friction is missing in the hub equation"), "{}", outcome.stdout);
@@ -511,7 +433,7 @@ fn demo_tells_the_story_and_writes_what_it_shows() {
 
 #[test]
 fn diagnose_of_a_complete_model_says_that_nothing_is_missing() {
-    let bench = Bench::new();
+    let bench = bench();
     let outcome =
         bench.greybox(&["diagnose", "model.toml", "run1.csv", "--holdout", "run2.csv", "--out", "out"]);
     assert_eq!(outcome.code, 0, "{}", outcome.stderr);

@@ -2,6 +2,8 @@
 
 use greybox_calibrate::qr;
 
+use crate::structure::Term;
+
 /// min ‖z − R θ‖² + rest, the reduced form of a regression with `samples` rows.
 #[derive(Debug, Clone)]
 pub(crate) struct Reduced {
@@ -66,7 +68,7 @@ impl Reduced {
         Solution { columns: columns.to_vec(), values, inverse, rss: self.rest + corner * corner }
     }
 
-    /// n ln(RSS/n + floor) + c k + [an even term is chosen] · c_e, with k chosen optional terms. The floor
+    /// n ln(RSS/n + floor) + c k + surcharges + [an even term is chosen] · c_e, with k chosen optional terms. The floor
     /// keeps a noise-free record from paying for terms that only mend rounding.
     fn criterion(&self, solution: &Solution, price: &Price<'_>) -> f64 {
         let n = self.samples;
@@ -74,6 +76,7 @@ impl Reduced {
         let broken = solution.columns.iter().any(|c| price.even.contains(c));
         n * (solution.rss / n + self.floor).max(1e-300).ln()
             + price.term * chosen as f64
+            + solution.columns.iter().filter_map(|c| price.surcharge.get(*c)).sum::<f64>()
             + if broken { BROKEN_SYMMETRY } else { 0.0 }
     }
 
@@ -100,10 +103,11 @@ impl Reduced {
     /// true terms stand a hundred standard errors clear of the noise, one at three is doubted; where they
     /// are barely visible, it is believed. The lower limit pays for looking at q candidates (risk
     /// inflation, Foster & George, Ann. Statist. 22, 1994), the upper is Schwarz's.
-    pub(crate) fn choose(&self, kept: &[usize], allowed: &[usize], even: &[usize]) -> Solution {
+    pub(crate) fn choose(&self, roles: &Roles) -> Solution {
+        let Roles { kept, optional: allowed, even, surcharge } = roles;
         let schwarz = self.samples.ln();
         let least = 2.0 * (allowed.len().max(2) as f64).ln();
-        let mut solution = self.search(allowed, &Price { kept, even, term: schwarz });
+        let mut solution = self.search(allowed, &Price { kept, even, surcharge, term: schwarz });
         let mut price = schwarz;
         for _ in 0..4 {
             let mut sizes: Vec<f64> = self
@@ -126,7 +130,7 @@ impl Reduced {
                 break;
             }
             price = middle;
-            solution = self.search(allowed, &Price { kept, even, term: price });
+            solution = self.search(allowed, &Price { kept, even, surcharge, term: price });
         }
         solution
     }
@@ -203,8 +207,47 @@ impl Reduced {
 /// (restoring forces and friction that differ between the two directions are the exception).
 const BROKEN_SYMMETRY: f64 = 4.6;
 
+/// What each degree beyond the third costs: −2 ln ½. Laws of motion seldom go beyond the cube, and among proxies
+/// that data barely tell apart (x³ and x³ẋ²) the simpler is the better guess.
+const HIGH_DEGREE: f64 = 1.39;
+
+/// The parts that the columns of a regression play.
+#[derive(Debug, Clone, Default)]
+pub(crate) struct Roles {
+    /// Always chosen.
+    pub kept: Vec<usize>,
+    /// To choose from.
+    pub optional: Vec<usize>,
+    /// Terms that keep their sign when all variables change theirs.
+    pub even: Vec<usize>,
+    /// What a column costs beyond the price of a term.
+    pub surcharge: Vec<f64>,
+}
+
+impl Roles {
+    /// The roles of columns that stand for candidates of `terms` (none: always kept), as far as `allowed`.
+    pub(crate) fn new(columns: &[Option<usize>], terms: &[Term], allowed: &[bool]) -> Roles {
+        let pick = |wanted: &dyn Fn(usize) -> bool| -> Vec<usize> {
+            (0..columns.len()).filter(|&c| columns[c].is_some_and(wanted)).collect()
+        };
+        let mut kept = pick(&|t| !terms[t].optional);
+        kept.extend((0..columns.len()).filter(|&c| columns[c].is_none()));
+        let degree = |t: usize| terms[t].powers.iter().map(|p| p.1).sum::<u32>();
+        Roles {
+            kept,
+            optional: pick(&|t| terms[t].optional && allowed[t]),
+            even: pick(&|t| terms[t].even),
+            surcharge: columns
+                .iter()
+                .map(|c| c.map_or(0.0, |t| HIGH_DEGREE * f64::from(degree(t).saturating_sub(3))))
+                .collect(),
+        }
+    }
+}
+
 struct Price<'a> {
     kept: &'a [usize],
     even: &'a [usize],
+    surcharge: &'a [f64],
     term: f64,
 }

@@ -7,6 +7,7 @@ use greybox_model::{Hold, Model};
 use greybox_recording::Recording;
 use greybox_sparse::{folds, select};
 
+use crate::choose::Roles;
 use crate::error::IdentifyError;
 use crate::library::{Library, Setting, derivative};
 use crate::output_error::{self, Refined, State};
@@ -514,14 +515,7 @@ fn estimate(
         let rows = weak::rows(structure, model, data, values, equation, window, trial)?;
         let gain = trial.and_then(|t| t.gain);
         let (reduced, terms) = weak::reduce(structure, &rows, gain);
-        let pick = |wanted: &dyn Fn(usize) -> bool| -> Vec<usize> {
-            (0..terms.len()).filter(|&c| terms[c].is_some_and(wanted)).collect()
-        };
-        let mut kept = pick(&|t| !structure.terms[t].optional);
-        kept.extend((0..terms.len()).filter(|&c| terms[c].is_none()));
-        let optional = pick(&|t| structure.terms[t].optional && allowed[t]);
-        let even = pick(&|t| structure.terms[t].even);
-        let solution = reduced.choose(&kept, &optional, &even);
+        let solution = reduced.choose(&Roles::new(&terms, &structure.terms, allowed));
         badness += reduced.samples * (solution.rss / reduced.samples).ln()
             + solution.columns.len() as f64 * reduced.samples.ln();
         for (&c, &v) in solution.columns.iter().zip(&solution.values) {

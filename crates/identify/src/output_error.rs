@@ -12,7 +12,7 @@ use std::sync::Arc;
 use greybox_calibrate::{Data, Fit, Free, Level, Limits, Point, Setup, qr};
 use rayon::prelude::*;
 
-use crate::choose::Reduced;
+use crate::choose::{Reduced, Roles};
 use crate::structure::Structure;
 
 /// Misfit, relative to a channel's spread, that counts as numerical: integration, rounding in the file.
@@ -91,23 +91,20 @@ pub(crate) struct Linearised {
     pub reduced: Reduced,
     /// Column of each candidate (none: it has no coefficient, or is not allowed).
     pub column: Vec<Option<usize>>,
-    /// Columns of the extras' parameters.
-    pub extras: Vec<usize>,
     /// Gram matrices of [J | z] over blocks of consecutive rows, `columns + 1` squared.
     pub blocks: Vec<Vec<f64>>,
 }
 
 impl Linearised {
-    /// Columns that always stay, that are optional, and that are even.
-    pub(crate) fn roles(&self, structure: &Structure, allowed: &[bool]) -> (Vec<usize>, Vec<usize>, Vec<usize>) {
-        let pick = |wanted: &dyn Fn(usize) -> bool| -> Vec<usize> {
-            (0..structure.terms.len()).filter(|&i| wanted(i)).filter_map(|i| self.column[i]).collect()
-        };
-        let mut kept = pick(&|i| !structure.terms[i].optional);
-        kept.extend(&self.extras);
-        let optional = pick(&|i| structure.terms[i].optional && allowed[i]);
-        let even = pick(&|i| structure.terms[i].even);
-        (kept, optional, even)
+    /// What the columns stand for.
+    pub(crate) fn roles(&self, structure: &Structure, allowed: &[bool]) -> Roles {
+        let mut columns = vec![None; self.reduced.columns];
+        for (term, column) in self.column.iter().enumerate() {
+            if let Some(c) = column {
+                columns[*c] = Some(term);
+            }
+        }
+        Roles::new(&columns, &structure.terms, allowed)
     }
 
     /// The regression on blocks drawn with replacement.
@@ -230,7 +227,6 @@ pub(crate) fn linearise(
         .enumerate()
         .map(|(i, t)| if allowed[i] || refined.state.active[i] { of(&t.parameter) } else { None })
         .collect();
-    let extras = structure.extras.iter().flat_map(|e| &e.parameters).filter_map(|p| of(&p.0)).collect();
     let count: usize = refined.fit.count.iter().sum();
     let data = &refined.setup.data;
     let floor = data
@@ -251,7 +247,7 @@ pub(crate) fn linearise(
     reduced.rest *= share;
     reduced.samples *= share;
     let blocks = if blocks > 0 { block_grams(&projected, np, share, blocks) } else { Vec::new() };
-    Some(Linearised { reduced, column, extras, blocks })
+    Some(Linearised { reduced, column, blocks })
 }
 
 /// 1 + 2 Σ ρ of the residual with all candidates, summed over lags while ρ is beyond chance.
@@ -393,8 +389,7 @@ fn fit_at(refined: &Refined, structure: &Structure, to: Level, limits: Limits) -
 /// One round: linearise, choose, refit. None where the choice stays as it is or the new fit fails.
 fn round(structure: &Structure, refined: &Refined, allowed: &[bool], seen: &[Vec<bool>]) -> Option<Refined> {
     let linear = linearise(structure, refined, allowed, 0)?;
-    let (kept, optional, even) = linear.roles(structure, allowed);
-    let solution = linear.reduced.choose(&kept, &optional, &even);
+    let solution = linear.reduced.choose(&linear.roles(structure, allowed));
     let mut state = refined.state.clone();
     for (i, term) in structure.terms.iter().enumerate() {
         if !term.optional {

@@ -20,7 +20,7 @@ pub(crate) struct Precision {
     pub extra_bound: Vec<Option<f64>>,
     /// Correlation of the first two parameters of the extras.
     pub extra_correlation: Option<f64>,
-    /// Share of bootstrap replicates that choose each candidate.
+    /// Share of bootstrap replicates that choose each candidate; empty without replicates.
     pub inclusion: Vec<f64>,
 }
 
@@ -194,12 +194,12 @@ fn sandwich(projected: &[(Vec<f64>, &[f64], usize)], inverse: &[f64], np: usize)
 
 /// Share of block-bootstrap replicates of the linearised problem that choose each candidate.
 fn inclusion(structure: &Structure, refined: &Refined, allowed: &[bool], options: &Options) -> Vec<f64> {
-    let none = vec![0.0; structure.terms.len()];
+    let none = Vec::new();
     if options.replicates == 0 {
         return none;
     }
     let Some(linear) = output_error::linearise(structure, refined, allowed, BLOCKS) else { return none };
-    let (kept, optional, even) = linear.roles(structure, allowed);
+    let roles = linear.roles(structure, allowed);
     let counts: Vec<Vec<usize>> = (0..options.replicates as u64)
         .into_par_iter()
         .map(|replicate| {
@@ -207,7 +207,7 @@ fn inclusion(structure: &Structure, refined: &Refined, allowed: &[bool], options
             let mut rng: Pcg64Mcg = rand::SeedableRng::seed_from_u64(stream);
             let blocks = linear.blocks.len();
             let drawn: Vec<usize> = (0..blocks).map(|_| rng.random_range(0..blocks)).collect();
-            linear.resampled(&drawn).choose(&kept, &optional, &even).columns
+            linear.resampled(&drawn).choose(&roles).columns
         })
         .collect();
     linear

@@ -480,37 +480,37 @@ fn finite(value: f64) -> Option<f64> {
     value.is_finite().then_some(value)
 }
 
-fn number_schema(_: &mut SchemaGenerator) -> Schema {
+pub(crate) fn number_schema(_: &mut SchemaGenerator) -> Schema {
     json_schema!({"type": ["number", "null"]})
 }
 
-fn number_map_schema(_: &mut SchemaGenerator) -> Schema {
+pub(crate) fn number_map_schema(_: &mut SchemaGenerator) -> Schema {
     json_schema!({"type": "object", "additionalProperties": {"type": ["number", "null"]}})
 }
 
 /// A number that may be not finite: `null` in JSON, NaN when read back.
-mod number {
+pub(crate) mod number {
     use serde::{Deserialize, Deserializer, Serialize, Serializer};
 
-    pub(super) fn serialize<S: Serializer>(value: &f64, serializer: S) -> Result<S::Ok, S::Error> {
+    pub(crate) fn serialize<S: Serializer>(value: &f64, serializer: S) -> Result<S::Ok, S::Error> {
         super::finite(*value).serialize(serializer)
     }
 
-    pub(super) fn deserialize<'de, D: Deserializer<'de>>(deserializer: D) -> Result<f64, D::Error> {
+    pub(crate) fn deserialize<'de, D: Deserializer<'de>>(deserializer: D) -> Result<f64, D::Error> {
         Ok(Option::<f64>::deserialize(deserializer)?.unwrap_or(f64::NAN))
     }
 }
 
 /// A map of numbers that may be not finite.
-mod number_map {
+pub(crate) mod number_map {
     use super::Ordered;
     use serde::{Deserialize, Deserializer, Serializer};
 
-    pub(super) fn serialize<S: Serializer>(map: &Ordered<f64>, serializer: S) -> Result<S::Ok, S::Error> {
+    pub(crate) fn serialize<S: Serializer>(map: &Ordered<f64>, serializer: S) -> Result<S::Ok, S::Error> {
         serializer.collect_map(map.iter().map(|(name, value)| (name, super::finite(*value))))
     }
 
-    pub(super) fn deserialize<'de, D: Deserializer<'de>>(deserializer: D) -> Result<Ordered<f64>, D::Error> {
+    pub(crate) fn deserialize<'de, D: Deserializer<'de>>(deserializer: D) -> Result<Ordered<f64>, D::Error> {
         let map = Ordered::<Option<f64>>::deserialize(deserializer)?;
         Ok(map.into_iter().map(|(name, value)| (name, value.unwrap_or(f64::NAN))).collect())
     }

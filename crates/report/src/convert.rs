@@ -1,7 +1,9 @@
 //! From a finished [`Diagnosis`] to the report's types: units, names and order change here, nothing is
-//! decided.
+//! decided. [`identification`] does the same for a finished identification.
 
-use greybox_calibrate::Data;
+pub mod identification;
+
+use greybox_calibrate::{Data, FreeRun};
 use greybox_diagnose::diagnosis::{Estimate as Estimated, Finding as Found, Role as RoleRuns, Run};
 use greybox_diagnose::locate::{Location as Located, spectrum};
 use greybox_diagnose::{Diagnosis, Verdict as Answer};
@@ -224,9 +226,16 @@ fn findings(d: &Diagnosis, sources: &Sources<'_>) -> Vec<Finding> {
             });
         }
     }
-    let inputs: Vec<&str> = d.nominal.inputs.iter().map(|i| i.channel.as_str()).collect();
-    let outputs: Vec<&str> = d.nominal.measurements.iter().map(|m| m.channel.as_str()).collect();
-    for recording in sources.train.iter().chain(sources.holdout) {
+    out.extend(health_findings(&d.nominal, sources.train.iter().chain(sources.holdout)));
+    out
+}
+
+/// What the health checks say about the channels that `model` uses.
+fn health_findings<'a>(model: &Model, recordings: impl Iterator<Item = &'a Recording>) -> Vec<Finding> {
+    let inputs: Vec<&str> = model.inputs.iter().map(|i| i.channel.as_str()).collect();
+    let outputs: Vec<&str> = model.measurements.iter().map(|m| m.channel.as_str()).collect();
+    let mut out = Vec::new();
+    for recording in recordings {
         for f in health::check(recording, &inputs, &outputs) {
             let used = f.channel.as_deref().is_none_or(|c| inputs.contains(&c) || outputs.contains(&c));
             if used {
@@ -277,9 +286,12 @@ pub fn page(diagnosis: &Diagnosis, report: Report, sources: &Sources<'_>) -> Pag
         } else {
             d.nominal.name.clone()
         },
-        recordings: recordings(&d.train, &d.nominal, page::Role::Train)
+        recordings: [(&d.train, page::Role::Train), (&d.holdout, page::Role::Holdout)]
             .into_iter()
-            .chain(recordings(&d.holdout, &d.nominal, page::Role::Holdout))
+            .flat_map(|(role, kind)| {
+                let runs = [&role.nominal, &role.calibrated, &role.improved].map(|run| Some(&run.run));
+                recordings(&role.data, &d.nominal, kind, runs)
+            })
             .collect(),
         residuals: residuals(d),
         mechanism_plots: plots(d),
@@ -316,15 +328,21 @@ fn times(data: &Data, recording: usize) -> Vec<f64> {
     out
 }
 
-fn output(data: &Data, run: &Run, recording: usize, c: usize, factor: f64) -> Vec<f64> {
+fn output(data: &Data, run: &FreeRun, recording: usize, c: usize, factor: f64) -> Vec<f64> {
     joined(data, recording, |i| {
         let n = data.pieces[i].len;
-        run.run.y[i][c * n..(c + 1) * n].iter().map(|v| v / factor).collect()
+        run.y[i][c * n..(c + 1) * n].iter().map(|v| v / factor).collect()
     })
 }
 
-fn recordings(role: &RoleRuns, model: &Model, kind: page::Role) -> Vec<page::Recording> {
-    let data = &role.data;
+/// The recordings of one role with the free runs of the nominal, the calibrated and the improved model; one
+/// that there is not leaves its series empty.
+fn recordings(
+    data: &Data,
+    model: &Model,
+    kind: page::Role,
+    runs: [Option<&FreeRun>; 3],
+) -> Vec<page::Recording> {
     (0..data.recordings.len())
         .map(|r| page::Recording {
             name: data.recordings[r].clone(),
@@ -335,15 +353,19 @@ fn recordings(role: &RoleRuns, model: &Model, kind: page::Role) -> Vec<page::Rec
                 .channels
                 .iter()
                 .enumerate()
-                .map(|(c, info)| page::Channel {
-                    name: info.name.clone(),
-                    unit: info.unit.clone(),
-                    measured: joined(data, r, |i| {
-                        data.pieces[i].measured[c].iter().map(|v| v / info.factor).collect()
-                    }),
-                    nominal: output(data, &role.nominal, r, c, info.factor),
-                    calibrated: output(data, &role.calibrated, r, c, info.factor),
-                    improved: output(data, &role.improved, r, c, info.factor),
+                .map(|(c, info)| {
+                    let [nominal, calibrated, improved] =
+                        runs.map(|run| run.map_or_else(Vec::new, |run| output(data, run, r, c, info.factor)));
+                    page::Channel {
+                        name: info.name.clone(),
+                        unit: info.unit.clone(),
+                        measured: joined(data, r, |i| {
+                            data.pieces[i].measured[c].iter().map(|v| v / info.factor).collect()
+                        }),
+                        nominal,
+                        calibrated,
+                        improved,
+                    }
                 })
                 .collect(),
             inputs: model
@@ -368,17 +390,9 @@ fn residuals(d: &Diagnosis) -> Vec<Residual> {
     let mut out = Vec::new();
     for r in 0..data.recordings.len() {
         for (c, info) in data.channels.iter().enumerate() {
-            let difference = |run: &Run| {
-                joined(data, r, |i| {
-                    let n = data.pieces[i].len;
-                    data.pieces[i].measured[c]
-                        .iter()
-                        .zip(&run.run.y[i][c * n..(c + 1) * n])
-                        .map(|(m, y)| (m - y) / info.factor)
-                        .collect()
-                })
-            };
-            let (before, after) = (difference(&d.train.calibrated), difference(&d.train.improved));
+            let (calibrated, improved) = (&d.train.calibrated.run, &d.train.improved.run);
+            let before = residual(data, calibrated, r, c, info.factor);
+            let after = residual(data, improved, r, c, info.factor);
             let windows = d
                 .mechanisms
                 .first()
@@ -400,7 +414,7 @@ fn residuals(d: &Diagnosis) -> Vec<Residual> {
                 noise_sigma: sigma,
                 windows,
                 spectrum: spectra(data, r, &before, &after, sigma),
-                map: state_map(d, r, c),
+                map: state_map(&d.nominal, data, [calibrated, improved], r, c),
                 before,
                 after,
             });
@@ -409,11 +423,21 @@ fn residuals(d: &Diagnosis) -> Vec<Residual> {
     out
 }
 
+/// Measurement minus simulation of channel `c` of one recording, in units of `factor`.
+fn residual(data: &Data, run: &FreeRun, recording: usize, c: usize, factor: f64) -> Vec<f64> {
+    joined(data, recording, |i| {
+        let n = data.pieces[i].len;
+        let simulated = &run.y[i][c * n..(c + 1) * n];
+        data.pieces[i].measured[c].iter().zip(simulated).map(|(m, y)| (m - y) / factor).collect()
+    })
+}
+
+/// Spectra of the residuals; an empty `before` stays empty.
 fn spectra(data: &Data, recording: usize, before: &[f64], after: &[f64], sigma: f64) -> Option<Spectrum> {
     let piece = data.pieces.iter().filter(|p| p.recording == recording).max_by_key(|p| p.len)?;
     let filled = |x: &[f64]| greybox_recording::interpolate::fill_missing(x);
-    let (freq, b) = spectrum(&filled(before), piece.dt);
-    let (_, a) = spectrum(&filled(after), piece.dt);
+    let (freq, a) = spectrum(&filled(after), piece.dt);
+    let b = if before.is_empty() { Vec::new() } else { spectrum(&filled(before), piece.dt).1 };
     if freq.len() < 8 {
         return None;
     }
@@ -421,13 +445,19 @@ fn spectra(data: &Data, recording: usize, before: &[f64], after: &[f64], sigma: 
     Some(Spectrum { noise: vec![level; freq.len()], freq, before: b, after: a })
 }
 
-/// Size of the calibrated model's residual over the state plane of the first coordinate.
-fn state_map(d: &Diagnosis, recording: usize, channel: usize) -> Option<StateMap> {
-    let state = d.nominal.states.first()?;
+/// Size of the residual of the first run over the state plane of the first coordinate, whose place at each
+/// time the second run says.
+fn state_map(
+    model: &Model,
+    data: &Data,
+    [judged, coordinates]: [&FreeRun; 2],
+    recording: usize,
+    channel: usize,
+) -> Option<StateMap> {
+    let state = model.states.first()?;
     if state.order < 2 {
         return None;
     }
-    let data = &d.train.data;
     let info = &data.channels[channel];
     let (mut x, mut y, mut value) = (Vec::new(), Vec::new(), Vec::new());
     for (i, piece) in data.pieces.iter().enumerate() {
@@ -437,9 +467,9 @@ fn state_map(d: &Diagnosis, recording: usize, channel: usize) -> Option<StateMap
         let n = piece.len;
         let keep = n.div_ceil(4000).max(1);
         for k in (0..n).step_by(keep) {
-            let e = piece.measured[channel][k] - d.train.calibrated.run.y[i][channel * n + k];
-            x.push(d.train.improved.run.x[i][k] / state.unit.factor);
-            y.push(d.train.improved.run.x[i][n + k] / state.unit.factor);
+            let e = piece.measured[channel][k] - judged.y[i][channel * n + k];
+            x.push(coordinates.x[i][k] / state.unit.factor);
+            y.push(coordinates.x[i][n + k] / state.unit.factor);
             value.push(e.abs() / info.factor);
         }
     }

@@ -87,11 +87,21 @@ pub fn with_interval(value: f64, ci95: Option<Interval>) -> String {
     }
 }
 
-/// An interval `[0.101, 0.160]`; `–` where there is none. An end that is not finite is ±∞.
+/// An interval `0.101 … 0.160`; `–` where there is none. The ends have three significant digits, and more where
+/// the width would not show.
+///
+/// ```
+/// use greybox_report::{contract::Interval, format::interval};
+/// assert_eq!(interval(Some(Interval::new(0.1012, 0.1601))), "0.101 … 0.160");
+/// assert_eq!(interval(Some(Interval::new(1.99451, 1.99989))), "1.9945 … 1.9999");
+/// ```
 pub fn interval(ci95: Option<Interval>) -> String {
     match ci95 {
         Some(ci) if ci.low.is_finite() && ci.high.is_finite() => {
-            format!("{} … {}", number(ci.low), number(ci.high))
+            let size = ci.low.abs().max(ci.high.abs());
+            let decades = size.log10().floor() - (ci.high - ci.low).abs().log10().floor();
+            let digits = if decades.is_finite() { (decades as i32 + 2).clamp(3, 8) as usize } else { 3 };
+            format!("{} … {}", significant(ci.low, digits), significant(ci.high, digits))
         }
         _ => UNKNOWN.to_owned(),
     }

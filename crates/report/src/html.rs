@@ -6,13 +6,16 @@
 //! by askama), through [`crate::expression::escape`], and as JSON in the data island, where `<`, `>` and `&`
 //! are written as `\u00XX` so that nothing in it can close the element.
 
+mod identified;
+
 use std::fmt::Write as _;
 
 use askama::Template;
 use serde::Serialize;
 
 use crate::contract::{
-    FitSet, Interval, Location, Mechanism, Names, Ordered, RecordingFit, Score, Severity, Verdict,
+    Finding, Fit, FitSet, InputHold, Interval, Location, Mechanism, ModelId, Names, Ordered, Producer,
+    RecordingFit, Score, Severity, Verdict,
 };
 use crate::decimate::{Buckets, MAX_POINTS, round_to_range};
 use crate::diff::{Edit, diff};
@@ -38,16 +41,34 @@ impl Page {
         let mut island = Island::default();
         let view = View::new(self, &mut island);
         let data = island.to_json()?;
-        let template = ReportTemplate {
-            view: &view,
-            uplot_css: UPLOT_CSS,
-            style: STYLE,
-            uplot_license: UPLOT_LICENSE,
-            uplot_js: UPLOT_JS,
-            script: SCRIPT,
-            data: &data,
-        };
-        Ok(template.render()?)
+        Ok(ReportTemplate { view: &view, common: &view.common, assets: Assets { data: &data } }.render()?)
+    }
+}
+
+/// What every page carries: style, script and the data of its plots.
+struct Assets<'a> {
+    data: &'a str,
+}
+
+impl Assets<'_> {
+    fn uplot_css(&self) -> &'static str {
+        UPLOT_CSS
+    }
+
+    fn style(&self) -> &'static str {
+        STYLE
+    }
+
+    fn uplot_license(&self) -> &'static str {
+        UPLOT_LICENSE
+    }
+
+    fn uplot_js(&self) -> &'static str {
+        UPLOT_JS
+    }
+
+    fn script(&self) -> &'static str {
+        SCRIPT
     }
 }
 
@@ -55,12 +76,8 @@ impl Page {
 #[template(path = "report.html")]
 struct ReportTemplate<'a> {
     view: &'a View,
-    uplot_css: &'a str,
-    style: &'a str,
-    uplot_license: &'a str,
-    uplot_js: &'a str,
-    script: &'a str,
-    data: &'a str,
+    common: &'a Common,
+    assets: Assets<'a>,
 }
 
 // ---------------------------------------------------------------------------------------------------------
@@ -145,34 +162,92 @@ fn series(label: &str, role: &'static str, buckets: &Buckets, values: &[f64]) ->
 // ---------------------------------------------------------------------------------------------------------
 // View: what the template prints. Fields named `…_html` hold HTML made here from escaped parts.
 
-struct View {
+/// What the pages of a diagnosis and of an identification share: heading, fit, signals, residual, data health.
+struct Common {
+    product: &'static str,
     title: String,
-    verdict: &'static str,
-    verdict_class: &'static str,
-    headline: String,
-    sentences: Vec<String>,
     meta: Vec<(&'static str, String)>,
-    equations: Vec<EquationView>,
-    shares: Vec<ShareView>,
+    fit_title: &'static str,
+    /// Whether there is a calibrated model to compare with.
+    compared: bool,
+    columns: Vec<&'static Shown>,
     fit: Vec<FitGroup>,
     fit_recordings: Vec<FitGroup>,
-    improved_known: bool,
     fit_columns: usize,
     window: Option<String>,
     holdout_source: String,
     recordings: Vec<RecordingView>,
+    residual_lead: &'static str,
+    map_note: &'static str,
     residuals: Vec<ResidualView>,
+    findings: Vec<FindingView>,
+    inputs: Vec<[String; 3]>,
+    thinned: bool,
+    version: String,
+    seed: u64,
+}
+
+/// A model as a page shows it.
+struct Shown {
+    /// Its key in the contract; also its colour.
+    key: &'static str,
+    /// Its name in legends.
+    name: &'static str,
+    /// Its name above a column.
+    head: &'static str,
+    /// What it is, below that.
+    note: &'static str,
+}
+
+/// The models of a diagnosis, in the order of the contract.
+const DIAGNOSIS: [Shown; 3] = [
+    Shown { key: "nominal", name: "nominal", head: "Nominal", note: "as given" },
+    Shown { key: "calibrated", name: "calibrated", head: "Calibrated", note: "refitted" },
+    Shown { key: "improved", name: "improved", head: "Improved", note: "with what was missing" },
+];
+
+impl Shown {
+    fn scores<'a>(&self, set: &'a FitSet) -> &'a Ordered<Score> {
+        match self.key {
+            "nominal" => &set.nominal,
+            "calibrated" => &set.calibrated,
+            _ => &set.improved,
+        }
+    }
+
+    fn line(&self, channel: &Channel, buckets: &Buckets) -> Option<SeriesData> {
+        let values = match self.key {
+            "nominal" => &channel.nominal,
+            "calibrated" => &channel.calibrated,
+            _ => &channel.improved,
+        };
+        series(self.name, self.key, buckets, values)
+    }
+}
+
+/// What tables and plots of the fit are made from.
+struct Scene<'a> {
+    models: &'static [Shown],
+    fit: &'a Fit,
+    noise_floor: &'a Ordered<f64>,
+    recordings: &'a [Recording],
+    residuals: &'a [Residual],
+}
+
+struct View {
+    common: Common,
+    verdict: &'static str,
+    verdict_class: &'static str,
+    headline: String,
+    sentences: Vec<String>,
+    equations: Vec<EquationView>,
+    shares: Vec<ShareView>,
     mechanisms: Vec<MechanismView>,
     remainder: RemainderView,
     parameters: Vec<ParameterView>,
     calibrated_known: bool,
     model: Option<ModelView>,
     nominal_text: String,
-    findings: Vec<FindingView>,
-    inputs: Vec<[String; 3]>,
-    thinned: bool,
-    version: String,
-    seed: u64,
 }
 
 struct EquationView {
@@ -311,36 +386,33 @@ impl View {
             Verdict::MissingPhysics => ("Physics is missing", "missing"),
             Verdict::Unexplained => ("Something is missing, unexplained", "unexplained"),
         };
-        let recordings: Vec<RecordingView> = page
-            .recordings
-            .iter()
-            .enumerate()
-            .map(|(index, recording)| recording_view(page, recording, index, island))
-            .collect();
-        let residuals = page.residuals.iter().map(|residual| residual_view(page, residual, island)).collect();
-        View {
+        let scene = Scene {
+            models: &DIAGNOSIS,
+            fit: &report.fit,
+            noise_floor: &report.noise_floor,
+            recordings: &page.recordings,
+            residuals: &page.residuals,
+        };
+        let common = Common {
+            product: "greybox diagnosis",
             title: page.title.clone(),
+            meta: meta(&report.model, &scene),
+            fit_title: "Before and after",
+            compared: scene.improved_known(),
+            residual_lead: "Measurement minus simulation on training data, before (calibrated) and after (improved).",
+            map_note: "before; RMS in each cell",
+            findings: findings(&report.findings),
+            inputs: inputs(&report.inputs),
+            ..scene.common(&report.greybox, island)
+        };
+        View {
+            common,
             verdict,
             verdict_class,
             headline,
             sentences,
-            meta: meta(page),
             equations: equations(page),
             shares: shares(page),
-            fit: [
-                fit_group("Held-out data", &report.fit.holdout, page, None),
-                fit_group("Training data", &report.fit.train, page, None),
-            ]
-            .into_iter()
-            .flatten()
-            .collect(),
-            fit_recordings: fit_by_recording(&report.fit.recordings, page),
-            improved_known: improved_known(page),
-            fit_columns: if improved_known(page) { 5 } else { 4 },
-            window: report.fit.window_s.map(format::plain),
-            holdout_source: report.fit.holdout_source.clone(),
-            recordings,
-            residuals,
             mechanisms: report
                 .mechanisms
                 .iter()
@@ -352,24 +424,66 @@ impl View {
             calibrated_known: report.parameters.values().any(|parameter| parameter.calibrated.is_some()),
             model: model_view(&page.models.nominal, &page.models.improved),
             nominal_text: page.models.nominal.clone(),
-            findings: findings(page),
-            inputs: report
-                .inputs
-                .iter()
-                .map(|(name, hold)| {
-                    [name.clone(), hold.hold_given.replace('_', " "), hold.hold_best.replace('_', " ")]
-                })
-                .collect(),
-            thinned: page.recordings.iter().any(|recording| recording.t.len() > MAX_POINTS),
-            version: report.greybox.version.clone(),
-            seed: report.greybox.seed,
         }
     }
 }
 
-fn meta(page: &Page) -> Vec<(&'static str, String)> {
+impl Scene<'_> {
+    /// Fit, signals and residuals; the caller says what differs from page to page.
+    fn common(&self, producer: &Producer, island: &mut Island) -> Common {
+        let recordings: Vec<RecordingView> = self
+            .recordings
+            .iter()
+            .enumerate()
+            .map(|(index, recording)| recording_view(self, recording, index, island))
+            .collect();
+        let residuals = self.residuals.iter().map(|residual| residual_view(self, residual, island)).collect();
+        let columns = self.columns();
+        let fit = [("Held-out data", &self.fit.holdout), ("Training data", &self.fit.train)];
+        Common {
+            product: "greybox",
+            title: String::new(),
+            meta: Vec::new(),
+            fit_title: "Fit",
+            compared: false,
+            fit_columns: columns.len() + 2,
+            columns,
+            fit: fit.into_iter().filter_map(|(title, set)| fit_group(title, set, self, None)).collect(),
+            fit_recordings: fit_by_recording(&self.fit.recordings, self),
+            window: self.fit.window_s.map(format::plain),
+            holdout_source: self.fit.holdout_source.clone(),
+            recordings,
+            residual_lead: "",
+            map_note: "RMS in each cell",
+            residuals,
+            findings: Vec::new(),
+            inputs: Vec::new(),
+            thinned: self.recordings.iter().any(|recording| recording.t.len() > MAX_POINTS),
+            version: producer.version.clone(),
+            seed: producer.seed,
+        }
+    }
+
+    /// Whether there is an improved model at all; without one its column is left out.
+    fn improved_known(&self) -> bool {
+        !self.fit.train.improved.is_empty() || !self.fit.holdout.improved.is_empty()
+    }
+
+    fn columns(&self) -> Vec<&'static Shown> {
+        self.models.iter().filter(|model| model.key != "improved" || self.improved_known()).collect()
+    }
+}
+
+fn inputs(holds: &Ordered<InputHold>) -> Vec<[String; 3]> {
+    let stated = |hold: &str| if hold.is_empty() { "not stated".to_owned() } else { hold.replace('_', " ") };
+    holds
+        .iter()
+        .map(|(name, hold)| [name.clone(), stated(&hold.hold_given), stated(&hold.hold_best)])
+        .collect()
+}
+
+fn meta(model: &ModelId, scene: &Scene<'_>) -> Vec<(&'static str, String)> {
     let mut out = Vec::new();
-    let model = &page.report.model;
     match (model.name.is_empty(), model.file.is_empty()) {
         (false, false) => out.push(("Model", format!("{} ({})", model.name, model.file))),
         (false, true) => out.push(("Model", model.name.clone())),
@@ -378,11 +492,11 @@ fn meta(page: &Page) -> Vec<(&'static str, String)> {
     }
     for (role, title) in [(Role::Train, "Trained on"), (Role::Holdout, "Held out")] {
         let names: Vec<&str> =
-            page.recordings.iter().filter(|r| r.role == role).map(|r| r.name.as_str()).collect();
+            scene.recordings.iter().filter(|r| r.role == role).map(|r| r.name.as_str()).collect();
         if !names.is_empty() {
             out.push((title, names.join(", ")));
-        } else if role == Role::Holdout && !page.report.fit.holdout_source.is_empty() {
-            out.push((title, page.report.fit.holdout_source.clone()));
+        } else if role == Role::Holdout && !scene.fit.holdout_source.is_empty() {
+            out.push((title, scene.fit.holdout_source.clone()));
         }
     }
     out
@@ -506,41 +620,32 @@ fn shares(page: &Page) -> Vec<ShareView> {
 
 // -- fit --------------------------------------------------------------------------------------------------
 
-fn unit_of<'a>(page: &'a Page, channel: &str) -> &'a str {
-    let mut channels = page.recordings.iter().flat_map(|recording| &recording.channels);
+fn unit_of<'a>(scene: &Scene<'a>, channel: &str) -> &'a str {
+    let mut channels = scene.recordings.iter().flat_map(|recording| &recording.channels);
     channels.find(|known| known.name == channel).map_or("", |known| known.unit.as_str())
 }
 
-/// Whether there is an improved model at all; without one its column is left out.
-fn improved_known(page: &Page) -> bool {
-    let fit = &page.report.fit;
-    !fit.train.improved.is_empty() || !fit.holdout.improved.is_empty()
-}
-
-fn fit_group(title: &str, set: &FitSet, page: &Page, suffix: Option<&str>) -> Option<FitGroup> {
+fn fit_group(title: &str, set: &FitSet, scene: &Scene<'_>, suffix: Option<&str>) -> Option<FitGroup> {
     if set.is_empty() {
         return None;
     }
-    let rows = set.channels().into_iter().map(|channel| fit_row(channel, set, page)).collect();
+    let rows = set.channels().into_iter().map(|channel| fit_row(channel, set, scene)).collect();
     let title = suffix.map_or_else(|| title.to_owned(), |suffix| format!("{title}, {suffix}"));
     Some(FitGroup { title, rows })
 }
 
-fn fit_row(channel: &str, set: &FitSet, page: &Page) -> FitRow {
-    let unit = unit_of(page, channel);
-    let mut models =
-        vec![("nominal", &set.nominal), ("calibrated", &set.calibrated), ("improved", &set.improved)];
-    if !improved_known(page) {
-        models.pop();
-    }
+fn fit_row(channel: &str, set: &FitSet, scene: &Scene<'_>) -> FitRow {
+    let unit = unit_of(scene, channel);
+    let models = scene.columns();
     let largest = models
         .iter()
-        .filter_map(|(_, scores)| scores.get(channel))
+        .filter_map(|model| model.scores(set).get(channel))
         .map(|score| score.nrmse)
         .filter(|nrmse| nrmse.is_finite())
         .fold(0.0, f64::max);
-    let cells = models.into_iter().map(|(model, scores)| fit_cell(model, scores.get(channel), unit, largest));
-    let floor = page.report.noise_floor.get(channel).copied().unwrap_or(f64::NAN);
+    let cells =
+        models.into_iter().map(|model| fit_cell(model.key, model.scores(set).get(channel), unit, largest));
+    let floor = scene.noise_floor.get(channel).copied().unwrap_or(f64::NAN);
     FitRow { channel: expression::text(channel), cells: cells.collect(), floor: format::percent(floor) }
 }
 
@@ -560,11 +665,11 @@ fn fit_cell(model: &'static str, score: Option<&Score>, unit: &str, largest: f64
     }
 }
 
-fn fit_by_recording(recordings: &Ordered<RecordingFit>, page: &Page) -> Vec<FitGroup> {
+fn fit_by_recording(recordings: &Ordered<RecordingFit>, scene: &Scene<'_>) -> Vec<FitGroup> {
     let mut out = Vec::new();
     for (file, fit) in recordings {
         for (set, suffix) in [(&fit.holdout, "held out"), (&fit.train, "training")] {
-            out.extend(set.as_ref().and_then(|set| fit_group(file, set, page, Some(suffix))));
+            out.extend(set.as_ref().and_then(|set| fit_group(file, set, scene, Some(suffix))));
         }
     }
     out
@@ -572,25 +677,30 @@ fn fit_by_recording(recordings: &Ordered<RecordingFit>, page: &Page) -> Vec<FitG
 
 // -- signals ----------------------------------------------------------------------------------------------
 
-fn recording_view(page: &Page, recording: &Recording, index: usize, island: &mut Island) -> RecordingView {
+fn recording_view(
+    scene: &Scene<'_>,
+    recording: &Recording,
+    index: usize,
+    island: &mut Island,
+) -> RecordingView {
     let buckets = Buckets::even(recording.t.len(), MAX_POINTS);
     let axis = island.axis(buckets.axis(&recording.t));
     let sync = format!("recording {index}");
     let mut plots = Vec::new();
     for channel in &recording.channels {
-        let lines: Vec<SeriesData> = [
-            series("nominal", "nominal", &buckets, &channel.nominal),
-            series("calibrated", "calibrated", &buckets, &channel.calibrated),
-            series("measured", "measured", &buckets, &channel.measured),
-            series("improved", "improved", &buckets, &channel.improved),
-        ]
-        .into_iter()
-        .flatten()
-        .collect();
+        // The last model is drawn over the measurement, the others under it.
+        let (last, others) = scene.models.split_last().map_or((None, scene.models), |(l, o)| (Some(l), o));
+        let lines: Vec<SeriesData> = others
+            .iter()
+            .map(|model| model.line(channel, &buckets))
+            .chain([series("measured", "measured", &buckets, &channel.measured)])
+            .chain(last.map(|model| model.line(channel, &buckets)))
+            .flatten()
+            .collect();
         if lines.is_empty() {
             continue;
         }
-        let note = scores_note(page, &recording.name, recording.role, &channel.name);
+        let note = scores_note(scene, &recording.name, recording.role, &channel.name);
         let alt = time_alt(recording, channel, &lines, &note);
         let plot = PlotData {
             kind: "time",
@@ -674,21 +784,21 @@ fn extent(values: &[f64], unit: &str) -> String {
 }
 
 /// `error: nominal 31 %, calibrated 22 %, improved 2.0 %` for this channel of this recording.
-fn scores_note(page: &Page, file: &str, role: Role, channel: &str) -> String {
-    let fit = &page.report.fit;
-    let Some(entry) = fit.recordings.get(file) else { return String::new() };
+fn scores_note(scene: &Scene<'_>, file: &str, role: Role, channel: &str) -> String {
+    let Some(entry) = scene.fit.recordings.get(file) else { return String::new() };
     let set = match role {
         Role::Train => entry.train.as_ref(),
         Role::Holdout => entry.holdout.as_ref(),
     };
     let Some(set) = set else { return String::new() };
-    let parts: Vec<String> =
-        [("nominal", &set.nominal), ("calibrated", &set.calibrated), ("improved", &set.improved)]
-            .into_iter()
-            .filter_map(|(name, scores)| {
-                Some(format!("{name} {}", format::percent_short(scores.get(channel)?.nrmse)))
-            })
-            .collect();
+    let parts: Vec<String> = scene
+        .models
+        .iter()
+        .filter_map(|model| {
+            let score = model.scores(set).get(channel)?;
+            Some(format!("{} {}", model.name, format::percent_short(score.nrmse)))
+        })
+        .collect();
     if parts.is_empty() { String::new() } else { format::tie(&format!("error: {}", parts.join(", "))) }
 }
 
@@ -710,9 +820,9 @@ fn time_alt(recording: &Recording, channel: &Channel, lines: &[SeriesData], note
 
 // -- residual ---------------------------------------------------------------------------------------------
 
-fn residual_view(page: &Page, residual: &Residual, island: &mut Island) -> ResidualView {
+fn residual_view(scene: &Scene<'_>, residual: &Residual, island: &mut Island) -> ResidualView {
     let buckets = Buckets::even(residual.t.len(), MAX_POINTS);
-    let recording = page.recordings.iter().position(|known| known.name == residual.recording);
+    let recording = scene.recordings.iter().position(|known| known.name == residual.recording);
     let sync = match recording {
         Some(index) => format!("recording {index}"),
         None => format!("residual {}", island.plots.len()),
@@ -733,17 +843,18 @@ fn residual_view(page: &Page, residual: &Residual, island: &mut Island) -> Resid
         let size = format::with_unit(&format::number(2.0 * sigma), &residual.unit);
         note_parts.push(format!("grey band: ±2σ of the noise, {size}"));
     }
+    let after = scene.models.last().map_or("improved", |model| model.name);
     let time_lines = [
         series("calibrated", "calibrated", &buckets, &residual.before),
-        series("improved", "improved", &buckets, &residual.after),
+        series(after, "improved", &buckets, &residual.after),
     ];
     let rms_text = |values: &[f64]| format::with_unit(&format::number(rms(values)), &residual.unit);
-    let alt = format!(
-        "Residual of {shown} on {} over time: RMS {} with the calibrated model, {} with the improved one",
-        residual.recording,
-        rms_text(&residual.before),
-        rms_text(&residual.after),
-    );
+    let sizes: Vec<String> = [("calibrated", &residual.before), (after, &residual.after)]
+        .into_iter()
+        .filter(|(_, values)| !values.is_empty())
+        .map(|(name, values)| format!("RMS {} with the {name} model", rms_text(values)))
+        .collect();
+    let alt = format!("Residual of {shown} on {} over time: {}", residual.recording, sizes.join(", "));
     let time = PlotView {
         index: island_time(island, &residual.t, &buckets, sync, time_lines, bands, sigma),
         title_html: "Over time".to_owned(),
@@ -769,7 +880,7 @@ fn residual_view(page: &Page, residual: &Residual, island: &mut Island) -> Resid
         let lines: Vec<SeriesData> = [
             log_series("noise", "noise", &buckets, &positive(&spectrum.noise)),
             log_series("calibrated", "calibrated", &buckets, &positive(&spectrum.before)),
-            log_series("improved", "improved", &buckets, &positive(&spectrum.after)),
+            log_series(after, "improved", &buckets, &positive(&spectrum.after)),
         ]
         .into_iter()
         .flatten()
@@ -795,7 +906,7 @@ fn residual_view(page: &Page, residual: &Residual, island: &mut Island) -> Resid
             index: island.push(plot),
             title_html: format!("Over frequency <small>in {}/√Hz</small>", escape(&unit)),
             note: String::new(),
-            alt: format!("Amplitude spectrum of the residual of {shown} with both models and of the noise"),
+            alt: format!("Amplitude spectrum of the residual of {shown} and of the noise"),
         })
     });
     ResidualView {
@@ -1089,8 +1200,8 @@ fn marked_tokens(old: &str, new: &str) -> String {
     out
 }
 
-fn findings(page: &Page) -> Vec<FindingView> {
-    let mut sorted: Vec<_> = page.report.findings.iter().collect();
+fn findings(found: &[Finding]) -> Vec<FindingView> {
+    let mut sorted: Vec<&Finding> = found.iter().collect();
     sorted.sort_by_key(|finding| std::cmp::Reverse(finding.severity));
     let view = sorted.into_iter().map(|finding| {
         let (severity, class) = match finding.severity {

@@ -1,10 +1,11 @@
-//! Reports of a diagnosis: JSON by contract and a self-contained HTML page.
+//! Reports of a diagnosis or an identification: JSON by contract and a self-contained HTML page.
 //!
-//! This crate turns a finished diagnosis into files and **decides nothing**: every number and every word of
+//! This crate turns a finished diagnosis (or identification) into files and **decides nothing**: every number and every word of
 //! the verdict comes in as plain data. [`Report`] is `report.json`; [`Page`] adds the signals and curves
 //! that only the page shows.
 //!
 //! - [`contract`]: the types of `report.json` and its JSON schema
+//! - [`identified`]: the same for an identification: [`IdentifyReport`]
 //! - [`page`]: what the page shows beside it; [`Page::to_html`] writes the file
 //! - [`sentence`]: the conclusion in plain language, to fill [`Report::summary`]
 //! - [`mod@format`], [`expression`], [`decimate`], [`diff`], [`svg`]: the pure functions underneath
@@ -34,12 +35,14 @@ pub mod diff;
 pub mod expression;
 pub mod format;
 mod html;
+pub mod identified;
 pub mod page;
 pub mod sentence;
 pub mod svg;
 
 pub use contract::Report;
-pub use page::Page;
+pub use identified::IdentifyReport;
+pub use page::{IdentifyPage, Page};
 
 /// Why a report could not be written or read.
 #[derive(Debug, thiserror::Error)]

@@ -5,6 +5,7 @@
 //! shorter one is drawn as far as it goes. NaN draws a gap.
 
 use crate::contract::{Interval, Report};
+use crate::identified::IdentifyReport;
 
 /// Everything one page shows.
 #[derive(Debug, Clone, PartialEq)]
@@ -21,6 +22,22 @@ pub struct Page {
     pub mechanism_plots: Vec<MechanismPlot>,
     /// The model before and after.
     pub models: ModelTexts,
+}
+
+/// Everything the page of an identification shows. Its recordings and residuals have the identified model in
+/// the place of the improved one; the nominal and the calibrated series are empty.
+#[derive(Debug, Clone, PartialEq)]
+pub struct IdentifyPage {
+    /// Heading of the page and title of the window.
+    pub title: String,
+    /// The contract: equations, order, delay, fit, findings.
+    pub report: IdentifyReport,
+    /// The recordings with what the model says about them.
+    pub recordings: Vec<Recording>,
+    /// The residual on training data, by channel.
+    pub residuals: Vec<Residual>,
+    /// The model that was written.
+    pub model_text: String,
 }
 
 /// Whether a recording was used for fitting.

@@ -1,7 +1,5 @@
 //! `greybox calibrate`: the same equations with refitted parameters.
 
-use std::path::PathBuf;
-
 use clap::Args;
 use greybox_calibrate::{Data, Score};
 use greybox_diagnose::Calibration;
@@ -12,10 +10,10 @@ use greybox_report::contract::{self, FitSet, Interval, ModelId, Ordered, Paramet
 use serde::Serialize;
 
 use crate::answer::Answer;
+use crate::arguments::{ModelStudy, Recordings};
 use crate::commands::check::check_for_model;
 use crate::failure::Failure;
-use crate::loading::{self, LoadedModel};
-use crate::output::OutputFolder;
+use crate::loading::LoadedModel;
 use crate::progress::Progress;
 use crate::story;
 
@@ -27,21 +25,8 @@ use crate::story;
 DIR receives model.toml (the model with the new values, comments kept) and report.json. Parameters with
 `fixed = true` stay; `std` is a prior. With no --holdout, the last fifth of each recording is held out.")]
 pub(crate) struct Arguments {
-    /// Model (TOML)
-    #[arg(value_name = "MODEL.toml")]
-    model: PathBuf,
-
-    /// Recordings to fit (CSV)
-    #[arg(value_name = "TRAIN.csv", required = true)]
-    train: Vec<PathBuf>,
-
-    /// Recordings that only judge the result
-    #[arg(long, value_name = "TEST.csv", num_args = 1..)]
-    holdout: Vec<PathBuf>,
-
-    /// Folder for the results; made where it is missing
-    #[arg(long, value_name = "DIR")]
-    out: PathBuf,
+    #[command(flatten)]
+    inputs: ModelStudy,
 }
 
 /// `report.json` of a calibration: the keys are those of a diagnosis, without its verdict.
@@ -56,26 +41,22 @@ struct Report {
 }
 
 pub(crate) fn run(arguments: &Arguments) -> Result<Answer, Failure> {
-    let loaded = loading::model(&arguments.model)?;
-    let (train, holdout) = loading::train_and_holdout(&arguments.train, &arguments.holdout)?;
+    let (loaded, recordings) = arguments.inputs.read()?;
     let model = &loaded.model;
-    Data::new(model, &train)?;
-    Data::new(model, &holdout)?;
     if model.parameters.iter().all(|p| p.fixed) {
         return Err(Failure::file(
-            &arguments.model,
+            &arguments.inputs.model,
             "every parameter is fixed, so there is nothing to calibrate",
         )
         .mend("take `fixed = true` from the parameters that may move"));
     }
-    let out = OutputFolder::prepare(&arguments.out)?;
-    let inputs = arguments.train.iter().chain(&arguments.holdout).chain([&arguments.model]);
-    out.spares(&["model.toml", "report.json"], inputs)?;
+    let out = arguments.inputs.folder(&["model.toml", "report.json"])?;
 
     let progress = Progress::open();
-    let calibration = greybox_diagnose::calibrate(model, &train, &holdout, &progress)?;
+    let Recordings { train, holdout } = &recordings;
+    let calibration = greybox_diagnose::calibrate(model, train, holdout, &progress)?;
     drop(progress);
-    let findings = findings(model, train.iter().chain(&holdout));
+    let findings = findings(model, train.iter().chain(holdout));
     let report = report(&loaded, &calibration, findings);
     let options = WriteOptions { original: Some(&loaded.text), ..Default::default() };
     let toml = calibration.model.to_toml(&options);
@@ -170,6 +151,6 @@ fn in_words(arguments: &Arguments, report: &Report) -> String {
         story::parameter_table(&report.parameters),
         story::fit_table(&report.fit, &report.noise_floor),
         story::notes(&report.findings),
-        out = arguments.out.display()
+        out = arguments.inputs.study.out.display()
     )
 }

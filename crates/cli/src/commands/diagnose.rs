@@ -1,16 +1,16 @@
 //! `greybox diagnose`: what physics does the model leave out?
 
-use std::path::{Path, PathBuf};
+use std::path::Path;
 
 use clap::Args;
-use greybox_calibrate::Data;
 use greybox_diagnose::Options;
 use greybox_recording::Recording;
 use greybox_report::convert::{self, Sources};
 
 use crate::answer::Answer;
+use crate::arguments::ModelStudy;
 use crate::failure::Failure;
-use crate::loading::{self, LoadedModel};
+use crate::loading::LoadedModel;
 use crate::output::OutputFolder;
 use crate::progress::Progress;
 use crate::story;
@@ -23,21 +23,8 @@ use crate::story;
 DIR receives report.json, report.html (self-contained, with plots) and improved.toml. With no --holdout, the
 last fifth of each recording is held out. The same seed and inputs give the same results.")]
 pub(crate) struct Arguments {
-    /// Nominal model (TOML)
-    #[arg(value_name = "MODEL.toml")]
-    model: PathBuf,
-
-    /// Recordings to choose and fit with (CSV)
-    #[arg(value_name = "TRAIN.csv", required = true)]
-    train: Vec<PathBuf>,
-
-    /// Recordings that only judge the result
-    #[arg(long, value_name = "TEST.csv", num_args = 1..)]
-    holdout: Vec<PathBuf>,
-
-    /// Folder for the results; made where it is missing
-    #[arg(long, value_name = "DIR")]
-    out: PathBuf,
+    #[command(flatten)]
+    inputs: ModelStudy,
 
     /// Seed of every random choice
     #[arg(long, value_name = "N", default_value_t = 0)]
@@ -45,16 +32,11 @@ pub(crate) struct Arguments {
 }
 
 pub(crate) fn run(arguments: &Arguments) -> Result<Answer, Failure> {
-    let loaded = loading::model(&arguments.model)?;
-    let (train, holdout) = loading::train_and_holdout(&arguments.train, &arguments.holdout)?;
-    Data::new(&loaded.model, &train)?;
-    Data::new(&loaded.model, &holdout)?;
-    let out = OutputFolder::prepare(&arguments.out)?;
-    let inputs = arguments.train.iter().chain(&arguments.holdout).chain([&arguments.model]);
-    out.spares(&["report.json", "report.html", "improved.toml"], inputs)?;
-    let results = diagnose(&loaded, &train, &holdout, arguments.seed)?;
+    let (loaded, recordings) = arguments.inputs.read()?;
+    let out = arguments.inputs.folder(&["report.json", "report.html", "improved.toml"])?;
+    let results = diagnose(&loaded, &recordings.train, &recordings.holdout, arguments.seed)?;
     results.write(&out)?;
-    let text = format!("{}\n{}", results.story, written(&arguments.out));
+    let text = format!("{}\n{}", results.story, written(&arguments.inputs.study.out));
     Ok(Answer::new(text, results.json))
 }
 

@@ -1,0 +1,210 @@
+//! `greybox identify`: the governing equations, from recordings alone.
+
+use clap::{Args, ValueEnum};
+use greybox_identify::{DelayedState, Identification, Library, Monomials, Options};
+use greybox_model::Hold;
+use greybox_report::ReportError;
+use greybox_report::convert::identification::{self as convert, MODEL_FILE, Sources};
+
+use crate::answer::Answer;
+use crate::arguments::{Recordings, Study};
+use crate::failure::Failure;
+use crate::progress::Progress;
+use crate::story;
+
+/// Find the governing equations from recordings alone: which terms, their values, and how sure each is
+#[derive(Debug, Args)]
+#[command(after_help = "Examples:
+  greybox identify run1.csv --states x --inputs f --holdout run2.csv --out found
+  greybox identify run1.csv run2.csv --states theta,alpha --inputs v --library separate,friction --out found
+  greybox identify run1.csv --states x --inputs f --delay x --longest 0.5 --out found
+
+DIR receives model.toml (runs in `greybox simulate` and `greybox diagnose`), report.json and report.html
+(self-contained, with plots). With no --holdout, the last fifth of each recording is held out. The same seed and
+inputs give the same results.")]
+pub(crate) struct Arguments {
+    #[command(flatten)]
+    study: Study,
+
+    /// Channels that are the coordinates of the machine, one equation each
+    #[arg(long, value_name = "X,…", value_delimiter = ',', num_args = 1, required = true)]
+    states: Vec<String>,
+
+    /// Channels that drive it; the first one sets the scale of the equations
+    #[arg(long, value_name = "F,…", value_delimiter = ',', num_args = 1)]
+    inputs: Vec<String>,
+
+    /// Highest order of the library to try [default: 6 for one state, 4 for several]
+    #[arg(long, value_name = "N")]
+    order: Option<usize>,
+
+    /// What the equations may contain: one kind of monomials and any of the other parts
+    /// [default: tensor for one state, separate for several]
+    #[arg(long, value_name = "PART,…", value_delimiter = ',', num_args = 1)]
+    library: Vec<Part>,
+
+    /// A candidate term of your own in the model language, such as "x'*abs(x')"; may be repeated
+    #[arg(long = "term", value_name = "EXPR")]
+    terms: Vec<String>,
+
+    /// Order of the leading derivative: 2 for mechanics, 1 for first-order systems
+    #[arg(long, value_name = "1|2", default_value_t = 2)]
+    derivatives: usize,
+
+    /// What the inputs do between samples [default: found from the recordings]
+    #[arg(long, value_name = "HOLD")]
+    hold: Option<Between>,
+
+    /// State that is also fed back with an unknown delay
+    #[arg(long, value_name = "STATE")]
+    delay: Option<String>,
+
+    /// Gain of the delayed feedback, where it is known
+    #[arg(long, value_name = "KP", requires = "delay", allow_negative_numbers = true)]
+    gain: Option<f64>,
+
+    /// Longest delay to look for, s
+    #[arg(
+        long,
+        value_name = "SECONDS",
+        requires = "delay",
+        default_value_t = 1.0,
+        allow_negative_numbers = true
+    )]
+    longest: f64,
+
+    /// Resampled data sets behind the inclusion probabilities
+    #[arg(long, value_name = "N", default_value_t = 100, value_parser = clap::value_parser!(u16).range(1..))]
+    replicates: u16,
+
+    /// Seed of every random choice
+    #[arg(long, value_name = "N", default_value_t = 0)]
+    seed: u64,
+}
+
+/// A part of the library.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, ValueEnum)]
+enum Part {
+    /// All products of powers, each exponent up to the order
+    Tensor,
+    /// All products of powers of total degree up to the order
+    Total,
+    /// Powers of single variables, no products
+    Separate,
+    /// A constant force
+    Constant,
+    /// Coulomb friction: the sign of every velocity
+    Friction,
+    /// Sine and cosine of every state
+    Trigonometric,
+}
+
+impl Part {
+    fn monomials(self) -> Option<Monomials> {
+        match self {
+            Part::Tensor => Some(Monomials::Tensor),
+            Part::Total => Some(Monomials::TotalDegree),
+            Part::Separate => Some(Monomials::Separate),
+            Part::Constant | Part::Friction | Part::Trigonometric => None,
+        }
+    }
+}
+
+/// What an input does between its samples.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, ValueEnum)]
+#[value(rename_all = "snake_case")]
+enum Between {
+    /// The sample's value until the next one
+    Zero,
+    /// A straight line
+    Linear,
+    /// The band-limited signal through the samples
+    BandLimited,
+}
+
+impl From<Between> for Hold {
+    fn from(between: Between) -> Hold {
+        match between {
+            Between::Zero => Hold::Zero,
+            Between::Linear => Hold::Linear,
+            Between::BandLimited => Hold::BandLimited,
+        }
+    }
+}
+
+pub(crate) fn run(arguments: &Arguments) -> Result<Answer, Failure> {
+    let options = options(arguments)?;
+    let recordings = arguments.study.recordings()?;
+    let out = arguments.study.folder(&["report.json", "report.html", MODEL_FILE], [])?;
+
+    let progress = Progress::open();
+    let Recordings { train, holdout } = &recordings;
+    let found = greybox_identify::identify(train, holdout, &options, &progress)?;
+    progress.stage("writing the report");
+    let sources = Sources { train, holdout, hold: options.hold };
+    let (files, answer) = results(&found, &sources, &arguments.study)?;
+    drop(progress);
+    let files: Vec<(&str, &[u8])> = files.iter().map(|(name, text)| (*name, text.as_bytes())).collect();
+    out.write(&files)?;
+    Ok(answer)
+}
+
+/// The files of an identification (name, content), and what the command says.
+fn results(
+    found: &Identification,
+    sources: &Sources<'_>,
+    study: &Study,
+) -> Result<([(&'static str, String); 3], Answer), Failure> {
+    let unwritten = |e: ReportError| Failure::internal(e.to_string());
+    let report = convert::report(found, sources);
+    let json_text = report.to_json().map_err(unwritten)?;
+    let json = serde_json::from_str(&json_text).map_err(|e| unwritten(e.into()))?;
+    let text = format!(
+        "{}\nWritten: {out}/report.html, {out}/report.json, {out}/{MODEL_FILE}\n",
+        story::identification(&report),
+        out = study.out.display()
+    );
+    let html = convert::page(found, report).to_html().map_err(unwritten)?;
+    let files = [("report.json", json_text), ("report.html", html), (MODEL_FILE, convert::model_toml(found))];
+    Ok((files, Answer::new(text, json)))
+}
+
+/// The request in the words of the library.
+fn options(arguments: &Arguments) -> Result<Options, Failure> {
+    fn borrowed(names: &[String]) -> Vec<&str> {
+        names.iter().map(|name| name.trim()).filter(|name| !name.is_empty()).collect()
+    }
+    let usual = Options::new(&borrowed(&arguments.states), &borrowed(&arguments.inputs));
+    let delay = arguments.delay.as_ref().map(|state| DelayedState {
+        state: state.clone(),
+        gain: arguments.gain,
+        longest: arguments.longest,
+    });
+    Ok(Options {
+        derivatives: arguments.derivatives,
+        library: library(arguments, usual.library.monomials)?,
+        order: arguments.order.unwrap_or(usual.order),
+        hold: arguments.hold.map(Hold::from),
+        delay,
+        replicates: usize::from(arguments.replicates),
+        seed: arguments.seed,
+        ..usual
+    })
+}
+
+fn library(arguments: &Arguments, usual: Monomials) -> Result<Library, Failure> {
+    let parts = &arguments.library;
+    let mut kinds = parts.iter().filter_map(|part| part.monomials());
+    let monomials = kinds.next().unwrap_or(usual);
+    if kinds.any(|other| other != monomials) {
+        return Err(Failure::input("--library names two kinds of monomials")
+            .mend("choose one of `tensor`, `total` and `separate`"));
+    }
+    Ok(Library {
+        monomials,
+        constant: parts.contains(&Part::Constant),
+        friction: parts.contains(&Part::Friction),
+        trigonometric: parts.contains(&Part::Trigonometric),
+        terms: arguments.terms.clone(),
+    })
+}
