@@ -129,9 +129,10 @@ impl Bootstrap {
 /// model.
 ///
 /// # Errors
-/// [`SparseError::Option`] for bad settings; [`SparseError::NoSuchColumn`]; [`SparseError::RowRange`], also for validation rows among those that
-/// are drawn; [`SparseError::Empty`] for an empty grid; [`SparseError::TooFewRows`] if a replicate leaves out no
-/// row to judge by; [`SparseError::Overflow`]; and those of the selector.
+/// [`SparseError::Option`] for bad settings; [`SparseError::NoSuchColumn`]; [`SparseError::RowRange`], also for
+/// validation rows among those that are drawn; [`SparseError::Empty`] for an empty grid;
+/// [`SparseError::TooFewRows`] if a replicate leaves out no row to judge by; [`SparseError::Overflow`]; and those
+/// of the selector.
 ///
 /// ```
 /// use greybox_sparse::bootstrap::{BootstrapOptions, Penalty, Resample, bootstrap};
