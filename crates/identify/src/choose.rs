@@ -251,3 +251,72 @@ struct Price<'a> {
     surcharge: &'a [f64],
     term: f64,
 }
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    /// Orthogonal unit columns with the given t-statistics under unit noise.
+    fn orthogonal(t: &[f64], samples: f64, floor: f64) -> Reduced {
+        let n = t.len();
+        let mut r = vec![0.0; n * n];
+        (0..n).for_each(|i| r[i * n + i] = 1.0);
+        Reduced { columns: n, r, z: t.to_vec(), rest: samples, samples, floor }
+    }
+
+    fn roles(count: usize) -> Roles {
+        Roles { optional: (0..count).collect(), surcharge: vec![0.0; count], ..Roles::default() }
+    }
+
+    #[test]
+    fn on_orthogonal_columns_the_solution_is_the_right_hand_side() {
+        let s = orthogonal(&[3.0, -2.0, 0.5], 100.0, 0.0).solve(&[0, 2]);
+        assert_eq!(s.values, [3.0, 0.5]);
+        assert!((s.rss - 104.0).abs() < 1e-12);
+        assert!(s.inverse.iter().all(|v| (v - 1.0).abs() < 1e-12));
+    }
+
+    #[test]
+    fn a_term_at_three_is_believed_among_its_likes_and_doubted_among_giants() {
+        // 40 000 rows: Schwarz's price is 10.6, so t = 2.9 alone would never do.
+        let chosen = |t: &[f64]| orthogonal(t, 40_000.0, 0.0).choose(&roles(t.len())).columns;
+        assert_eq!(chosen(&[4.0, 3.9, 2.9, 0.3]), [0, 1, 2]);
+        assert_eq!(chosen(&[900.0, 700.0, 800.0, 2.9]), [0, 1, 2]);
+    }
+
+    #[test]
+    fn kept_columns_stay_and_even_terms_must_pay_for_the_symmetry_they_break() {
+        let reduced = orthogonal(&[50.0, 3.4, 0.1], 1000.0, 0.0);
+        let odd = Roles { kept: vec![2], optional: vec![0, 1], ..roles(3) };
+        assert_eq!(reduced.choose(&odd).columns, [0, 1, 2]);
+        let even = Roles { even: vec![1], ..odd };
+        assert_eq!(reduced.choose(&even).columns, [0, 2]);
+    }
+
+    #[test]
+    fn of_two_equal_proxies_the_one_of_lower_degree_is_taken() {
+        // Two columns almost the same.
+        let (c, s) = (0.999_f64, (1.0 - 0.999_f64.powi(2)).sqrt());
+        let reduced = Reduced {
+            columns: 2,
+            r: vec![1.0, c, 0.0, s],
+            z: vec![20.0, 0.3],
+            rest: 1000.0,
+            samples: 1000.0,
+            floor: 0.0,
+        };
+        let price = |surcharge: Vec<f64>| Roles { surcharge, ..roles(2) };
+        assert_eq!(reduced.choose(&price(vec![0.0, 2.0])).columns, [0]);
+        assert_eq!(reduced.choose(&price(vec![2.0, 0.0])).columns, [1]);
+    }
+
+    #[test]
+    fn what_only_mends_rounding_is_left_out() {
+        // Residuals of 10⁻⁷ where 10⁻⁵ counts as numerical: the third term is certain, and irrelevant.
+        let mut reduced = orthogonal(&[30.0, 20.0, 1e-5], 1000.0, 1e-10);
+        reduced.rest = 1000.0 * 1e-14;
+        assert_eq!(reduced.choose(&roles(3)).columns, [0, 1]);
+        reduced.floor = 0.0;
+        assert_eq!(reduced.choose(&roles(3)).columns, [0, 1, 2]);
+    }
+}

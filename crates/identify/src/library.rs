@@ -112,9 +112,8 @@ impl Library {
         }
         let n = setting.orders as u32;
         let mut exponents = vec![0u32; variables.len()];
-        loop {
-            // Count through all exponents up to n like an odometer.
-            let Some(i) = exponents.iter().position(|e| *e < n) else { break };
+        // Count through all exponents up to n like an odometer.
+        while let Some(i) = exponents.iter().position(|e| *e < n) {
             exponents[..i].fill(0);
             exponents[i] += 1;
             let total: u32 = exponents.iter().sum();
@@ -147,10 +146,11 @@ impl Library {
                 base,
                 powers,
                 order: order as usize,
-                even: total % 2 == 0,
+                even: total.is_multiple_of(2),
             });
         }
-        let own = |base: &str, state: &String| if several { format!("{base}_{state}") } else { base.to_string() };
+        let own =
+            |base: &str, state: &String| if several { format!("{base}_{state}") } else { base.to_string() };
         for s in setting.states {
             if self.friction && setting.derivatives > 1 {
                 out.push(Candidate {
@@ -232,7 +232,8 @@ mod tests {
     #[test]
     fn a_coefficient_never_takes_a_name_in_use() {
         let states = vec!["x".to_string()];
-        let mut setting = Setting { states: &states, derivatives: 2, orders: 1, taken: vec!["k1".to_string()] };
+        let mut setting =
+            Setting { states: &states, derivatives: 2, orders: 1, taken: vec!["k1".to_string()] };
         let names: Vec<String> =
             Library::default().terms(&mut setting).into_iter().map(|t| t.parameter).collect();
         assert_eq!(names, ["m", "k1_", "c1", "k1c1"]);

@@ -172,7 +172,12 @@ pub(crate) fn linearise(
     blocks: usize,
 ) -> Option<Linearised> {
     let active = refined.state.active.iter().zip(allowed).map(|(a, b)| *a || *b).collect();
-    let wide = setup(structure, &refined.setup.data, &State { active, ..refined.state.clone() }, Some(&refined.setup))?;
+    let wide = setup(
+        structure,
+        &refined.setup.data,
+        &State { active, ..refined.state.clone() },
+        Some(&refined.setup),
+    )?;
     let point = Point { parameters: wide.values(), starts: refined.fit.point.starts.clone() };
     let rows = wide.with_problem(&refined.level, &refined.scale, |p| p.rows(&point, true, None));
     let np = wide.free.len();
@@ -220,7 +225,8 @@ pub(crate) fn linearise(
     let t = qr::triangle(&mut a, m, stride);
     let r: Vec<f64> = (0..np * np).map(|k| t[(k / np) * stride + k % np]).collect();
     let z: Vec<f64> = (0..np).map(|i| t[i * stride + np]).collect();
-    let of = |name: &str| wide.model.parameter(name).and_then(|i| wide.free.iter().position(|f| f.index == i));
+    let of =
+        |name: &str| wide.model.parameter(name).and_then(|i| wide.free.iter().position(|f| f.index == i));
     let column = structure
         .terms
         .iter()
@@ -347,7 +353,7 @@ impl Refined {
             .iter()
             .zip(&before.scale)
             .zip(&data.spread)
-            .any(|((now, then), spread)| !(*now <= factor * then.max(NUMERICAL * spread)))
+            .any(|((now, then), spread)| now.is_nan() || *now > factor * then.max(NUMERICAL * spread))
     }
 }
 
@@ -367,7 +373,9 @@ pub(crate) fn begin(structure: &Structure, data: &Arc<Data>, start: State) -> Op
     let point = Point { parameters: setup.values(), starts: setup.starts(&level, &setup.values()) };
     let limits = Limits { iterations: 15, tolerance: 1e-4 };
     let fit = setup.with_problem(&level, &scale, |p| p.fit(point, limits));
-    fit.cost.is_finite().then(|| Refined { state: start, setup, level, fit, scale, rounds: 0 }.after(structure))
+    fit.cost
+        .is_finite()
+        .then(|| Refined { state: start, setup, level, fit, scale, rounds: 0 }.after(structure))
 }
 
 /// The same terms fitted again under another structure (other holds).

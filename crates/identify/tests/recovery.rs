@@ -140,7 +140,7 @@ fn a_term_in_the_noise_is_called_doubtful_rather_than_decided_silently() {
     let truth: Vec<&str> = DUFFING.iter().map(|d| d.0).collect();
     let options = Options { replicates: 60, ..cubic() };
     let (mut wrong, mut named) = (0, 0);
-    for seed in 0..12 {
+    for seed in 0..24 {
         let found = run(&[duffing(900 + seed, 0.01, 40.0, 0.05)], &options);
         let equation = &found.equations[0];
         let is_in = |name: &str| expressions(&found, 0).contains(&name);
@@ -153,8 +153,8 @@ fn a_term_in_the_noise_is_called_doubtful_rather_than_decided_silently() {
         wrong += mistakes.len();
         named += mistakes.iter().filter(|m| equation.doubtful.iter().any(|d| d.expression == **m)).count();
     }
-    assert!(wrong >= 3, "the case is not hard enough to test anything: {wrong}");
-    assert!(named * 3 >= wrong * 2, "{named} of {wrong} mistakes are named");
+    assert!(wrong >= 6, "the case is not hard enough to test anything: {wrong}");
+    assert!(named * 2 >= wrong, "{named} of {wrong} mistakes are named");
 }
 
 #[test]
@@ -177,7 +177,8 @@ fn first_order_systems_and_second_inputs() {
     // T ẏ + y + 0.3 y² + 0.7 w = u.
     let mut random = Pcg64Mcg::seed_from_u64(6);
     let (n, dt) = (3000, 0.02);
-    let u: Vec<f64> = (0..n).map(|k| (0.9 * k as f64 * dt).sin() + 0.5 * (0.23 * k as f64 * dt).cos()).collect();
+    let u: Vec<f64> =
+        (0..n).map(|k| (0.9 * k as f64 * dt).sin() + 0.5 * (0.23 * k as f64 * dt).cos()).collect();
     let w: Vec<f64> = (0..n).map(|k| 0.8 * (0.51 * k as f64 * dt).sin()).collect();
     let mut y = Vec::new();
     let mut state: f64 = 0.2;
@@ -228,7 +229,11 @@ fn a_delayed_feedback_is_found_with_its_bound() {
             past.push(x);
             let delayed = |w: f64| {
                 let at = past.len() as f64 - 1.0 + w - late as f64;
-                if at <= 0.0 { 1.0 } else { past[at as usize] + at.fract() * (past[at as usize + 1] - past[at as usize]) }
+                if at <= 0.0 {
+                    1.0
+                } else {
+                    past[at as usize] + at.fract() * (past[at as usize + 1] - past[at as usize])
+                }
             };
             let next = f[(k + 1).min(n - 1)];
             let drive = |w: f64| f[k] + (next - f[k]) * (s as f64 + w) / steps as f64;

@@ -149,12 +149,11 @@ pub(crate) fn run(arguments: &Arguments) -> Result<Answer, Failure> {
     Ok(answer)
 }
 
+/// Name and content of what a command writes.
+type Files = [(&'static str, String); 3];
+
 /// The files of an identification (name, content), and what the command says.
-fn results(
-    found: &Identification,
-    sources: &Sources<'_>,
-    study: &Study,
-) -> Result<([(&'static str, String); 3], Answer), Failure> {
+fn results(found: &Identification, sources: &Sources<'_>, study: &Study) -> Result<(Files, Answer), Failure> {
     let unwritten = |e: ReportError| Failure::internal(e.to_string());
     let report = convert::report(found, sources);
     let json_text = report.to_json().map_err(unwritten)?;

@@ -161,7 +161,7 @@ pub fn delay_warning(d: &Delay) -> Option<String> {
              with --gain, or record faster motion"
         ));
     }
-    if d.ci95.is_none_or(|ci| !(ci.low > 0.0)) {
+    if d.ci95.is_none_or(|ci| ci.low.is_nan() || ci.low <= 0.0) {
         parts.push(
             "the interval of the delay holds zero or is unknown: a feedback without delay may explain these \
              recordings as well"
