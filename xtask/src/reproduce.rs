@@ -7,6 +7,7 @@
 
 mod chapter2;
 mod chapter3;
+mod duffing;
 pub(crate) mod figure;
 mod fixture;
 mod index;
