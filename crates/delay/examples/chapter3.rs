@@ -11,7 +11,7 @@ use greybox_delay::taylor::{self, Data, Model, Order, Search};
 use greybox_delay::windows::{self, Before, Windowed};
 use greybox_recording::smooth::savitzky_golay;
 use greybox_simulate::rigs::{DelayedDuffing, RotaryFlexibleJoint, Sampling, Sine, multisine, square_wave};
-use greybox_sparse::log_grid;
+use greybox_sparse::select::logspace;
 use rand_distr::{Distribution, Normal};
 use rand_pcg::Pcg64Mcg;
 use rand_pcg::rand_core::SeedableRng;
@@ -314,7 +314,7 @@ fn joint_search(equation: Equation, last: usize, seed: u64) -> Result<Search, Fa
         (1..=last).map(|order| Order { order, columns: joint_terms(equation, order).len() }).collect();
     let options = taylor::Options {
         replicates: 10,
-        thresholds: log_grid(1e-10, 1.0, 100),
+        thresholds: logspace(1e-10, 1.0, 100),
         ..taylor::Options::thesis(equation.protected(), seed)
     };
     let data = [&train, &test].map(|(columns, target)| Data { columns, target });

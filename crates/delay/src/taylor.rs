@@ -12,14 +12,13 @@
 //!
 //! The order with the smallest error is the model. Two remarks that the thesis does not make: the standard
 //! deviations over replicates that draw single rows understate the truth by far, because neighbouring rows share
-//! noise ([`Resampling::Blocks`] draws stretches instead); and the truncation of the expansion biases the delay
+//! noise ([`Resample::Blocks`] draws stretches instead); and the truncation of the expansion biases the delay
 //! however long the recording is ([`crate::expansion::Expansion::truncation`]), so the result is a start for
 //! [`crate::exact`].
 //!
 //! Columns come from any operation on the signals: windows, or the iterated integrals of Eq 3.10.
-use greybox_sparse::{
-    Design, Penalty, Resampling, Sample, Selector, SparseError, bootstrap, log_grid, slices,
-};
+use greybox_sparse::select::logspace;
+use greybox_sparse::{BootstrapOptions, Penalty, Resample, Rows, Selector, SparseError, Triangle, bootstrap};
 
 /// Why there is no model.
 #[derive(Debug, Clone, PartialEq, thiserror::Error)]
@@ -63,6 +62,17 @@ pub enum TaylorError {
         /// Its columns.
         columns: usize,
     },
+    /// The training rows of the lowest order cannot tell its columns apart.
+    #[error(
+        "column {column} of order {order} is zero or a combination of those before it in the training rows: leave \
+         it out, or excite the system further"
+    )]
+    Dependent {
+        /// The order.
+        order: usize,
+        /// The column, from 0.
+        column: usize,
+    },
     /// No order was given.
     #[error("no polynomial order was given")]
     NoOrder,
@@ -100,7 +110,7 @@ pub struct Options {
     /// Bootstrap replicates.
     pub replicates: usize,
     /// What a replicate draws: single rows as printed; blocks for honest standard deviations.
-    pub resampling: Resampling,
+    pub resample: Resample,
     /// What is thresholded: the coefficients as they stand, as printed, or one of the others.
     pub selector: Selector,
     /// Thresholds λ.
@@ -118,9 +128,9 @@ impl Options {
         Self {
             protected,
             replicates: 30,
-            resampling: Resampling::Rows { ratio: 0.5 },
+            resample: Resample::Rows { ratio: 0.5 },
             selector: Selector::StlsqRaw,
-            thresholds: log_grid(1e-6, 1.0, 50),
+            thresholds: logspace(1e-6, 1.0, 50),
             tolerance: 0.05,
             seed,
         }
@@ -170,8 +180,8 @@ impl Search {
 /// Algorithm 2 over nested orders.
 ///
 /// # Errors
-/// Data that do not fit together, options out of range, fewer rows than columns, columns of the lowest order that
-/// depend on each other.
+/// Data that do not fit together, options out of range, columns of the lowest order that depend on each other (as
+/// they do where there are fewer rows than columns).
 pub fn search(
     train: Data<'_>,
     test: Data<'_>,
@@ -182,30 +192,36 @@ pub fn search(
     let both = |j: usize| [train.columns[j].as_slice(), &test.columns[j]].concat();
     let columns: Vec<Vec<f64>> = (0..widest).map(both).collect();
     let target = [train.target, test.target].concat();
-    let design = Design::new(&slices(&columns), &target)?;
+    let rows = Rows::from_vecs(&columns, &target)?;
     let training = 0..train.target.len();
     let judging = training.end..target.len();
-    let judge = Sample::new(&design, std::slice::from_ref(&judging))?;
-    let penalty = Penalty::Validated { grid: options.thresholds.clone(), rows: vec![judging] };
+    let whole = Triangle::of_rows(&rows, std::slice::from_ref(&training))?;
+    let judge = Triangle::of_rows(&rows, std::slice::from_ref(&judging))?;
+    let penalty = Penalty::Validated { grid: options.thresholds.clone(), ranges: vec![judging] };
     let protected: Vec<usize> = (0..options.protected).collect();
+    let draws = BootstrapOptions {
+        replicates: options.replicates,
+        resample: options.resample,
+        seed: options.seed,
+        ..BootstrapOptions::default()
+    };
     let mut models = Vec::with_capacity(orders.len());
     for &Order { order, columns } in orders {
+        if let Some((column, _)) = whole.first_columns(columns).first_dependent() {
+            if models.is_empty() {
+                return Err(TaylorError::Dependent { order, column });
+            }
+            // What the rows cannot tell apart, no higher order can.
+            break;
+        }
         let spread = bootstrap(
-            &design,
+            &rows.first_columns(columns),
             std::slice::from_ref(&training),
-            columns,
+            &protected,
             options.selector,
             &penalty,
-            &protected,
-            options.resampling,
-            options.replicates,
-            options.seed,
-        );
-        let spread = match spread {
-            // What the rows cannot tell apart, no higher order can.
-            Err(SparseError::RankDeficient { .. }) if !models.is_empty() => break,
-            spread => spread?,
-        };
+            &draws,
+        )?;
         let test_error = judge.rss(&spread.mean) / test.target.len() as f64;
         models.push(Model {
             order,

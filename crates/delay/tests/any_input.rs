@@ -4,7 +4,7 @@ use greybox_delay::exact::{self, Gain, Rows};
 use greybox_delay::expansion::Expansion;
 use greybox_delay::spectrum::DelaySystem;
 use greybox_delay::taylor::{self, Data, Order};
-use greybox_sparse::{Resampling, Selector};
+use greybox_sparse::{Resample, Selector};
 use proptest::prelude::*;
 
 /// Numbers of every kind, ordinary ones most often.
@@ -57,7 +57,8 @@ proptest! {
     #[test]
     fn algorithm_2(
         values in prop::collection::vec(prop::collection::vec(number(), 4), 1..20),
-        (ratio, block, protected, seed) in (number(), 0usize..30, 0usize..5, any::<u64>()),
+        (ratio, block, circular) in (number(), 0usize..30, any::<bool>()),
+        (protected, seed) in (0usize..5, any::<u64>()),
         (threshold, tolerance, counts) in (number(), number(), prop::collection::vec(0usize..6, 0..4)),
     ) {
         let columns: Vec<Vec<f64>> = (0..3).map(|j| values.iter().map(|v| v[j]).collect()).collect();
@@ -67,7 +68,10 @@ proptest! {
         let options = taylor::Options {
             protected,
             replicates: 2,
-            resampling: if block == 0 { Resampling::Rows { ratio } } else { Resampling::Blocks { length: block } },
+            resample: match block {
+                0 => Resample::Rows { ratio },
+                length => Resample::Blocks { length, circular },
+            },
             selector: Selector::StlsqRaw,
             thresholds: vec![threshold, 0.1],
             tolerance,

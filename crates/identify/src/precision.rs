@@ -203,7 +203,8 @@ fn inclusion(structure: &Structure, refined: &Refined, allowed: &[bool], options
     let counts: Vec<Vec<usize>> = (0..options.replicates as u64)
         .into_par_iter()
         .map(|replicate| {
-            let mut rng = Pcg64Mcg::new((u128::from(options.seed) << 64) | u128::from(replicate) << 1 | 1);
+            let stream = options.seed ^ replicate.wrapping_mul(0x9e37_79b9_7f4a_7c15);
+            let mut rng: Pcg64Mcg = rand::SeedableRng::seed_from_u64(stream);
             let blocks = linear.blocks.len();
             let drawn: Vec<usize> = (0..blocks).map(|_| rng.random_range(0..blocks)).collect();
             linear.resampled(&drawn).choose(&kept, &optional, &even).columns

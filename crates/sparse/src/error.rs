@@ -82,6 +82,9 @@ pub enum SparseError {
         /// Pivot divided by the column's squared norm.
         pivot: f64,
     },
+    /// No model of a grid has a finite error on the rows that judge it.
+    #[error("the sums of squares overflow: state the columns and the target in larger units")]
+    Overflow,
     /// The target is zero in every row.
     #[error("the target is zero in every row: nothing is to be explained")]
     ZeroTarget,

@@ -17,7 +17,7 @@ pub mod subset;
 mod testing;
 pub mod triangle;
 
-pub use bootstrap::{Bootstrap, BootstrapOptions, Resample, bootstrap, stability};
+pub use bootstrap::{Bootstrap, BootstrapOptions, Penalty, Resample, bootstrap, stability};
 pub use covariance::{Covariance, covariance};
 pub use error::SparseError;
 pub use gram::{BlockGram, Gram};

@@ -299,23 +299,35 @@ fn refit(triangle: &Triangle, found: &[usize], protected: &[usize]) -> Result<Fi
     triangle.fit(&independent.into_iter().map(|i| active[i]).collect::<Vec<_>>())
 }
 
-/// The path parameter from the densest to the sparsest model, for `candidates` columns.
+/// The path parameter from the densest to the sparsest model, for `candidates` columns: the values of `grid`
+/// ascending, or the numbers of columns kept descending for [`Selector::Backward`] and [`Selector::BestSubset`].
 ///
 /// # Errors
 /// [`SparseError::Empty`] without λ, [`SparseError::Option`] for a negative or non-finite one.
-pub fn ordered_grid(options: &Options, candidates: usize, protected: usize) -> Result<Vec<f64>, SparseError> {
-    if matches!(options.selector, Selector::Backward | Selector::BestSubset) {
+pub fn ordered_grid(
+    selector: Selector,
+    grid: &[f64],
+    candidates: usize,
+    protected: usize,
+) -> Result<Vec<f64>, SparseError> {
+    if matches!(selector, Selector::Backward | Selector::BestSubset) {
         return Ok((protected..=candidates).rev().map(|k| k as f64).collect());
     }
-    if options.grid.is_empty() {
+    if grid.is_empty() {
         return Err(SparseError::Empty { what: "values of λ" });
     }
-    for &lambda in &options.grid {
+    for &lambda in grid {
         check_range("lambda", lambda, 0.0, f64::MAX, "finite and not negative")?;
     }
-    let mut grid = options.grid.clone();
+    let mut grid = grid.to_vec();
     grid.sort_by(f64::total_cmp);
     Ok(grid)
+}
+
+/// Mean square error of every fit on held-out rows, not below rounding.
+pub(crate) fn held_out_errors(held: &Triangle, fits: &[Fit]) -> Vec<f64> {
+    let floor = (ROUNDING * held.target_norm()).powi(2);
+    fits.iter().map(|f| held.rss(&f.coefficients).max(floor) / held.rows() as f64).collect()
 }
 
 /// Runs Algorithm 1.
@@ -378,14 +390,13 @@ fn order_model(
     whole: &Triangle,
 ) -> Result<OrderModel, SparseError> {
     let candidates = problem.orders[r];
-    let grid = ordered_grid(options, candidates, problem.protected.len())?;
+    let grid = ordered_grid(options.selector, &options.grid, candidates, problem.protected.len())?;
     let errors: Vec<Vec<f64>> = pairs
         .par_iter()
         .map(|(train, held)| {
             let (train, held) = (train.first_columns(candidates), held.first_columns(candidates));
             let fits = path(options.selector, &train, &problem.protected, &grid)?;
-            let floor = (ROUNDING * held.target_norm()).powi(2);
-            Ok(fits.iter().map(|f| held.rss(&f.coefficients).max(floor) / held.rows() as f64).collect())
+            Ok(held_out_errors(&held, &fits))
         })
         .collect::<Result<_, SparseError>>()?;
     let (cv_mean, cv_error): (Vec<f64>, Vec<f64>) =
