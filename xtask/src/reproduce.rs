@@ -12,6 +12,7 @@ pub(crate) mod figure;
 mod fixture;
 mod index;
 mod joint;
+mod link;
 
 use std::path::{Path, PathBuf};
 
@@ -203,6 +204,17 @@ pub(crate) fn run(root: &Path, arguments: &Arguments) -> Result<Ending> {
     }
     println!("{}", out.join("index.html").display());
     Ok(if outcomes.iter().all(|o| o.failures.is_empty()) { Ending::Done } else { Ending::Missed })
+}
+
+/// The median; of an even number the mean of the middle two.
+fn median(mut values: Vec<f64>) -> f64 {
+    values.sort_by(f64::total_cmp);
+    let middle = values.len() / 2;
+    match values.len() {
+        0 => f64::NAN,
+        n if n % 2 == 1 => values[middle],
+        _ => 0.5 * (values[middle - 1] + values[middle]),
+    }
 }
 
 /// What is wrong with a piece: a value out of its bounds, a value without bounds, a bound without a value, a

@@ -21,7 +21,9 @@ pub enum IdentifyError {
         second: &'static str,
     },
     /// A channel's name cannot be used in an equation.
-    #[error("channel `{name}` cannot be a name in an equation: {reason}; rename it in the recording's header")]
+    #[error(
+        "channel `{name}` cannot be a name in an equation: {reason}; rename it in the recording's header"
+    )]
     Name {
         /// The channel.
         name: String,
@@ -78,13 +80,17 @@ pub enum IdentifyError {
         name: String,
     },
     /// The recordings are too short for one window of the weak form.
-    #[error("the longest gap-free stretch has {samples} samples: too few for a first estimate of the equation")]
+    #[error(
+        "the longest gap-free stretch has {samples} samples: too few for a first estimate of the equation"
+    )]
     TooShort {
         /// Its length.
         samples: usize,
     },
     /// No model could be fitted.
-    #[error("no equation of this library follows the recordings: every fit diverged; try another library or a lower order")]
+    #[error(
+        "no equation of this library follows the recordings: every fit diverged; try another library or a lower order"
+    )]
     NoFit,
     /// The recordings do not fit the model that the request describes.
     #[error(transparent)]

@@ -267,13 +267,18 @@ pub(crate) fn structure(recordings: &[Recording], options: &Options) -> Result<S
     }
     if !(1..=2).contains(&options.derivatives) {
         let found = options.derivatives as f64;
-        return Err(IdentifyError::Range { what: "the order of the leading derivative", found, range: "1 to 2" });
+        return Err(IdentifyError::Range {
+            what: "the order of the leading derivative",
+            found,
+            range: "1 to 2",
+        });
     }
     if !(1..=12).contains(&options.order) {
         let found = options.order as f64;
         return Err(IdentifyError::Range { what: "the order of the library", found, range: "1 to 12" });
     }
-    let roles = options.states.iter().map(|s| (s, "state")).chain(options.inputs.iter().map(|s| (s, "input")));
+    let roles =
+        options.states.iter().map(|s| (s, "state")).chain(options.inputs.iter().map(|s| (s, "input")));
     let mut seen: Vec<(&String, &'static str)> = Vec::new();
     for (name, role) in roles {
         if let Some((_, first)) = seen.iter().find(|(n, _)| *n == name) {
@@ -282,9 +287,7 @@ pub(crate) fn structure(recordings: &[Recording], options: &Options) -> Result<S
         check_name(name)?;
         seen.push((name, role));
     }
-    let unit = |name: &str| {
-        recordings.iter().flat_map(|r| r.channel(name)).find_map(|c| c.unit.clone())
-    };
+    let unit = |name: &str| recordings.iter().flat_map(|r| r.channel(name)).find_map(|c| c.unit.clone());
     let signal = |name: &String| Signal { name: name.clone(), unit: unit(name) };
     let hold = options.hold.unwrap_or(Hold::Linear);
     let mut library = options.library.clone();
@@ -350,8 +353,12 @@ fn check_name(name: &str) -> Result<(), IdentifyError> {
         return Err(wrong("the language has another meaning for it".to_string()));
     }
     match greybox_model::parse(name) {
-        Ok(parsed) if matches!(&parsed.expr, greybox_model::Expr::Var { name: n, primes: 0 } if **n == *name) => Ok(()),
-        Ok(_) => Err(wrong("names have letters, digits and underscores, and begin with a letter".to_string())),
+        Ok(parsed) if matches!(&parsed.expr, greybox_model::Expr::Var { name: n, primes: 0 } if **n == *name) => {
+            Ok(())
+        }
+        Ok(_) => {
+            Err(wrong("names have letters, digits and underscores, and begin with a letter".to_string()))
+        }
         Err(e) => Err(wrong(e.to_string())),
     }
 }
@@ -365,7 +372,10 @@ fn check_term(term: &str, options: &Options) -> Result<(), IdentifyError> {
         let is_input = options.inputs.iter().any(|s| **s == **name);
         if !is_state && !is_input {
             let known: Vec<String> = options.states.iter().chain(&options.inputs).cloned().collect();
-            return Err(wrong(format!("`{name}` is neither a state nor an input (there are {})", known.join(", "))));
+            return Err(wrong(format!(
+                "`{name}` is neither a state nor an input (there are {})",
+                known.join(", ")
+            )));
         }
         let most = if is_state { options.derivatives } else { 1 };
         if usize::from(*primes) >= most {
@@ -421,7 +431,9 @@ fn first_estimates(
     };
     let trial = match trials.as_slice() {
         [None] => None,
-        _ => best(&everything).first().and_then(|s| trials[0].map(|t| weak::Trial { delay: s.1.extras[1], ..t })),
+        _ => best(&everything)
+            .first()
+            .and_then(|s| trials[0].map(|t| weak::Trial { delay: s.1.extras[1], ..t })),
     };
     let by_order = order_search(structure, model, data, &values, window(WINDOWS[1]), trial, options);
     let chosen = by_order.iter().min_by(|a, b| a.1.total_cmp(&b.1)).map_or(options.order, |o| o.0);
@@ -447,7 +459,9 @@ fn order_search(
 ) -> Vec<(usize, f64)> {
     let mut total: Vec<(usize, f64)> = (1..=options.order).map(|n| (n, 0.0)).collect();
     for equation in 0..structure.equations.len() {
-        let Some(rows) = weak::rows(structure, model, data, values, equation, window, trial) else { continue };
+        let Some(rows) = weak::rows(structure, model, data, values, equation, window, trial) else {
+            continue;
+        };
         let (target, columns, protected) = weak::regression(structure, &rows, trial.and_then(|t| t.gain));
         let views: Vec<&[f64]> = columns.iter().map(|c| c.1.as_slice()).collect();
         let sizes: Vec<usize> = (1..=options.order)
@@ -597,14 +611,14 @@ fn conclude(
         Some(Role { data, run, scores, by_recording })
     };
     let train = role(data.clone()).ok_or(IdentifyError::NoFit)?;
-    let holdout =
-        if held.is_empty() { None } else { role(Arc::new(Data::new(&model, held)?)) };
+    let holdout = if held.is_empty() { None } else { role(Arc::new(Data::new(&model, held)?)) };
     let equations = structure
         .equations
         .iter()
         .enumerate()
         .map(|(e, equation)| {
-            let of_equation = || (0..structure.terms.len()).filter(move |&i| structure.terms[i].equation == e);
+            let of_equation =
+                || (0..structure.terms.len()).filter(move |&i| structure.terms[i].equation == e);
             let terms = of_equation()
                 .filter(|&i| state.active[i])
                 .map(|i| {
@@ -642,12 +656,7 @@ fn conclude(
                     })
                 })
                 .collect();
-            FoundEquation {
-                state: options.states[e].clone(),
-                input: equation.input.clone(),
-                terms,
-                doubtful,
-            }
+            FoundEquation { state: options.states[e].clone(), input: equation.input.clone(), terms, doubtful }
         })
         .collect();
     let delays = options

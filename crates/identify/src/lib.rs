@@ -10,7 +10,7 @@ mod weak;
 
 pub use error::IdentifyError;
 pub use identify::{
-    DelayedState, DoubtfulTerm, FoundDelay, FoundEquation, FoundTerm, HoldoutSource, Identification, Observer,
-    Options, OrderChoice, Quiet, Role, identify,
+    DelayedState, DoubtfulTerm, FoundDelay, FoundEquation, FoundTerm, HoldoutSource, Identification,
+    Observer, Options, OrderChoice, Quiet, Role, identify,
 };
 pub use library::{Library, Monomials};

@@ -150,7 +150,8 @@ impl Library {
                 even: total % 2 == 0,
             });
         }
-        let own = |base: &str, state: &String| if several { format!("{base}_{state}") } else { base.to_string() };
+        let own =
+            |base: &str, state: &String| if several { format!("{base}_{state}") } else { base.to_string() };
         for s in setting.states {
             if self.friction && setting.derivatives > 1 {
                 out.push(Candidate {
@@ -232,7 +233,8 @@ mod tests {
     #[test]
     fn a_coefficient_never_takes_a_name_in_use() {
         let states = vec!["x".to_string()];
-        let mut setting = Setting { states: &states, derivatives: 2, orders: 1, taken: vec!["k1".to_string()] };
+        let mut setting =
+            Setting { states: &states, derivatives: 2, orders: 1, taken: vec!["k1".to_string()] };
         let names: Vec<String> =
             Library::default().terms(&mut setting).into_iter().map(|t| t.parameter).collect();
         assert_eq!(names, ["m", "k1_", "c1", "k1c1"]);

@@ -99,7 +99,11 @@ pub(crate) struct Linearised {
 
 impl Linearised {
     /// Columns that always stay, that are optional, and that are even.
-    pub(crate) fn roles(&self, structure: &Structure, allowed: &[bool]) -> (Vec<usize>, Vec<usize>, Vec<usize>) {
+    pub(crate) fn roles(
+        &self,
+        structure: &Structure,
+        allowed: &[bool],
+    ) -> (Vec<usize>, Vec<usize>, Vec<usize>) {
         let pick = |wanted: &dyn Fn(usize) -> bool| -> Vec<usize> {
             (0..structure.terms.len()).filter(|&i| wanted(i)).filter_map(|i| self.column[i]).collect()
         };
@@ -175,7 +179,12 @@ pub(crate) fn linearise(
     blocks: usize,
 ) -> Option<Linearised> {
     let active = refined.state.active.iter().zip(allowed).map(|(a, b)| *a || *b).collect();
-    let wide = setup(structure, &refined.setup.data, &State { active, ..refined.state.clone() }, Some(&refined.setup))?;
+    let wide = setup(
+        structure,
+        &refined.setup.data,
+        &State { active, ..refined.state.clone() },
+        Some(&refined.setup),
+    )?;
     let point = Point { parameters: wide.values(), starts: refined.fit.point.starts.clone() };
     let rows = wide.with_problem(&refined.level, &refined.scale, |p| p.rows(&point, true, None));
     let np = wide.free.len();
@@ -223,7 +232,8 @@ pub(crate) fn linearise(
     let t = qr::triangle(&mut a, m, stride);
     let r: Vec<f64> = (0..np * np).map(|k| t[(k / np) * stride + k % np]).collect();
     let z: Vec<f64> = (0..np).map(|i| t[i * stride + np]).collect();
-    let of = |name: &str| wide.model.parameter(name).and_then(|i| wide.free.iter().position(|f| f.index == i));
+    let of =
+        |name: &str| wide.model.parameter(name).and_then(|i| wide.free.iter().position(|f| f.index == i));
     let column = structure
         .terms
         .iter()
@@ -371,7 +381,9 @@ pub(crate) fn begin(structure: &Structure, data: &Arc<Data>, start: State) -> Op
     let point = Point { parameters: setup.values(), starts: setup.starts(&level, &setup.values()) };
     let limits = Limits { iterations: 15, tolerance: 1e-4 };
     let fit = setup.with_problem(&level, &scale, |p| p.fit(point, limits));
-    fit.cost.is_finite().then(|| Refined { state: start, setup, level, fit, scale, rounds: 0 }.after(structure))
+    fit.cost
+        .is_finite()
+        .then(|| Refined { state: start, setup, level, fit, scale, rounds: 0 }.after(structure))
 }
 
 /// The same terms fitted again under another structure (other holds).

@@ -107,9 +107,8 @@ pub(crate) fn assess(
     } else {
         gauss.iter().map(|g| quantile(freedom) * g).collect::<Vec<f64>>()
     };
-    let position = |name: &str| {
-        setup.model.parameter(name).and_then(|i| setup.free.iter().position(|f| f.index == i))
-    };
+    let position =
+        |name: &str| setup.model.parameter(name).and_then(|i| setup.free.iter().position(|f| f.index == i));
     let of_terms = |values: &[f64]| -> Vec<Option<f64>> {
         structure
             .terms
@@ -184,9 +183,8 @@ fn sandwich(projected: &[(Vec<f64>, &[f64], usize)], inverse: &[f64], np: usize)
     (0..np)
         .map(|i| {
             // Row i of (RᵀR)⁻¹ = R⁻¹ R⁻ᵀ.
-            let row: Vec<f64> = (0..np)
-                .map(|k| (0..np).map(|l| inverse[i * np + l] * inverse[k * np + l]).sum())
-                .collect();
+            let row: Vec<f64> =
+                (0..np).map(|k| (0..np).map(|l| inverse[i * np + l] * inverse[k * np + l]).sum()).collect();
             correction * gradients.iter().map(|g| qr::dot(&row, g).powi(2)).sum::<f64>().sqrt()
         })
         .collect()

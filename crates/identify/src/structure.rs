@@ -82,7 +82,8 @@ impl Structure {
         let _ = writeln!(text, "name = {}\n", quote(&self.title));
         let table = |text: &mut String, signal: &Signal, more: &str| {
             let unit = signal.unit.as_ref().map(|u| format!("unit = {}", quote(u)));
-            let inside: Vec<String> = unit.into_iter().chain((!more.is_empty()).then(|| more.to_string())).collect();
+            let inside: Vec<String> =
+                unit.into_iter().chain((!more.is_empty()).then(|| more.to_string())).collect();
             let _ = writeln!(text, "{} = {{ {} }}", signal.name, inside.join(", "));
         };
         if !self.inputs.is_empty() {

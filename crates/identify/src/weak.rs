@@ -56,7 +56,12 @@ fn earlier(signal: &[f64], dt: f64, delay: f64) -> Vec<f64> {
 }
 
 /// Values of all candidate terms along the smoothed states, `[piece][term][sample]`.
-pub(crate) fn evaluate(structure: &Structure, model: &Model, data: &Data, hats: &Hats) -> Option<Vec<Vec<Vec<f64>>>> {
+pub(crate) fn evaluate(
+    structure: &Structure,
+    model: &Model,
+    data: &Data,
+    hats: &Hats,
+) -> Option<Vec<Vec<Vec<f64>>>> {
     let orders: Vec<usize> = model.states.iter().map(|s| s.order).collect();
     let offsets: Vec<usize> = orders
         .iter()
@@ -123,9 +128,7 @@ pub(crate) fn rows(
         (0..structure.terms.len()).filter(|&i| structure.terms[i].equation == equation).collect();
     let input = structure.equations[equation].input.as_ref().and_then(|name| model.input(name));
     let late: Vec<Vec<f64>> = match trial {
-        Some(t) => {
-            data.pieces.iter().map(|p| earlier(&p.smooth[t.state].value, p.dt, t.delay)).collect()
-        }
+        Some(t) => data.pieces.iter().map(|p| earlier(&p.smooth[t.state].value, p.dt, t.delay)).collect(),
         None => Vec::new(),
     };
     let zeros: Vec<Vec<f64>> = data.pieces.iter().map(|p| vec![0.0; p.len]).collect();
@@ -144,7 +147,9 @@ pub(crate) fn rows(
                 .iter()
                 .map(|&t| match state_of(&structure.terms[t].expression) {
                     // A derivative of a measured state: from the measurement itself.
-                    Some((j, primes)) => Column { signal: &piece.measured[j], order: primes, hold: Join::Smooth },
+                    Some((j, primes)) => {
+                        Column { signal: &piece.measured[j], order: primes, hold: Join::Smooth }
+                    }
                     None => Column { signal: &values[i][t], order: 0, hold: Join::Smooth },
                 })
                 .collect();
@@ -257,7 +262,13 @@ pub(crate) fn period(data: &Data) -> f64 {
                 let band = 0.1 * data.spread[c];
                 let mut side = 0i8;
                 for v in y {
-                    let now = if v - mean > band { 1 } else if v - mean < -band { -1 } else { side };
+                    let now = if v - mean > band {
+                        1
+                    } else if v - mean < -band {
+                        -1
+                    } else {
+                        side
+                    };
                     crossings += usize::from(side != 0 && now != side);
                     side = now;
                 }

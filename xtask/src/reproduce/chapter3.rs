@@ -5,7 +5,7 @@ use std::f64::consts::TAU;
 use anyhow::{Context, Result};
 use greybox_eso::{Design, Observer, Scheme, record};
 
-use super::chapter2::{Beam, photograph};
+use super::chapter2::{Beam, photograph, relative_rms};
 use super::figure::{Axis, Plot, Series, Style};
 use super::fixture::Fixture;
 use super::index::number;
@@ -213,13 +213,6 @@ fn response(fixture: &Fixture, reference: impl Fn(f64) -> f64) -> Result<Piece> 
         ));
     }
     Ok(piece)
-}
-
-/// RMS(estimate − truth) / RMS(truth).
-fn relative_rms(estimate: &[f64], truth: &[f64]) -> f64 {
-    let wrong: f64 = estimate.iter().zip(truth).map(|(e, t)| (e - t) * (e - t)).sum();
-    let size: f64 = truth.iter().map(|t| t * t).sum();
-    (wrong / size).sqrt()
 }
 
 #[cfg(test)]

@@ -174,6 +174,39 @@ pub(crate) fn is_exact(search: &Search) -> bool {
     chosen == wanted
 }
 
+/// The coefficient of a term in the model of an order.
+pub(crate) fn coefficient(search: &Search, order: usize, term: &str) -> f64 {
+    let place = terms().iter().position(|name| name == term);
+    place.and_then(|j| search.orders.get(order - 1)?.coefficients.get(j).copied()).unwrap_or(0.0)
+}
+
+/// What a variant finds in several records.
+#[derive(Debug, Clone)]
+pub(crate) struct Tally {
+    /// Records.
+    pub(crate) records: usize,
+    /// Of these, with the least AIC at order 3 (a tie goes to the smaller order).
+    pub(crate) order_three: usize,
+    /// With exactly the terms of equation 2.18 at the least AIC.
+    pub(crate) exact: usize,
+    /// Median |error| of the coefficients in the order of [`TRUTH`], in %; a missing term is 100 % off.
+    pub(crate) medians: [f64; 6],
+}
+
+/// Runs a variant on records of consecutive seeds.
+pub(crate) fn tally(records: &[Record], variant: Variant) -> Result<Tally> {
+    let searches = records.iter().map(|record| search(record, variant)).collect::<Result<Vec<_>>>()?;
+    let error = |search: &Search, (term, truth): (&str, f64)| {
+        100.0 * (coefficient(search, search.model().order, term) / truth - 1.0).abs()
+    };
+    Ok(Tally {
+        records: records.len(),
+        order_three: searches.iter().filter(|s| s.model().order == 3).count(),
+        exact: searches.iter().filter(|s| is_exact(s)).count(),
+        medians: TRUTH.map(|term| super::median(searches.iter().map(|s| error(s, term)).collect())),
+    })
+}
+
 /// The record behind the page's tables and figures.
 const SEED: u64 = 1;
 
@@ -197,22 +230,4 @@ pub(crate) fn identified() -> Result<&'static Identification> {
         Ok(identify(&recordings, &recordings, &options, &Quiet)?)
     });
     made.as_ref().map_err(|e| anyhow!("{e:#}"))
-}
-
-#[cfg(test)]
-mod scratch {
-    use super::*;
-    #[test]
-    fn scratch() {
-        let t = std::time::Instant::now();
-        for v in [Variant::PRINTED, Variant::WINDOWED] {
-            let s = of_the_page(v).unwrap();
-            let names = terms();
-            println!("{:?} {:?}", t.elapsed(), v);
-            for m in &s.orders { println!("{} aic {} lambda {} {:?}", m.order, m.aic, m.lambda(), m.support.iter().map(|&j| format!("{:.4} {}", m.coefficients[j], names[j])).collect::<Vec<_>>()); }
-        }
-        println!("{:?}", t.elapsed());
-        let f = identified().unwrap();
-        println!("{:?} {:?}", t.elapsed(), f.equations[0].terms);
-    }
 }

@@ -53,7 +53,6 @@ impl Axis {
     }
 
     /// A logarithmic axis by the data.
-    #[cfg_attr(not(test), expect(dead_code, reason = "for the figures that are not made yet"))]
     pub(crate) fn log(title: impl Into<String>) -> Self {
         Self { title: title.into(), scale: Scale::Log, range: None }
     }
@@ -69,7 +68,6 @@ pub(crate) enum Style {
     /// Points.
     Points,
     /// Points joined by a line.
-    #[cfg_attr(not(test), expect(dead_code, reason = "for the figures that are not made yet"))]
     Joined,
 }
 
@@ -93,7 +91,6 @@ impl Series {
     }
 
     /// With error bars of ± `errors`, one per point.
-    #[cfg_attr(not(test), expect(dead_code, reason = "for the figures that are not made yet"))]
     pub(crate) fn with_errors(self, errors: Vec<f64>) -> Self {
         Self { errors, ..self }
     }
