@@ -101,6 +101,8 @@ pub(crate) struct Variant {
     pub(crate) selector: Selector,
     /// How the folds are made.
     pub(crate) folds: FoldKind,
+    /// The smallest λ that is tried; the largest is one, and there are 20 in a decade.
+    pub(crate) smallest: f64,
 }
 
 impl Variant {
@@ -113,6 +115,7 @@ impl Variant {
         integrals: Integrals::Windows,
         selector: Selector::StlsqRaw,
         folds: FoldKind::Contiguous,
+        smallest: 1e-2,
     };
 }
 
@@ -156,11 +159,14 @@ pub(crate) fn search(record: &Record, variant: Variant) -> Result<Search> {
     let all = [0..target.len()];
     let split = train_test(&all, 0.5, gap)?;
     let problem = Problem::new(Rows::from_vecs(&rows, &target)?, &orders, &[0], split)?;
-    // LASSO's λ is relative to the target and the columns, and needs smaller ones.
-    let relative = matches!(variant.selector, Selector::Lasso | Selector::LassoRefit);
-    let raw = select::Options::raw();
-    let grid = if relative { select::logspace(1e-5, 1e-1, 40) } else { raw.grid.clone() };
-    let options = select::Options { selector: variant.selector, fold_kind: variant.folds, grid, ..raw };
+    let count = (-20.0 * variant.smallest.log10()).round() as usize;
+    let grid = select::logspace(variant.smallest, 1.0, count);
+    let options = select::Options {
+        selector: variant.selector,
+        fold_kind: variant.folds,
+        grid,
+        ..select::Options::raw()
+    };
     Ok(select::search(&problem, &options)?)
 }
 
