@@ -5,8 +5,11 @@
 //! prints stands in `fixtures/thesis/*.json`, corrected by the errata that each file names; what we measure
 //! stands in the piece, and its bounds in the file. Nothing is random but for fixed seeds.
 
+mod algorithm2;
 mod chapter2;
 mod chapter3;
+mod delayed;
+mod delayed_joint;
 mod duffing;
 pub(crate) mod figure;
 mod fixture;

@@ -5,6 +5,7 @@ use std::f64::consts::TAU;
 use anyhow::{Context, Result};
 use greybox_eso::{Design, Observer, Scheme, record};
 
+use super::algorithm2::{figure_3_1, figure_3_5, table_3_1, table_3_4, table_3_5};
 use super::chapter2::{Beam, photograph, relative_rms};
 use super::figure::{Axis, Plot, Series, Style};
 use super::fixture::Fixture;
@@ -14,16 +15,16 @@ use super::{Check, Column, Drawing, Entry, Piece, Status, Table, joint};
 /// Its tables and figures, in order.
 pub(crate) fn entries() -> Vec<Entry> {
     vec![
-        Entry { id: "Table 3.1", make: None },
+        Entry { id: "Table 3.1", make: Some(table_3_1) },
         Entry { id: "Table 3.2", make: Some(table_3_2) },
-        Entry { id: "Figure 3.1", make: None },
+        Entry { id: "Figure 3.1", make: Some(figure_3_1) },
         Entry { id: "Figure 3.2", make: Some(photograph) },
         Entry { id: "Table 3.3", make: Some(table_3_3) },
         Entry { id: "Figure 3.3", make: Some(figure_3_3) },
         Entry { id: "Figure 3.4", make: Some(figure_3_4) },
-        Entry { id: "Figure 3.5", make: None },
-        Entry { id: "Table 3.4", make: None },
-        Entry { id: "Table 3.5", make: None },
+        Entry { id: "Figure 3.5", make: Some(figure_3_5) },
+        Entry { id: "Table 3.4", make: Some(table_3_4) },
+        Entry { id: "Table 3.5", make: Some(table_3_5) },
     ]
 }
 

@@ -59,15 +59,18 @@ impl Record {
     fn velocity(&self, from: Velocity) -> Result<Vec<f64>> {
         Ok(match from {
             Velocity::True => self.velocity.clone(),
-            Velocity::Observer => {
-                let observer = Observer::new(Design::thesis(), STEP, Scheme::Euler)?;
-                let mut states = vec![[0.0; 2]; self.displacement.len()];
-                record::forward(&observer, &self.displacement, None, &mut states)?;
-                states.iter().map(|z| z[1]).collect()
-            }
+            Velocity::Observer => observed(&self.displacement)?,
             Velocity::Smoothed => savitzky_golay(&self.displacement, STEP, 401, 5).d1,
         })
     }
+}
+
+/// The velocity by the observer of equations 2.22 and 3.27, every millisecond, as it runs in real time.
+pub(crate) fn observed(position: &[f64]) -> Result<Vec<f64>> {
+    let observer = Observer::new(Design::thesis(), STEP, Scheme::Euler)?;
+    let mut states = vec![[0.0; 2]; position.len()];
+    record::forward(&observer, position, None, &mut states)?;
+    Ok(states.iter().map(|z| z[1]).collect())
 }
 
 /// Where the velocity in the nonlinear terms comes from.

@@ -6,7 +6,6 @@ use std::sync::OnceLock;
 
 use anyhow::{Context, Result, anyhow, bail};
 use greybox_algebraic::{Column, Hold, Iterated, Kernel, Restart};
-use greybox_eso::{Design, Observer, Scheme, record};
 use greybox_identify::{
     FoundEquation, Identification, Library as Candidates, Monomials, Options, Quiet, identify,
 };
@@ -36,8 +35,8 @@ const NOISE: f64 = 1e-3;
 pub(crate) const ORDERS: u32 = 4;
 /// Frequencies of the dither, Hz: below, around and above the link's resonance at 4.5 Hz.
 const DITHER_HZ: [f64; 6] = [0.7, 1.3, 2.9, 4.3, 6.1, 8.9];
-/// Amplitude of each of its sines, V: 0.3 V in all.
-const DITHER: f64 = 0.05;
+/// Amplitude of each of its sines, V.
+const DITHER: f64 = 0.12;
 
 /// The angles as measured, and the voltage.
 #[derive(Debug, Clone)]
@@ -271,12 +270,7 @@ pub(crate) fn search(
 fn rate(angle: &[f64], from: Velocity) -> Result<Vec<f64>> {
     match from {
         Velocity::True => bail!("a record of the link holds no true velocity"),
-        Velocity::Observer => {
-            let observer = Observer::new(Design::thesis(), STEP, Scheme::Euler)?;
-            let mut states = vec![[0.0; 2]; angle.len()];
-            record::forward(&observer, angle, None, &mut states)?;
-            Ok(states.iter().map(|z| z[1]).collect())
-        }
+        Velocity::Observer => super::duffing::observed(angle),
         Velocity::Smoothed => Ok(savitzky_golay(angle, STEP, 61, 5).d1),
     }
 }
