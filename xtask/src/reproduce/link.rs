@@ -38,12 +38,13 @@ const DITHER_HZ: [f64; 6] = [0.7, 1.3, 2.9, 4.3, 6.1, 8.9];
 /// Amplitude of each of its sines, V.
 const DITHER: f64 = 0.12;
 
-/// The angles as measured, and the voltage.
+/// The angles as measured, the voltage, and the true velocities, which are not recorded.
 #[derive(Debug, Clone)]
 pub(crate) struct Record {
     theta: Vec<f64>,
     alpha: Vec<f64>,
     volts: Vec<f64>,
+    rates: [Vec<f64>; 2],
 }
 
 /// The reference of the thesis: ±30°, 0.66 Hz.
@@ -69,7 +70,8 @@ impl Record {
             let t = k as f64 * STEP;
             ProportionalController::THESIS.command(reference(t), measured[0], multisine(&dither, t))
         })?;
-        Ok(Self { theta, alpha, volts: run.voltages })
+        let rates = [2, 3].map(|i| run.states.iter().map(|state| state[i]).collect());
+        Ok(Self { theta, alpha, volts: run.voltages, rates })
     }
 }
 
@@ -231,8 +233,13 @@ pub(crate) fn search(
     integrals: Integrals,
 ) -> Result<Found> {
     let (theta, alpha) = (&record.theta, &record.alpha);
-    let rates = [rate(theta, velocity)?, rate(alpha, velocity)?];
-    let sign: Vec<f64> = rates[0].iter().map(|v| v.signum()).collect();
+    let rates = match velocity {
+        Velocity::True => record.rates.clone(),
+        Velocity::Observer => [super::duffing::observed(theta)?, super::duffing::observed(alpha)?],
+        Velocity::Smoothed => [theta, alpha].map(|angle| savitzky_golay(angle, STEP, 61, 5).d1),
+    };
+    // At rest the sign is zero.
+    let sign: Vec<f64> = rates[0].iter().map(|v| if *v == 0.0 { 0.0 } else { v.signum() }).collect();
     let library = library();
     let values = library.evaluate(&[theta, &rates[0], alpha, &rates[1]], &[("sign(theta')", &sign)])?;
     let labels = library.labels();
@@ -267,26 +274,21 @@ pub(crate) fn search(
     Ok(Found { search: select::search(&problem, &select::Options::normalised())?, names })
 }
 
-fn rate(angle: &[f64], from: Velocity) -> Result<Vec<f64>> {
-    match from {
-        Velocity::True => bail!("a record of the link holds no true velocity"),
-        Velocity::Observer => super::duffing::observed(angle),
-        Velocity::Smoothed => Ok(savitzky_golay(angle, STEP, 61, 5).d1),
-    }
-}
-
 /// Seed of the record behind the page's tables and figures.
 pub(crate) const SEED: u64 = 1;
 
 /// Both equations by Algorithm 1 on the dithered record of the page.
 pub(crate) fn of_the_page() -> Result<&'static [Found; 2]> {
     static ONCE: OnceLock<Result<[Found; 2]>> = OnceLock::new();
-    let made = ONCE.get_or_init(|| {
-        let record = Record::new(SEED, true)?;
-        let find = |equation| search(&record, equation, Velocity::Smoothed, Integrals::Windows);
-        Ok([find(Equation::Theta)?, find(Equation::Alpha)?])
-    });
+    let made = ONCE.get_or_init(|| with_velocities(Velocity::Smoothed));
     made.as_ref().map_err(|e| anyhow!("{e:#}"))
+}
+
+/// The same with other velocities.
+pub(crate) fn with_velocities(velocity: Velocity) -> Result<[Found; 2]> {
+    let record = Record::new(SEED, true)?;
+    let find = |equation| search(&record, equation, velocity, Integrals::Windows);
+    Ok([find(Equation::Theta)?, find(Equation::Alpha)?])
 }
 
 /// Seconds of the record that `greybox identify` gets: it simulates all of them many times.
@@ -296,7 +298,7 @@ pub(crate) const IDENTIFIED_SECONDS: f64 = 30.0;
 pub(crate) fn identified() -> Result<&'static Identification> {
     static ONCE: OnceLock<Result<Identification>> = OnceLock::new();
     let made = ONCE.get_or_init(|| {
-        let Record { theta, alpha, volts } = Record::new(SEED, true)?;
+        let Record { theta, alpha, volts, .. } = Record::new(SEED, true)?;
         let samples = (IDENTIFIED_SECONDS / STEP).round() as usize;
         let channel = |name: &str, unit: &str, mut values: Vec<f64>| {
             values.truncate(samples);
