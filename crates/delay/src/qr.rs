@@ -1,4 +1,5 @@
-//! Least squares by Householder QR of normalised columns: the only solver of this crate.
+//! Least squares by Householder QR of normalised columns, with the orthogonal factor: variable projection needs it at
+//! every delay, and the triangles of `greybox-sparse` do not keep it.
 use nalgebra::DMatrix;
 
 /// A = Q R diag(scale): columns are divided by their norms first, so that units do not matter.

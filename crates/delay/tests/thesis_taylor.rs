@@ -117,16 +117,21 @@ fn printed_signals_give_the_delay_of_the_thesis() {
         let errors: Vec<f64> = search.models.iter().map(|m| m.test_error).collect();
         assert!(errors[1] > 1e4 * errors[2] && errors[3] > 0.9 * errors[2], "{errors:?}");
     }
-    // With noise: the structure at order 3 always, the delay anywhere between 0.10 and 0.26.
-    for seed in 1..6 {
-        let (train, test) = rows(0.01, seed, Initial::Separate);
-        let search = algorithm_2(&train, &test, 3, &Options::thesis(2, seed));
-        let model = &search.models[2];
-        assert!(is_exact(model), "seed {seed}: {model:?}");
-        let tau = reading(model).delay;
-        println!("{seed}: {tau}");
-        assert!((0.09..=0.27).contains(&tau), "seed {seed}: {tau}");
-    }
+    // With noise: the structure at order 3 always, and the delay of the truncation in the median. A single recording
+    // may land anywhere from 0.1 to 0.3, by the luck of the draw alone: recording 3 does so over seeds of the draw.
+    let tau: Vec<f64> = (1..12)
+        .map(|seed| {
+            let (train, test) = rows(0.01, seed, Initial::Separate);
+            let search = algorithm_2(&train, &test, 3, &Options::thesis(2, seed));
+            let model = &search.models[2];
+            assert!(is_exact(model), "seed {seed}: {model:?}");
+            let reading = reading(model);
+            assert!((0.05..0.4).contains(&reading.delay), "seed {seed}: {reading:?}");
+            reading.delay
+        })
+        .collect();
+    println!("{tau:?}");
+    assert!((0.14..=0.17).contains(&median(tau.clone())), "{tau:?}");
 }
 
 #[test]

@@ -21,6 +21,7 @@ use rayon::prelude::*;
 use crate::error::{SparseError, check_range};
 use crate::folds::minimum;
 use crate::gram::{BlockGram, Gram};
+use crate::protect::checked;
 use crate::rows::{Rows, check_ranges, count};
 use crate::select::{Options, Problem, Search, Selector, held_out_errors, ordered_grid, path};
 use crate::triangle::{Fit, Triangle};
@@ -128,9 +129,10 @@ impl Bootstrap {
 /// model.
 ///
 /// # Errors
-/// [`SparseError::Option`] for bad settings; [`SparseError::RowRange`], also for validation rows among those that
-/// are drawn; [`SparseError::Empty`] for an empty grid; [`SparseError::TooFewRows`] if a replicate leaves out no
-/// row to judge by; [`SparseError::Overflow`]; and those of the selector.
+/// [`SparseError::Option`] for bad settings; [`SparseError::NoSuchColumn`]; [`SparseError::RowRange`], also for
+/// validation rows among those that are drawn; [`SparseError::Empty`] for an empty grid;
+/// [`SparseError::TooFewRows`] if a replicate leaves out no row to judge by; [`SparseError::Overflow`]; and those
+/// of the selector.
 ///
 /// ```
 /// use greybox_sparse::bootstrap::{BootstrapOptions, Penalty, Resample, bootstrap};
@@ -161,6 +163,7 @@ pub fn bootstrap(
     if options.replicates == 0 {
         return Err(SparseError::Empty { what: "bootstrap replicates" });
     }
+    let protected = &checked(protected, rows.columns())?;
     let judge = Judge::new(rows, ranges, protected.len(), selector, penalty)?;
     let sampler = Sampler::new(rows, ranges, options.resample)?;
     let replicates: Vec<(f64, Vec<f64>)> = (0..options.replicates)
@@ -648,6 +651,11 @@ mod tests {
         let run = |penalty: Penalty, resample| {
             bootstrap(&rows, &[0..40], &[], Selector::StlsqRaw, &penalty, &options(resample)).unwrap_err()
         };
+        // Named twice is protected once: every size from one column up is tried.
+        let small = BootstrapOptions { replicates: 1, ..options(Resample::Rows { ratio: 1.0 }) };
+        let all = Penalty::LeftOut { grid: vec![] };
+        let twice = bootstrap(&rows, &[0..40], &[1; 9], Selector::Backward, &all, &small).unwrap();
+        assert_eq!(twice.inclusion[1], 1.0);
         let half = Resample::Rows { ratio: 0.5 };
         let on = |ranges: Vec<Range<usize>>| Penalty::Validated { grid: vec![0.1], ranges };
         assert!(matches!(run(on(vec![39..60]), half), SparseError::RowRange { start: 39, .. }));
