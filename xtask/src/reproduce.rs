@@ -205,6 +205,9 @@ pub(crate) fn run(root: &Path, arguments: &Arguments) -> Result<Ending> {
             missing.push(fixture);
             continue;
         };
+        if entry.slow {
+            eprintln!("{}: many records, this takes a while", entry.id);
+        }
         let piece = make(&fixture).with_context(|| entry.id.to_owned())?;
         let failures = judge(&piece, &fixture);
         println!("{:<11} {}", entry.id, piece.status.name());

@@ -241,7 +241,7 @@ pub(crate) fn figure_3_1(_: &Fixture) -> Result<Piece> {
             let rise = error(5) / error(3);
             piece.checks.push(Check::new("MSE at order 5 over that at 3, as printed", rise));
         }
-        let axes = (Axis::linear("order of the polynomial"), Axis::log("MSE on the test record"));
+        let axes = (Axis::whole("order of the polynomial"), Axis::log("MSE on the test record"));
         draw(&mut piece, caption, axes, vec![Series::new("", Style::Joined, test_errors(search))])?;
     }
     Ok(piece)
@@ -271,7 +271,7 @@ pub(crate) fn figure_3_5(_: &Fixture) -> Result<Piece> {
         piece.checks.push(Check::new(format!("MSE at order 1 over the least, {symbol}"), first / least));
         series.push(Series::new(symbol, Style::Joined, curve));
     }
-    let axes = (Axis::linear("order of the polynomials"), Axis::log("MSE on the test record"));
+    let axes = (Axis::whole("order of the polynomials"), Axis::log("MSE on the test record"));
     draw(&mut piece, "Both equations of the virtual joint.", axes, series)?;
     Ok(piece)
 }

@@ -247,7 +247,7 @@ pub(crate) fn draw(piece: &mut Piece, caption: &str, axes: (Axis, Axis), series:
 }
 
 fn aic_axes() -> (Axis, Axis) {
-    (Axis::linear("order of the polynomial"), Axis::linear("AIC on the test rows"))
+    (Axis::whole("order of the polynomial"), Axis::linear("AIC on the test rows"))
 }
 
 fn lambda_axes() -> (Axis, Axis) {
@@ -534,6 +534,14 @@ fn table_2_3(fixture: &Fixture) -> Result<Piece> {
     }
     let share = 100.0 * inside as f64 / all as f64;
     piece.checks.push(Check::new("intervals of greybox identify that hold the truth, %", share));
+    // A term that was not found is zero.
+    for row in fixture.rows.iter().filter_map(|row| row.get("name")?.as_str()) {
+        for column in [&mut by_windows, &mut by_identify] {
+            if column.iter().all(|(name, _)| name != row) {
+                column.push((row.to_owned(), 0.0));
+            }
+        }
+    }
     piece.columns.push(Column { title: "virtual rig, windowed".into(), values: by_windows });
     piece.columns.push(Column { title: "virtual rig, greybox identify".into(), values: by_identify });
     let headings = [
@@ -635,8 +643,8 @@ fn figure_2_6(_: &Fixture) -> Result<Piece> {
         Status::VirtualRig,
         format!(
             "{LINK} λ is here relative to a term's share of the voltage, since the coefficients span three decades. On \
-             the rig the curves are flat towards small λ, where a few superfluous terms do no harm, and rise where a true \
-             term is lost: there is no marked minimum inside as in the thesis. The sparsest model within one standard \
+             the rig the curves are flat towards small λ and rise where a true term is lost; the minimum lies in between, \
+             but only 3 % below the flat part. The sparsest model within one standard \
              error of the least MSE_cv is taken."
         ),
     );

@@ -266,8 +266,8 @@ pub(crate) fn search(
     };
     let target = rows.pop().context("no columns")?;
     let orders: Vec<usize> = library.lengths().iter().map(|length| length + 1).collect();
-    let all = [0..target.len()];
-    let split = train_test(&all, 0.5, gap)?;
+    let all = 0..target.len();
+    let split = train_test(std::slice::from_ref(&all), 0.5, gap)?;
     let problem = Problem::new(Rows::from_vecs(&rows, &target)?, &orders, &[0], split)?;
     let mut names = vec![equation.acceleration().to_owned()];
     names.extend(labels);
