@@ -10,7 +10,7 @@ use greybox_report::svg::nice_ticks;
 
 const WIDTH: f64 = 720.0;
 const HEIGHT: f64 = 380.0;
-const LEFT: f64 = 78.0;
+const LEFT: f64 = 88.0;
 const TOP: f64 = 16.0;
 const BOTTOM: f64 = 54.0;
 const MARGIN: f64 = 14.0;
@@ -44,6 +44,8 @@ pub(crate) struct Axis {
     pub(crate) scale: Scale,
     /// Its ends; by the data where not given.
     pub(crate) range: Option<(f64, f64)>,
+    /// Whether only whole numbers are marked.
+    pub(crate) whole: bool,
 }
 
 impl Axis {
@@ -52,10 +54,14 @@ impl Axis {
         Self { title: title.into(), ..Self::default() }
     }
 
+    /// A linear axis by the data that counts something.
+    pub(crate) fn whole(title: impl Into<String>) -> Self {
+        Self { title: title.into(), whole: true, ..Self::default() }
+    }
+
     /// A logarithmic axis by the data.
-    #[cfg_attr(not(test), expect(dead_code, reason = "for the figures that are not made yet"))]
     pub(crate) fn log(title: impl Into<String>) -> Self {
-        Self { title: title.into(), scale: Scale::Log, range: None }
+        Self { title: title.into(), scale: Scale::Log, ..Self::default() }
     }
 }
 
@@ -69,7 +75,6 @@ pub(crate) enum Style {
     /// Points.
     Points,
     /// Points joined by a line.
-    #[cfg_attr(not(test), expect(dead_code, reason = "for the figures that are not made yet"))]
     Joined,
 }
 
@@ -93,7 +98,10 @@ impl Series {
     }
 
     /// With error bars of ± `errors`, one per point.
-    #[cfg_attr(not(test), expect(dead_code, reason = "for the figures that are not made yet"))]
+    #[cfg_attr(
+        not(test),
+        expect(dead_code, reason = "no table of chapters 2 and 3 is drawn with error bars")
+    )]
     pub(crate) fn with_errors(self, errors: Vec<f64>) -> Self {
         Self { errors, ..self }
     }
@@ -119,6 +127,7 @@ pub(crate) struct Plot {
 /// An axis with its ends and places on the drawing.
 struct Mapped {
     scale: Scale,
+    whole: bool,
     ends: (f64, f64),
     places: (f64, f64),
 }
@@ -139,6 +148,7 @@ impl Mapped {
         };
         (ends.0.is_finite() && ends.1.is_finite() && ends.1 > ends.0).then_some(Self {
             scale: axis.scale,
+            whole: axis.whole,
             ends,
             places,
         })
@@ -165,7 +175,11 @@ impl Mapped {
         }
         let (low, high) =
             if self.scale == Scale::Log { (10f64.powf(low), 10f64.powf(high)) } else { (low, high) };
-        let (ticks, decimals) = nice_ticks(low, high, 7);
+        let (mut ticks, mut decimals) = nice_ticks(low, high, 7);
+        if self.whole {
+            ticks.retain(|t| (t - t.round()).abs() < 1e-9);
+            decimals = 0;
+        }
         ticks.into_iter().map(|t| (self.place(t), number(t, decimals))).collect()
     }
 }

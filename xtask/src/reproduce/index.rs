@@ -20,7 +20,7 @@ color:#fff;vertical-align:3px}.reproduced{background:#2c7a4b}.virtual_rig{backgr
 .constants{background:#5a6472}.differs{background:#7a4fa0}.none{background:#b98a00}.failed{background:#b3401f}\
 .scroll{overflow-x:auto}table{border-collapse:collapse;margin:10px 0 14px;font-size:14.5px}\
 caption{text-align:left;color:#5a6472;padding-bottom:4px}th,td{padding:3px 14px 3px 0;text-align:right;\
-border-bottom:1px solid #e9ecf0;vertical-align:top}td{white-space:nowrap}td.text{white-space:normal}th:first-child,td:first-child,.text{text-align:left}\
+border-bottom:1px solid #e9ecf0;vertical-align:top}td{white-space:nowrap}td.text,td:first-child{white-space:normal}th:first-child,td:first-child,.text{text-align:left}\
 th{font-weight:600;border-color:#8b95a3}.ours{color:#0b6fa8;font-weight:600}figure{margin:12px 0}\
 figcaption{color:#5a6472;font-size:14.5px}.errata{font-size:14.5px;background:#f5f7f9;padding:8px 14px;\
 border-radius:4px;margin:10px 0}.errata p{margin:3px 0}.failures{color:#b3401f;font-weight:600}\
@@ -263,10 +263,10 @@ fn printed(value: f64) -> String {
     if small { format!("{value:e}") } else { value.to_string() }.replace('-', "−")
 }
 
-/// A number of ours, to five figures.
+/// A number of ours, to five figures; whole numbers without decimals.
 pub(crate) fn number(value: f64) -> String {
-    if value == 0.0 {
-        return "0".into();
+    if value.fract() == 0.0 && value.abs() < 1e6 {
+        return format!("{value:.0}").replace('-', "−");
     }
     let decimals = (4.0 - value.abs().log10().floor()).clamp(0.0, 12.0) as usize;
     if value.abs() < 1e-3 || value.abs() >= 1e6 || !value.is_finite() {
