@@ -466,12 +466,8 @@ fn order_search(
         let Some(rows) = weak::rows(structure, model, data, values, equation, window, trial) else {
             continue;
         };
-<<<<<<< HEAD
         let weak::Regression { target, columns, protected } =
             weak::regression(structure, &rows, trial.and_then(|t| t.gain));
-=======
-        let (target, columns, protected) = weak::regression(structure, &rows, trial.and_then(|t| t.gain));
->>>>>>> repro
         let views: Vec<&[f64]> = columns.iter().map(|c| c.1.as_slice()).collect();
         let sizes: Vec<usize> = (1..=options.order)
             .map(|n| columns.iter().filter(|c| c.0.is_none_or(|t| structure.terms[t].order <= n)).count())

@@ -96,7 +96,6 @@ pub(crate) struct Linearised {
 }
 
 impl Linearised {
-<<<<<<< HEAD
     /// What the columns stand for.
     pub(crate) fn roles(&self, structure: &Structure, allowed: &[bool]) -> Roles {
         let mut columns = vec![None; self.reduced.columns];
@@ -106,22 +105,6 @@ impl Linearised {
             }
         }
         Roles::new(&columns, &structure.terms, allowed)
-=======
-    /// Columns that always stay, that are optional, and that are even.
-    pub(crate) fn roles(
-        &self,
-        structure: &Structure,
-        allowed: &[bool],
-    ) -> (Vec<usize>, Vec<usize>, Vec<usize>) {
-        let pick = |wanted: &dyn Fn(usize) -> bool| -> Vec<usize> {
-            (0..structure.terms.len()).filter(|&i| wanted(i)).filter_map(|i| self.column[i]).collect()
-        };
-        let mut kept = pick(&|i| !structure.terms[i].optional);
-        kept.extend(&self.extras);
-        let optional = pick(&|i| structure.terms[i].optional && allowed[i]);
-        let even = pick(&|i| structure.terms[i].even);
-        (kept, optional, even)
->>>>>>> repro
     }
 
     /// The regression on blocks drawn with replacement.
