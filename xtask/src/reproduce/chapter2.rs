@@ -554,8 +554,9 @@ fn table_2_3(fixture: &Fixture) -> Result<Piece> {
     ];
     let caption = format!(
         "Errors of the coefficients found on the virtual rig, in % of its own; {inside} of {all} intervals hold the truth. \
-         The sign of a smoothed velocity is wrong while the hub sticks: the windowed errors of friction and of alpha' \
-         halve with the true velocities."
+         The sign of a smoothed velocity is wrong \
+         while the hub sticks: with the true velocities the largest windowed errors halve. The noise of the angles stays \
+         in the regressors and, fed back, in the voltage."
     );
     piece.tables.push(Table { caption, headings: headings.map(String::from).into(), rows });
     piece.tables.push(what_the_link_needs(&mut piece.checks)?);

@@ -20,7 +20,7 @@ color:#fff;vertical-align:3px}.reproduced{background:#2c7a4b}.virtual_rig{backgr
 .constants{background:#5a6472}.differs{background:#7a4fa0}.none{background:#b98a00}.failed{background:#b3401f}\
 .scroll{overflow-x:auto}table{border-collapse:collapse;margin:10px 0 14px;font-size:14.5px}\
 caption{text-align:left;color:#5a6472;padding-bottom:4px}th,td{padding:3px 14px 3px 0;text-align:right;\
-border-bottom:1px solid #e9ecf0;vertical-align:top}td{white-space:nowrap}td.text,td:first-child{white-space:normal}th:first-child,td:first-child,.text{text-align:left}\
+border-bottom:1px solid #e9ecf0;vertical-align:top}td{white-space:nowrap}td.text,.own td:first-child{white-space:normal}th:first-child,td:first-child,.text{text-align:left}\
 th{font-weight:600;border-color:#8b95a3}.ours{color:#0b6fa8;font-weight:600}figure{margin:12px 0}\
 figcaption{color:#5a6472;font-size:14.5px}.errata{font-size:14.5px;background:#f5f7f9;padding:8px 14px;\
 border-radius:4px;margin:10px 0}.errata p{margin:3px 0}.failures{color:#b3401f;font-weight:600}\
@@ -168,7 +168,8 @@ fn section(out: &mut String, outcome: &Outcome, errata: &BTreeMap<String, String
     }
     if !piece.checks.is_empty() {
         let rows = piece.checks.iter().map(|c| {
-            let bounds = fixture.bounds.get(&c.name).map_or_else(String::new, ToString::to_string);
+            let bounds =
+                fixture.bounds.get(&c.name).map_or_else(String::new, |b| b.to_string().replace('-', "−"));
             vec![c.name.clone(), number(c.measured), bounds]
         });
         let headings = ["judged".into(), "measured".into(), "bounds".into()].into();
@@ -215,7 +216,11 @@ fn thesis_table(out: &mut String, fixture: &Fixture, outcome: Option<&Outcome>) 
 }
 
 fn our_table(out: &mut String, table: &Table) {
-    let _ = write!(out, "<div class=\"scroll\"><table><caption>{}</caption><tr>", escape(&table.caption));
+    let _ = write!(
+        out,
+        "<div class=\"scroll\"><table class=\"own\"><caption>{}</caption><tr>",
+        escape(&table.caption)
+    );
     for heading in &table.headings {
         let _ = write!(out, "<th>{}</th>", escape(heading));
     }
