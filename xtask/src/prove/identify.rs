@@ -313,7 +313,7 @@ const CASES: [(&str, usize, CaseFn); 14] = [
     ("peers' protocol, 1 ms, 0.1", 100, |s| peers_case(s, 0.001, 0.1, 85)),
     ("peers' protocol, 10 ms, 0.01", 100, |s| peers_case(s, 0.01, 0.01, 95)),
     ("peers' protocol, 10 ms, 0.05", 100, |s| peers_case(s, 0.01, 0.05, 25)),
-    ("peers' protocol, 10 ms, no noise", 20, |s| peers_case(s, 0.01, 0.0, 100)),
+    ("peers' protocol, 10 ms, no noise", 20, |s| peers_case(s, 0.01, 0.0, 20)),
     ("intervals, 10 ms, 0.01", 400, interval_case),
     ("flexible link, dithered", 20, link_case),
     ("delayed duffing, 20 s, kp known", 30, |s| delayed_case(s, 20.0, Some(2.0), Some((0.7, 2.2)))),
@@ -348,7 +348,8 @@ fn peers_case(seeds: &[u64], dt: f64, sigma: f64, goal: usize) -> Result<Vec<Fig
     let options = Options { replicates, ..peers_options() };
     let make = |seed| Ok(vec![duffing_recording(seed, dt, 40.0, sigma, [0.0, 0.0])?]);
     let trials = run_seeds(seeds, make, &options, &[DUFFING], None)?;
-    let mut figures = vec![exact_figure(&trials, 0, "structure exact", goal, 100)];
+    let of = if sigma > 0.0 { 100 } else { 20 };
+    let mut figures = vec![exact_figure(&trials, 0, "structure exact", goal, of)];
     figures.push(Figure::plain("median errors m k1 k3 c1 c2 c3", percent(&medians(&trials, 0)) + " %"));
     if sigma > 0.0 && goal > 90 {
         figures.push(efficiency_figure(&trials));
