@@ -292,8 +292,13 @@ fn exact_figure(trials: &[Trial], equation: usize, name: &str, goal: usize, of: 
     Figure::judged(name, format!("{found} of {n}"), format!(">= {goal} of {of}"), found >= least)
 }
 
-fn limits_figure(name: &str, measured: &[f64], limits: &[f64]) -> Figure {
-    let met = measured.iter().zip(limits).all(|(m, l)| m <= l);
+/// Below this many seeds a median is no more than one draw: only gross misses are judged.
+const FEW: usize = 10;
+
+fn limits_figure(name: &str, measured: &[f64], limits: &[f64], seeds: usize) -> Figure {
+    // The median of |error| is 0.67 standard deviations; single draws stay within five medians (3.4).
+    let factor = if seeds < FEW { 5.0 } else { 1.0 };
+    let met = measured.iter().zip(limits).all(|(m, l)| *m <= factor * l);
     Figure::judged(name, percent(measured) + " %", percent(limits) + " %", met)
 }
 
@@ -330,16 +335,19 @@ fn thesis_case(seeds: &[u64]) -> Result<Vec<Figure>> {
     let limits = [0.0002, 0.0005, 0.008, 0.005, 0.011, 0.0005];
     Ok(vec![
         exact_figure(&trials, 0, "structure exact (orders 1 to 6)", 98, 100),
-        limits_figure("median errors m k1 k3 c1 c2 c3", &medians(&trials, 0), &limits),
+        limits_figure("median errors m k1 k3 c1 c2 c3", &medians(&trials, 0), &limits, trials.len()),
         efficiency_figure(&trials),
     ])
 }
 
 fn efficiency_figure(trials: &[Trial]) -> Figure {
     let worst = inefficiency(trials);
-    // Over n seeds the mean square scatters by sqrt(2/n); six coefficients are looked at.
-    let slack = 2.0 * (2.0 / trials.len() as f64).sqrt();
-    let met = worst <= 1.3_f64.max(1.0 + slack);
+    // Over few seeds n the mean square is χ²(n)/n: its upper 0.02 % point by Wilson and Hilferty, since the worst of
+    // several coefficients is looked at.
+    let n = trials.len() as f64;
+    let chance = (1.0 - 2.0 / (9.0 * n) + 3.5 * (2.0 / (9.0 * n)).sqrt()).powi(3);
+    let limit = if n < 100.0 { chance.max(1.3) } else { 1.3 };
+    let met = worst <= limit;
     Figure::judged("variance over Cramer-Rao bound, worst", format!("{worst:.2}"), "<= 1.3", met)
 }
 
@@ -473,7 +481,7 @@ fn link_case(seeds: &[u64]) -> Result<Vec<Figure>> {
             ">= 19 of 20",
             both >= share(19, 20, n),
         ),
-        limits_figure("worst median error of hub, link", &worst, &[0.04, 0.04]),
+        limits_figure("worst median error of hub, link", &worst, &[0.04, 0.04], n),
     ])
 }
 
@@ -501,7 +509,7 @@ fn delayed_case(
                 name,
                 text,
                 format!("<= {m} %, <= {w} %"),
-                100.0 * middle <= m && 100.0 * worst <= w,
+                (delays.len() < FEW || 100.0 * middle <= m) && 100.0 * worst <= w,
             ),
             None => Figure::plain(name, text),
         },
@@ -560,6 +568,9 @@ pub(crate) fn run(first: u64, count: Option<usize>, only: Option<&str>) -> Resul
         let seeds: Vec<u64> = (0..n as u64).map(|i| first.wrapping_mul(1_000_003).wrapping_add(i)).collect();
         eprintln!("{name} ({n} seeds) …");
         outcomes.push(Outcome { case: (*name).to_string(), figures: case(&seeds)? });
+    }
+    if count.is_some_and(|c| c < FEW) {
+        eprintln!("with so few seeds only gross misses are judged; the goals are those of the full proof");
     }
     Ok(outcomes)
 }
