@@ -10,6 +10,7 @@ pub struct Along<'a> {
     /// `states[piece][i]` is entry i of the state vector.
     pub states: Vec<Vec<Vec<f64>>>,
     parameters: Vec<f64>,
+    simulated: bool,
 }
 
 impl<'a> Along<'a> {
@@ -37,7 +38,7 @@ impl<'a> Along<'a> {
                 }
             }
         }
-        Along { setup, states, parameters: point.parameters.clone() }
+        Along { setup, states, parameters: point.parameters.clone(), simulated: false }
     }
 
     /// Simulated states, `x[piece][i * n + k]`.
@@ -47,7 +48,55 @@ impl<'a> Along<'a> {
             .zip(&setup.data.pieces)
             .map(|(x, piece)| x.chunks(piece.len).map(<[f64]>::to_vec).collect())
             .collect();
-        Along { setup, states, parameters: parameters.to_vec() }
+        Along { setup, states, parameters: parameters.to_vec(), simulated: true }
+    }
+
+    /// Highest derivatives `[piece][state][sample]`: smoothed where the state is measured, else what the
+    /// model's own equations say.
+    fn highest(&self) -> Option<Vec<Vec<Vec<f64>>>> {
+        let (model, nz) = (&self.setup.model, self.setup.system.nz);
+        let symbols: Vec<(&str, u8)> =
+            model.states.iter().map(|s| (s.name.as_str(), s.order as u8)).collect();
+        let mut exprs = Vec::new();
+        for equation in &model.equations {
+            let (mass, rest) = equation.residual().affine_in(&symbols)?;
+            exprs.extend(mass);
+            exprs.push(rest);
+        }
+        let values = self.eval(&exprs, &[])?;
+        let smoothed = !self.simulated;
+        Some(
+            (0..self.states.len())
+                .map(|p| {
+                    let n = self.setup.data.pieces[p].len;
+                    let mut z = vec![vec![0.0; n]; nz];
+                    let mut a = vec![0.0; nz * nz];
+                    let mut b = vec![0.0; nz];
+                    let mut pivots = vec![0; nz];
+                    for k in 0..n {
+                        for e in 0..nz {
+                            for j in 0..nz {
+                                a[e * nz + j] = values[e * (nz + 1) + j][p][k];
+                            }
+                            b[e] = -values[e * (nz + 1) + nz][p][k];
+                        }
+                        greybox_simulate::small::factor(&mut a, &mut pivots, nz);
+                        greybox_simulate::small::solve(&a, &pivots, nz, &mut b, 1);
+                        for j in 0..nz {
+                            z[j][k] = b[j];
+                        }
+                    }
+                    if smoothed {
+                        for (z, hat) in z.iter_mut().zip(&self.setup.hats.highest[p]) {
+                            if let Some(hat) = hat {
+                                z.clone_from(hat);
+                            }
+                        }
+                    }
+                    z
+                })
+                .collect(),
+        )
     }
 
     /// Values of `exprs` (states, inputs, parameters of the model, `extra` names), as
@@ -83,8 +132,11 @@ impl<'a> Along<'a> {
                 return (primes == 0).then_some(base + i);
             }
             if let Some(j) = model.state(name) {
-                return ((primes as usize) < system.orders[j])
-                    .then(|| 1 + system.offsets[j] + primes as usize);
+                return match (primes as usize).cmp(&system.orders[j]) {
+                    std::cmp::Ordering::Less => Some(1 + system.offsets[j] + primes as usize),
+                    std::cmp::Ordering::Equal => Some(system.highest() + j),
+                    std::cmp::Ordering::Greater => None,
+                };
             }
             if primes > 0 {
                 return None;
@@ -116,6 +168,11 @@ impl<'a> Along<'a> {
         kinds.extend(std::iter::repeat_n(LeafKind::Parameter, extra.len()));
         kinds.extend(std::iter::repeat_n(LeafKind::Varying, delays.len()));
         let tape = Tape::compile(&rewritten, kinds, &resolve).ok()?;
+        let highest = exprs.iter().any(|e| {
+            let used = e.variables();
+            used.iter().any(|(n, p)| model.state(n).is_some_and(|j| *p as usize == system.orders[j]))
+        });
+        let highest = if highest { self.highest()? } else { Vec::new() };
         let mut out = vec![Vec::with_capacity(self.states.len()); exprs.len()];
         for (i, piece) in self.setup.data.pieces.iter().enumerate() {
             let time: Vec<f64> = (0..piece.len).map(|k| piece.start + k as f64 * piece.dt).collect();
@@ -125,7 +182,7 @@ impl<'a> Along<'a> {
                 } else if leaf < 1 + system.nx {
                     Column::Series(&self.states[i][leaf - 1])
                 } else if leaf < system.inputs() {
-                    Column::Value(0.0)
+                    highest.get(i).map_or(Column::Value(0.0), |z| Column::Series(&z[leaf - system.highest()]))
                 } else if leaf < system.parameters() {
                     Column::Series(&piece.inputs[leaf - system.inputs()])
                 } else if leaf < base {

@@ -1,7 +1,7 @@
 //! A mechanism at a place: what it adds to the model.
 
 use greybox_calibrate::Free;
-use greybox_model::{Expr, Model, Parameter};
+use greybox_model::{Equation, Expr, Model, Parameter, State, Unit};
 
 use crate::library::{Mechanism, On};
 use crate::place::{Motion, Place};
@@ -24,6 +24,8 @@ pub struct Instance {
     pub candidate: Candidate,
     /// Names of the parameters in the model, in the order of [`Mechanism::parameters`].
     pub names: Vec<String>,
+    /// Names of its states in the model, in the order of the file.
+    pub states: Vec<String>,
     /// The law as it stands in the model (a force), or the replacement.
     pub expression: Expr,
 }
@@ -32,19 +34,26 @@ pub struct Instance {
 pub fn candidates(model: &Model, library: &[Mechanism], places: &[Place]) -> Vec<Candidate> {
     let mut out = Vec::new();
     for (i, mechanism) in library.iter().enumerate() {
+        let symmetric = mechanism.reaction.as_ref().is_some_and(|r| swapped(&mechanism.law) == *r);
+        let mut pairs: Vec<(&Motion, &Motion)> = Vec::new();
         for place in places {
             let fits = match (mechanism.on, place) {
-                (On::Motion, Place::Motion(m)) => {
-                    let needs_position = mentions(&mechanism.law, 0);
-                    let needs_rate = mentions(&mechanism.law, 1);
-                    (!needs_position || m.position.is_some()) && (!needs_rate || m.rate.is_some())
+                (On::Motion, Place::Motion(m)) => has(mechanism, "d", m),
+                (On::Spring, Place::Spring { motion, level: 0, alone: true, .. })
+                | (On::Feedback, Place::Spring { motion, .. }) => has(mechanism, "d", motion),
+                (On::Load, Place::Load { motion, .. }) => has(mechanism, "d", motion),
+                (On::Pair, Place::Pair { own, other }) => {
+                    let seen = symmetric && pairs.iter().any(|p| *p == (other, own));
+                    pairs.push((own, other));
+                    !seen && has(mechanism, "d", own) && has(mechanism, "o", other)
                 }
-                (On::Equation, Place::Equation(_)) => true,
+                (On::Equation, Place::Equation(_))
+                | (On::Measurement, Place::Measurement(_))
+                | (On::Parameter, Place::Parameter(_)) => true,
                 (On::Input, Place::Input(i)) => {
                     let name = &model.inputs[*i].name;
                     model.equations.iter().any(|e| e.residual().mentions(name))
                 }
-                (On::Measurement, Place::Measurement(_)) => true,
                 _ => false,
             };
             if fits {
@@ -58,28 +67,92 @@ pub fn candidates(model: &Model, library: &[Mechanism], places: &[Place]) -> Vec
     out
 }
 
-fn mentions(law: &Expr, primes: u8) -> bool {
-    law.contains("d", primes)
+/// Whether a motion knows everything that the mechanism asks of it.
+fn has(mechanism: &Mechanism, placeholder: &str, m: &Motion) -> bool {
+    let known = [&m.position, &m.rate, &m.acceleration];
+    (0..=3u8).all(|primes| {
+        !mechanism.depends_on(placeholder, primes) || known.get(primes as usize).is_some_and(|e| e.is_some())
+    })
+}
+
+/// The law with d and o exchanged.
+fn swapped(law: &Expr) -> Expr {
+    law.substitute(&|n, primes| match n {
+        "d" => Some(Expr::prime("o", primes)),
+        "o" => Some(Expr::prime("d", primes)),
+        _ => None,
+    })
+}
+
+fn level(m: &Motion, primes: u8) -> Option<Expr> {
+    match primes {
+        0 => m.position.clone(),
+        1 => m.rate.clone(),
+        2 => m.acceleration.clone(),
+        _ => None,
+    }
+}
+
+/// A weight in front of a law: `w*law`.
+fn weighted(w: f64, law: Expr) -> Expr {
+    if w == 1.0 {
+        law
+    } else if w == -1.0 {
+        -law
+    } else {
+        Expr::Num(w) * law
+    }
 }
 
 impl Candidate {
-    /// An expression of the mechanism file in the model's own names; `rename` maps its parameters.
+    /// The motion it acts on, where it acts on one.
+    pub fn motion(&self) -> Option<&Motion> {
+        match &self.place {
+            Place::Motion(m) | Place::Spring { motion: m, .. } | Place::Load { motion: m, .. } => Some(m),
+            Place::Pair { own, .. } => Some(own),
+            _ => None,
+        }
+    }
+
+    /// An expression of the mechanism file in the model's own names; `rename` maps its parameters and
+    /// states.
     pub fn translate(&self, model: &Model, e: &Expr, rename: &dyn Fn(&str) -> String) -> Expr {
         e.substitute(&|name, primes| match (name, &self.place) {
-            ("d", Place::Motion(Motion { position, rate, .. })) => {
-                let of = if primes == 0 { position } else { rate };
-                of.clone().map(|d| if self.mirrored { -d } else { d })
+            ("d", Place::Pair { own, .. }) => level(own, primes),
+            ("d", _) => {
+                let d = self.motion().and_then(|m| level(m, primes));
+                d.map(|d| if self.mirrored { -d } else { d })
             }
-            ("u", Place::Input(i)) if primes == 0 => Some(Expr::var(&model.inputs[*i].name)),
+            ("o", Place::Pair { other, .. }) => level(other, primes),
+            ("load", Place::Load { load, .. }) if primes == 0 => Some(load.clone()),
+            ("u", Place::Input(i)) => Some(Expr::prime(&model.inputs[*i].name, primes)),
             ("y", Place::Measurement(c)) if primes == 0 => Some(model.measurements[*c].expr.clone()),
-            ("t" | "pi" | "d" | "u" | "y", _) => None,
-            _ => Some(Expr::var(&rename(name))),
+            ("p", Place::Parameter(p)) if primes == 0 => Some(Expr::var(&model.parameters[*p].name)),
+            ("k", Place::Spring { parameter, factor, .. }) if primes == 0 => {
+                Some(weighted(*factor, Expr::var(&model.parameters[*parameter].name)))
+            }
+            ("t" | "pi", _) => None,
+            _ => Some(Expr::prime(&rename(name), primes)),
         })
     }
 
-    /// Names for the mechanism's parameters that the model does not use yet: as the library writes
-    /// them, else with the equation's name behind.
-    pub fn names(&self, model: &Model, mechanism: &Mechanism) -> Vec<String> {
+    /// What the law stands in for: zero for a force.
+    pub fn base(&self, model: &Model) -> Expr {
+        match &self.place {
+            Place::Input(i) => Expr::var(&model.inputs[*i].name),
+            Place::Measurement(c) => model.measurements[*c].expr.clone(),
+            Place::Parameter(p) => Expr::var(&model.parameters[*p].name),
+            Place::Spring { motion, parameter, factor, .. } => {
+                let k = weighted(*factor, Expr::var(&model.parameters[*parameter].name));
+                k * motion.position.clone().unwrap_or(Expr::Num(0.0))
+            }
+            _ => Expr::Num(0.0),
+        }
+    }
+
+    /// Names for the mechanism's parameters and states that the model does not use yet: as the library
+    /// writes them, else with the equation's name behind.
+    pub fn names(&self, model: &Model, mechanism: &Mechanism) -> (Vec<String>, Vec<String>) {
         let taken = |n: &str| {
             model.parameter(n).is_some()
                 || model.state(n).is_some()
@@ -87,8 +160,9 @@ impl Candidate {
                 || matches!(n, "t" | "pi")
         };
         let suffix = self.place.equations(model).first().cloned().unwrap_or_default();
-        let plain: Vec<String> = mechanism.parameters().map(str::to_string).collect();
-        if plain.iter().any(|n| taken(n)) {
+        let plain: Vec<String> =
+            mechanism.parameters().chain(mechanism.states.iter().map(|s| s.name.as_str())).map(str::to_string).collect();
+        let mut all = if plain.iter().any(|n| taken(n)) {
             plain
                 .iter()
                 .map(|n| {
@@ -98,33 +172,83 @@ impl Candidate {
                 .collect()
         } else {
             plain
-        }
+        };
+        let states = all.split_off(mechanism.parameters().count());
+        (all, states)
     }
 
     /// Adds the mechanism to a model, its parameters at `values` (order of
     /// [`Mechanism::parameters`]).
     pub fn insert(&self, model: &mut Model, mechanism: &Mechanism, values: &[f64]) -> Instance {
-        let names = self.names(model, mechanism);
-        let plain: Vec<String> = mechanism.parameters().map(str::to_string).collect();
+        let (names, states) = self.names(model, mechanism);
+        let plain: Vec<String> = mechanism
+            .parameters()
+            .chain(mechanism.states.iter().map(|s| s.name.as_str()))
+            .map(str::to_string)
+            .collect();
+        let new: Vec<&String> = names.iter().chain(&states).collect();
         let rename =
-            |n: &str| plain.iter().position(|p| p == n).map_or_else(|| n.to_string(), |i| names[i].clone());
+            |n: &str| plain.iter().position(|p| p == n).map_or_else(|| n.to_string(), |i| new[i].clone());
         let mut law = self.translate(model, &mechanism.law, &rename).simplify();
+        // The states' equations and units, before anything is replaced in the model.
+        let equations: Vec<(Expr, Expr, Unit)> = mechanism
+            .states
+            .iter()
+            .map(|s| {
+                let of = |e: &Expr| self.translate(model, e, &rename);
+                let dimension = model.dimension_of(&of(&s.unit)).unwrap_or_default();
+                (of(&s.lhs), of(&s.rhs), Unit::si(dimension))
+            })
+            .collect();
         match &self.place {
-            Place::Motion(motion) => {
+            Place::Motion(motion) | Place::Load { motion, .. } => {
                 if self.mirrored {
                     // A push towards −d is a negative force along d.
                     law = (-law).simplify();
                 }
                 for (e, &w) in motion.weights.iter().enumerate() {
                     if w != 0.0 {
-                        let term = if w == 1.0 {
-                            law.clone()
-                        } else if w == -1.0 {
-                            -law.clone()
-                        } else {
-                            Expr::Num(w) * law.clone()
+                        model.add_term(e, weighted(w, law.clone()));
+                    }
+                }
+            }
+            Place::Pair { own, other } => {
+                for (e, &w) in own.weights.iter().enumerate() {
+                    if w != 0.0 {
+                        model.add_term(e, weighted(w, law.clone()));
+                    }
+                }
+                if let Some(reaction) = &mechanism.reaction {
+                    let reaction = self.translate(model, reaction, &rename).simplify();
+                    for (e, &w) in other.weights.iter().enumerate() {
+                        if w != 0.0 {
+                            model.add_term(e, weighted(w, reaction.clone()));
+                        }
+                    }
+                }
+            }
+            Place::Spring { motion, parameter, alone, .. } => {
+                let name = model.parameters[*parameter].name.clone();
+                let base = self.base(model);
+                for (e, &w) in motion.weights.iter().enumerate() {
+                    if w == 0.0 {
+                        continue;
+                    }
+                    if *alone {
+                        // The law stands where the term stood.
+                        let without = |e: &Expr| {
+                            if !e.mentions(&name) {
+                                return e.clone();
+                            }
+                            e.substitute(&|n, p| (n == name && p == 0).then_some(Expr::Num(0.0))).simplify()
                         };
-                        model.add_term(e, term);
+                        let equation = &mut model.equations[e];
+                        equation.lhs = without(&equation.lhs);
+                        equation.rhs = without(&equation.rhs);
+                        model.add_term(e, weighted(w, law.clone()));
+                    } else {
+                        model.add_term(e, weighted(w, law.clone()));
+                        model.add_term(e, weighted(-w, base.clone()));
                     }
                 }
             }
@@ -134,6 +258,14 @@ impl Candidate {
                 model.replace(&name, 0, &law);
             }
             Place::Measurement(c) => model.measurements[*c].expr = law.clone(),
+            Place::Parameter(p) => {
+                let name = model.parameters[*p].name.clone();
+                let measured: Vec<Expr> = model.measurements.iter().map(|m| m.expr.clone()).collect();
+                model.replace(&name, 0, &law);
+                for (m, expr) in model.measurements.iter_mut().zip(measured) {
+                    m.expr = expr;
+                }
+            }
         }
         for (name, value) in names.iter().zip(values) {
             model.parameters.push(Parameter {
@@ -144,29 +276,32 @@ impl Candidate {
                 fixed: false,
             });
         }
-        Instance { candidate: self.clone(), names, expression: law }
+        for (name, (lhs, rhs, unit)) in states.iter().zip(equations) {
+            model.states.push(State { name: name.clone(), unit, order: 1, channel: None, initial: Vec::new() });
+            model.equations.push(Equation { name: name.clone(), lhs, rhs });
+        }
+        model.recompute_orders();
+        Instance { candidate: self.clone(), names, states, expression: law }
     }
 
     /// The mechanism's parameters as unknowns of a fit; `scales[i]` is the size of inner parameter i.
     pub fn free(&self, mechanism: &Mechanism, first: usize, scales: &[f64]) -> Vec<Free> {
         let positive = |n: &str| mechanism.positive.iter().any(|p| p == n);
-        let mut out = Vec::new();
-        for (i, name) in mechanism.linear.iter().enumerate() {
-            let lower = if positive(name) { 0.0 } else { f64::NEG_INFINITY };
-            out.push(Free { index: first + i, mean: 0.0, std: f64::INFINITY, lower, upper: f64::INFINITY });
-        }
-        for (i, inner) in mechanism.inner.iter().enumerate() {
-            let scale = scales[i].abs().max(1e-300);
-            // A positive parameter may run down to zero unless the file says otherwise.
-            let free_to_zero = positive(&inner.name) && inner.low <= 1e-3;
-            out.push(Free {
-                index: first + mechanism.linear.len() + i,
-                mean: 0.0,
-                std: f64::INFINITY,
-                lower: if free_to_zero { 0.0 } else { inner.low * scale },
-                upper: inner.high * scale,
-            });
-        }
-        out
+        mechanism
+            .parameters()
+            .enumerate()
+            .map(|(at, name)| {
+                let (lower, upper) = match mechanism.inner(name) {
+                    Some((i, inner)) => {
+                        let scale = scales[i].abs().max(1e-300);
+                        // A positive parameter may run down to zero unless the file says otherwise.
+                        let free_to_zero = positive(name) && inner.low <= 1e-3;
+                        (if free_to_zero { 0.0 } else { inner.low * scale }, inner.high * scale)
+                    }
+                    None => (if positive(name) { 0.0 } else { f64::NEG_INFINITY }, f64::INFINITY),
+                };
+                Free { index: first + at, mean: 0.0, std: f64::INFINITY, lower, upper }
+            })
+            .collect()
     }
 }

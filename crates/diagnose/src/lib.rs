@@ -7,6 +7,7 @@ pub mod library;
 pub mod locate;
 pub mod place;
 pub mod screen;
+pub mod spectra;
 pub mod search;
 pub mod surface;
 

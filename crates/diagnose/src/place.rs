@@ -5,6 +5,10 @@
 //! and g linear in the coordinates (or rates), shows an element of the machine: a spring or a damper
 //! that acts on the motion d = g with the weights w on the equations, so that action equals reaction.
 //! A missing force F(d, d') at that element enters equation e as w_e F.
+//!
+//! The other places: an equation as a whole, an input, a measurement, a parameter (that may drift), a
+//! spring (a parameter k whose element is a position, so that its term is w k d), a pair of coordinates
+//! (that may be coupled), and a motion with the force that its joint transmits.
 
 use greybox_model::{Dimension, Expr, Model};
 
@@ -19,6 +23,35 @@ pub enum Place {
     Input(usize),
     /// A measurement.
     Measurement(usize),
+    /// A parameter of the nominal model.
+    Parameter(usize),
+    /// The term w·k·d of a parameter k.
+    Spring {
+        /// d with its weights.
+        motion: Motion,
+        /// Index of k.
+        parameter: usize,
+        /// The term is `factor`·k·d.
+        factor: f64,
+        /// Primes of the coordinates in d; the motion's `position` is d at this level.
+        level: u8,
+        /// The parameter multiplies nothing but d (no reference that a feedback compares d with).
+        alone: bool,
+    },
+    /// The equation of one coordinate and another coordinate.
+    Pair {
+        /// d.
+        own: Motion,
+        /// o.
+        other: Motion,
+    },
+    /// A motion with the force that its joint transmits.
+    Load {
+        /// d.
+        motion: Motion,
+        /// The force, without highest derivatives.
+        load: Expr,
+    },
 }
 
 /// A motion on which forces can act.
@@ -32,23 +65,22 @@ pub struct Motion {
     pub position: Option<Expr>,
     /// d', where the model knows it.
     pub rate: Option<Expr>,
+    /// d'', where the motion is that of second-order coordinates.
+    pub acceleration: Option<Expr>,
 }
 
 impl Place {
     /// Names of the equations where it enters, the one that the report names first.
     pub fn equations(&self, model: &Model) -> Vec<String> {
         match self {
-            Place::Motion(m) => {
-                let mut named: Vec<usize> = (0..m.weights.len()).filter(|&e| m.weights[e] != 0.0).collect();
-                // The equation whose own coordinate is the motion comes first.
-                let own = own_coordinates(model);
-                named.sort_by_key(|&e| {
-                    let alone = own[e].is_some_and(|j| {
-                        m.coefficients.iter().enumerate().all(|(i, c)| (*c != 0.0) == (i == j))
-                    });
-                    (!alone, e)
-                });
-                named.into_iter().map(|e| model.equations[e].name.clone()).collect()
+            Place::Motion(m) | Place::Spring { motion: m, .. } | Place::Load { motion: m, .. } => {
+                weighted_equations(model, &m.weights, &m.coefficients)
+            }
+            Place::Pair { own, .. } => weighted_equations(model, &own.weights, &own.coefficients),
+            Place::Parameter(p) => {
+                let name = &model.parameters[*p].name;
+                let with = model.equations.iter().filter(|e| e.residual().mentions(name));
+                with.map(|e| e.name.clone()).collect()
             }
             Place::Equation(e) => vec![model.equations[*e].name.clone()],
             Place::Input(i) => {
@@ -72,6 +104,19 @@ impl Place {
             }
         }
     }
+}
+
+/// Names of the equations with weight, the one whose own coordinate is the motion first.
+fn weighted_equations(model: &Model, weights: &[f64], coefficients: &[f64]) -> Vec<String> {
+    let own = own_coordinates(model);
+    let mut named: Vec<usize> =
+        (0..weights.len().min(own.len())).filter(|&e| weights[e] != 0.0).collect();
+    named.sort_by_key(|&e| {
+        let alone =
+            own[e].is_some_and(|j| coefficients.iter().enumerate().all(|(i, c)| (*c != 0.0) == (i == j)));
+        (!alone, e)
+    });
+    named.into_iter().map(|e| model.equations[e].name.clone()).collect()
 }
 
 /// The state each equation governs: a matching of equations to states through the mass matrix that
@@ -124,7 +169,7 @@ pub fn own_coordinates(model: &Model) -> Vec<Option<usize>> {
 }
 
 /// All places of a model: motions (own coordinates first, then rank-one elements), equations, inputs,
-/// measurements.
+/// measurements, parameters, springs, pairs, loads.
 pub fn places(model: &Model) -> Vec<Place> {
     let n = model.states.len();
     let mut motions: Vec<Motion> = Vec::new();
@@ -135,24 +180,120 @@ pub fn places(model: &Model) -> Vec<Place> {
             motions.push(motion);
         }
     };
-    for (e, own) in own_coordinates(model).into_iter().enumerate() {
-        if let Some(j) = own {
-            let (mut w, mut c) = (vec![0.0; n], vec![0.0; n]);
-            w[e] = 1.0;
-            c[j] = 1.0;
-            add(w, c);
-        }
+    let alone = |e: usize, j: usize| {
+        let (mut w, mut c) = (vec![0.0; n], vec![0.0; n]);
+        w[e] = 1.0;
+        c[j] = 1.0;
+        (w, c)
+    };
+    let own: Vec<(usize, usize)> = own_coordinates(model)
+        .into_iter()
+        .enumerate()
+        .filter_map(|(e, own)| own.map(|j| (e, j)))
+        .collect();
+    for &(e, j) in &own {
+        let (w, c) = alone(e, j);
+        add(w, c);
     }
-    for parameter in &model.parameters {
-        if let Some((w, c)) = rank_one(model, &parameter.name) {
-            add(w, c);
+    let mut springs = Vec::new();
+    for (index, parameter) in model.parameters.iter().enumerate() {
+        if let Some(element) = rank_one(model, &parameter.name) {
+            if let Some(mut motion) = motion(model, element.weights.clone(), element.coefficients.clone()) {
+                let at_level = if element.level == 0 { motion.position.clone() } else { motion.rate.clone() };
+                if element.level == 1 || at_level.is_some() {
+                    motion.position = at_level;
+                    springs.push(Place::Spring {
+                        motion,
+                        parameter: index,
+                        factor: element.factor,
+                        level: element.level,
+                        alone: element.alone,
+                    });
+                }
+            }
+            if element.alone {
+                add(element.weights, element.coefficients);
+            }
         }
     }
     let mut out: Vec<Place> = motions.into_iter().map(Place::Motion).collect();
     out.extend((0..model.equations.len()).map(Place::Equation));
     out.extend((0..model.inputs.len()).map(Place::Input));
     out.extend((0..model.measurements.len()).map(Place::Measurement));
+    out.extend((0..model.parameters.len()).filter(|&p| {
+        let name = &model.parameters[p].name;
+        !model.parameters[p].fixed && model.equations.iter().any(|e| e.residual().mentions(name))
+    }).map(Place::Parameter));
+    out.extend(springs);
+    let single: Vec<Motion> = own
+        .iter()
+        .filter_map(|&(e, j)| {
+            let (w, c) = alone(e, j);
+            motion(model, w, c)
+        })
+        .collect();
+    for (i, own) in single.iter().enumerate() {
+        for (k, other) in single.iter().enumerate() {
+            if i != k && own.position.is_some() == other.position.is_some() {
+                out.push(Place::Pair { own: own.clone(), other: other.clone() });
+            }
+        }
+    }
+    for (motion, &(e, j)) in single.iter().zip(&own) {
+        if motion.rate.is_some() {
+            out.extend(
+                loads(model, e, j).into_iter().map(|load| Place::Load { motion: motion.clone(), load }),
+            );
+        }
+    }
     out
+}
+
+/// What the joint of coordinate `own` may transmit: the drive terms of its equation together, and its
+/// position terms together. Constant factors of one common sign stay; highest derivatives never appear.
+fn loads(model: &Model, equation: usize, own: usize) -> Vec<Expr> {
+    let residual = model.equations[equation].residual();
+    let (mut drive, mut position): (Option<Expr>, Option<Expr>) = (None, None);
+    for (negative, term) in residual.terms() {
+        let mut highest = false;
+        let mut rate = false;
+        let mut input = false;
+        let mut coordinate = false;
+        for (name, primes) in term.variables() {
+            if let Some(j) = model.state(&name) {
+                let order = model.states[j].order;
+                highest |= primes as usize >= order;
+                rate |= primes > 0;
+                coordinate |= primes == 0 && (j != own || order > 1);
+            }
+            input |= model.input(&name).is_some();
+        }
+        if highest || rate {
+            continue;
+        }
+        let sum = if input {
+            &mut drive
+        } else if coordinate {
+            &mut position
+        } else {
+            continue;
+        };
+        *sum = Some(match (sum.take(), negative) {
+            (None, false) => term.clone(),
+            (None, true) => -term.clone(),
+            (Some(s), false) => s + term.clone(),
+            (Some(s), true) => s - term.clone(),
+        });
+    }
+    // The sign does not matter under abs(): without a leading minus.
+    [drive, position]
+        .into_iter()
+        .flatten()
+        .map(|e| match e {
+            Expr::Neg(inner) => *inner,
+            other => other,
+        })
+        .collect()
 }
 
 fn same(a: &Motion, b: &Motion) -> bool {
@@ -163,17 +304,31 @@ fn same(a: &Motion, b: &Motion) -> bool {
         || (close(&a.coefficients, &flipped) && close(&a.weights, &against))
 }
 
-/// Weights and coefficients of the element behind a parameter, if it is one.
-fn rank_one(model: &Model, parameter: &str) -> Option<(Vec<f64>, Vec<f64>)> {
+/// An element of the machine behind a parameter p: its term in equation e is `factor`·w_e·p·(g + rest).
+struct Element {
+    weights: Vec<f64>,
+    coefficients: Vec<f64>,
+    factor: f64,
+    /// Primes of the states in g.
+    level: u8,
+    /// Nothing but states in it (no reference that a feedback compares with).
+    alone: bool,
+}
+
+/// The element behind a parameter, if it is one.
+fn rank_one(model: &Model, parameter: &str) -> Option<Element> {
     let n = model.states.len();
     let mut rows: Vec<Option<(u8, Vec<f64>)>> = Vec::new();
+    let mut alone = true;
     for equation in &model.equations {
         let g = equation.residual().derivative(parameter, 0).simplify();
         if g == Expr::Num(0.0) {
             rows.push(None);
             continue;
         }
-        rows.push(Some(linear_form(model, &g)?));
+        let (level, form, pure) = linear_form(model, &g)?;
+        alone &= pure;
+        rows.push(Some((level, form)));
     }
     let (level, form) = rows.iter().flatten().next()?.clone();
     let lead = form.iter().copied().find(|c| *c != 0.0)?;
@@ -197,23 +352,25 @@ fn rank_one(model: &Model, parameter: &str) -> Option<(Vec<f64>, Vec<f64>)> {
         return None;
     }
     // Force per unit weight: make the largest weight one, so that F is the force itself.
-    let size = weights.iter().fold(0.0f64, |m, w| m.max(w.abs()));
-    let sign = 1.0 / size;
-    Some((weights.iter().map(|w| w * sign).collect(), coefficients))
+    let factor = weights.iter().fold(0.0f64, |m, w| m.max(w.abs()));
+    let weights = weights.iter().map(|w| w / factor).collect();
+    Some(Element { weights, coefficients, factor, level, alone })
 }
 
-/// `g` as a linear form with constant coefficients in the states' derivatives of one common level.
-fn linear_form(model: &Model, g: &Expr) -> Option<(u8, Vec<f64>)> {
+/// `g` as a linear form with constant coefficients in the states' derivatives of one common level, and
+/// whether nothing stands beside them.
+fn linear_form(model: &Model, g: &Expr) -> Option<(u8, Vec<f64>, bool)> {
     for level in 0..2u8 {
         let symbols: Vec<(&str, u8)> = model.states.iter().map(|s| (s.name.as_str(), level)).collect();
         if let Some((coefficients, rest)) = g.affine_in(&symbols)
-            && rest.simplify() == Expr::Num(0.0)
+            && !rest.variables().iter().any(|(n, _)| model.state(n).is_some())
         {
+            let pure = rest.simplify() == Expr::Num(0.0);
             let numbers: Option<Vec<f64>> = coefficients.iter().map(|c| c.simplify().constant()).collect();
             if let Some(numbers) = numbers
                 && numbers.iter().any(|c| *c != 0.0)
             {
-                return Some((level, numbers));
+                return Some((level, numbers, pure));
             }
         }
     }
@@ -255,12 +412,12 @@ fn motion(model: &Model, weights: Vec<f64>, coefficients: Vec<f64>) -> Option<Mo
         }
         sum
     };
-    let (position, rate) = match first {
-        1 => (None, combine(0)),
-        0 => (combine(0), None),
-        _ => (combine(0), combine(1)),
+    let (position, rate, acceleration) = match first {
+        1 => (None, combine(0), combine(1)),
+        0 => (combine(0), None, None),
+        _ => (combine(0), combine(1), combine(2)),
     };
-    Some(Motion { weights, coefficients, position, rate })
+    Some(Motion { weights, coefficients, position, rate, acceleration })
 }
 
 fn is_velocity(d: &Dimension) -> bool {

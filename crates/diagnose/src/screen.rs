@@ -16,13 +16,15 @@
 use std::ops::Range;
 
 use greybox_calibrate::{Level, Point, SegmentRows, Setup, qr};
-use greybox_simulate::SignalLanes;
+use greybox_model::{Equation, Expr, Hold, Input, Measurement, Model, Parameter, State, System, Unit};
+use greybox_simulate::{Environment, Method, Seeds, Signal, SignalLanes, integrate};
 use rayon::prelude::*;
 
 use crate::along::Along;
 use crate::candidate::Candidate;
-use crate::library::{Mechanism, On, Scale};
+use crate::library::{Mechanism, Scale};
 use crate::place::Place;
+use crate::spectra::Spectra;
 
 /// One candidate with one choice of its inner parameters, as columns of the regression.
 pub struct Variant {
@@ -32,7 +34,7 @@ pub struct Variant {
     pub inner: Vec<f64>,
     /// Sizes of the inner parameters.
     pub scales: Vec<f64>,
-    /// Lanes.
+    /// Columns.
     pub columns: Range<usize>,
     /// The single column is the whole change (an input transformed), its coefficient 1 when the inner
     /// values are right; `Some(true)` when the coefficient may rescale the inner value.
@@ -52,13 +54,27 @@ pub struct Scored {
     pub shift: Vec<f64>,
     /// Sizes of the inner parameters.
     pub scales: Vec<f64>,
+    /// The next best choices of the inner parameters: (gain, values, shift).
+    pub others: Vec<(f64, Vec<f64>, Vec<f64>)>,
+}
+
+/// What one column of the regression does to the machine.
+enum Component {
+    /// A force with weights on the equations.
+    Force(Vec<f64>, Vec<Vec<f64>>),
+    /// A change of an input.
+    Input(usize, Vec<Vec<f64>>),
+    /// A change of a measurement.
+    Output(usize, Vec<Vec<f64>>),
 }
 
 /// Exogenous signals of a set of candidates.
 pub struct Lanes {
     /// Per piece.
     pub signals: Vec<SignalLanes>,
-    /// The variants behind the lanes.
+    /// Each column is the sum of these lanes.
+    pub columns: Vec<Range<usize>>,
+    /// The variants behind the columns.
     pub variants: Vec<Variant>,
 }
 
@@ -70,6 +86,7 @@ pub fn inner_scales(
     setup: &Setup,
 ) -> Option<Vec<f64>> {
     let keep = |n: &str| n.to_string();
+    let duration = || setup.data.pieces.iter().map(|p| p.len as f64 * p.dt).fold(0.0, f64::max);
     mechanism
         .inner
         .iter()
@@ -78,119 +95,72 @@ pub fn inner_scales(
                 let e = candidate.translate(&setup.model, e, &keep);
                 Some(along.eval(&[e], &[])?.pop()?.concat())
             };
+            let range = |e| -> Option<f64> {
+                let v = series(e)?;
+                Some(
+                    v.iter().fold(f64::NEG_INFINITY, |m, x| m.max(*x))
+                        - v.iter().fold(f64::INFINITY, |m, x| m.min(*x)),
+                )
+            };
             let size = match &inner.scale {
                 Scale::One => 1.0,
                 Scale::Step => setup.data.pieces.iter().map(|p| p.dt).fold(0.0, f64::max),
+                Scale::Duration => duration(),
+                Scale::PerDuration => 1.0 / duration(),
                 Scale::Rms(e) => {
                     let v = series(e)?;
                     (v.iter().map(|x| x * x).sum::<f64>() / v.len().max(1) as f64).sqrt()
                 }
                 Scale::Max(e) => series(e)?.iter().fold(0.0f64, |m, x| m.max(x.abs())),
                 Scale::Top(e) => series(e)?.iter().fold(f64::NEG_INFINITY, |m, x| m.max(*x)),
-                Scale::Range(e) => {
-                    let v = series(e)?;
-                    v.iter().fold(f64::NEG_INFINITY, |m, x| m.max(*x))
-                        - v.iter().fold(f64::INFINITY, |m, x| m.min(*x))
+                Scale::Frequency(e) => {
+                    let e = candidate.translate(&setup.model, e, &keep);
+                    let rate = e.time_derivative(&|n| setup.model.state(n).is_some()).simplify();
+                    let mut both = along.eval(&[e, rate], &[])?;
+                    let (rate, value) = (both.pop()?.concat(), both.pop()?.concat());
+                    let mean = value.iter().sum::<f64>() / value.len().max(1) as f64;
+                    let swing: f64 = value.iter().map(|v| (v - mean).powi(2)).sum();
+                    (rate.iter().map(|v| v * v).sum::<f64>() / swing).sqrt()
                 }
+                Scale::Range(e) => range(e)?,
+                Scale::PerRange(e) => 1.0 / range(e)?,
             };
             (size.is_finite() && size > 0.0).then_some(size)
         })
         .collect()
 }
 
-/// Builds the lanes of all candidates along given states.
-pub fn lanes(setup: &Setup, library: &[Mechanism], candidates: &[Candidate], along: &Along<'_>) -> Lanes {
+/// Builds the lanes of all candidates along given states; `spectra` proposes angular frequencies.
+pub fn lanes(
+    setup: &Setup,
+    library: &[Mechanism],
+    candidates: &[Candidate],
+    along: &Along<'_>,
+    spectra: &Spectra<'_>,
+) -> Lanes {
+    let made: Vec<Vec<(Variant, Vec<Vec<Component>>)>> = candidates
+        .par_iter()
+        .enumerate()
+        .map(|(index, candidate)| {
+            let mechanism = &library[candidate.mechanism];
+            variants(setup, mechanism, candidate, index, along, spectra)
+        })
+        .collect();
     let nz = setup.system.nz;
-    // Columns first, then interleaved per piece.
-    enum Column {
-        Force(Vec<f64>, Vec<Vec<f64>>),
-        Input(usize, Vec<Vec<f64>>),
-    }
-    let mut columns: Vec<Column> = Vec::new();
+    let mut components: Vec<Component> = Vec::new();
+    let mut columns = Vec::new();
     let mut variants = Vec::new();
-    for (index, candidate) in candidates.iter().enumerate() {
-        let mechanism = &library[candidate.mechanism];
-        let Some(scales) = inner_scales(mechanism, candidate, along, setup) else { continue };
-        for grid in grid(mechanism) {
-            let inner: Vec<f64> = grid.iter().zip(&scales).map(|(g, s)| g * s).collect();
-            let mut extra: Vec<(&str, f64)> = Vec::new();
-            for (name, value) in mechanism
-                .parameters()
-                .zip(std::iter::repeat_n(0.0, mechanism.linear.len()).chain(inner.iter().copied()))
-            {
-                extra.push((name, value));
-            }
-            // The file's own parameter names may also be names of the model: mark them.
-            let marked: Vec<String> = extra.iter().map(|e| format!("mechanism#{}", e.0)).collect();
-            let rename = |n: &str| {
-                if mechanism.parameters().any(|p| p == n) { format!("mechanism#{n}") } else { n.to_string() }
-            };
-            let extra: Vec<(&str, f64)> =
-                marked.iter().map(String::as_str).zip(extra.iter().map(|e| e.1)).collect();
-            let law = candidate.translate(&setup.model, &mechanism.law, &rename);
-            // The law's derivatives with respect to its linear parameters: one column each.
-            let slopes = || {
-                let slopes: Vec<_> = marked[..mechanism.linear.len()]
-                    .iter()
-                    .map(|n| law.derivative(n, 0).simplify())
-                    .collect();
-                along.eval(&slopes, &extra)
-            };
-            let first = columns.len();
-            let mut secant = None;
-            match (&candidate.place, mechanism.on) {
-                (Place::Motion(motion), On::Motion) => {
-                    let sign = if candidate.mirrored { -1.0 } else { 1.0 };
-                    let weights: Vec<f64> = motion.weights.iter().map(|w| w * sign).collect();
-                    let Some(series) = slopes() else { continue };
-                    for s in series {
-                        columns.push(Column::Force(weights.clone(), s));
-                    }
-                }
-                (Place::Equation(e), On::Equation) => {
-                    let mut weights = vec![0.0; nz];
-                    weights[*e] = 1.0;
-                    let Some(series) = slopes() else { continue };
-                    for s in series {
-                        columns.push(Column::Force(weights.clone(), s));
-                    }
-                }
-                (Place::Input(i), On::Input) => {
-                    let u = greybox_model::Expr::var(&setup.model.inputs[*i].name);
-                    if mechanism.linear.is_empty() {
-                        let change = |values: &[f64]| {
-                            let extra: Vec<(&str, f64)> =
-                                marked.iter().map(String::as_str).zip(values.iter().copied()).collect();
-                            along.eval(&[law.clone() - u.clone()], &extra)?.pop()
-                        };
-                        let Some(series) = change(&inner) else { continue };
-                        let tiny: Vec<f64> = inner.iter().map(|v| v * 1e-6).collect();
-                        let size = |s: &[Vec<f64>]| s.iter().flatten().fold(0.0f64, |m, v| m.max(v.abs()));
-                        let vanishes = change(&tiny).is_some_and(|s| size(&s) < 1e-3 * size(&series));
-                        secant = Some(vanishes && inner.len() == 1);
-                        if size(&series) == 0.0 {
-                            continue;
-                        }
-                        columns.push(Column::Input(*i, series));
-                    } else {
-                        let Some(series) = slopes() else { continue };
-                        for s in series {
-                            columns.push(Column::Input(*i, s));
-                        }
-                    }
-                }
-                _ => continue,
-            }
-            variants.push(Variant {
-                candidate: index,
-                inner,
-                scales: scales.clone(),
-                columns: first..columns.len(),
-                secant,
-            });
+    for (mut variant, parts) in made.into_iter().flatten() {
+        let from = columns.len();
+        for column in parts {
+            let first = components.len();
+            components.extend(column);
+            columns.push(first..components.len());
         }
+        variant.columns = from..columns.len();
+        variants.push(variant);
     }
-    let count = columns.len();
+    let count = components.len();
     let signals = setup
         .data
         .pieces
@@ -201,11 +171,20 @@ pub fn lanes(setup: &Setup, library: &[Mechanism], candidates: &[Candidate], alo
                 lanes: count,
                 weights: vec![0.0; nz * count],
                 force: vec![0.0; piece.len * count],
-                inputs: Vec::new(),
+                ..SignalLanes::default()
             };
-            for (l, column) in columns.iter().enumerate() {
-                match column {
-                    Column::Force(weights, series) => {
+            let put = |tables: &mut Vec<(usize, Vec<f64>)>, of: usize, l: usize, series: &[f64]| {
+                let at = tables.iter().position(|t| t.0 == of).unwrap_or_else(|| {
+                    tables.push((of, vec![0.0; piece.len * count]));
+                    tables.len() - 1
+                });
+                for (k, v) in series.iter().enumerate() {
+                    tables[at].1[k * count + l] = if v.is_finite() { *v } else { 0.0 };
+                }
+            };
+            for (l, component) in components.iter().enumerate() {
+                match component {
+                    Component::Force(weights, series) => {
                         for (e, w) in weights.iter().enumerate() {
                             lanes.weights[e * count + l] = *w;
                         }
@@ -213,36 +192,342 @@ pub fn lanes(setup: &Setup, library: &[Mechanism], candidates: &[Candidate], alo
                             lanes.force[k * count + l] = if v.is_finite() { *v } else { 0.0 };
                         }
                     }
-                    Column::Input(i, series) => {
-                        let at = match lanes.inputs.iter().position(|t| t.0 == *i) {
-                            Some(at) => at,
-                            None => {
-                                lanes.inputs.push((*i, vec![0.0; piece.len * count]));
-                                lanes.inputs.len() - 1
-                            }
-                        };
-                        for (k, v) in series[p].iter().enumerate() {
-                            lanes.inputs[at].1[k * count + l] = if v.is_finite() { *v } else { 0.0 };
-                        }
-                    }
+                    Component::Input(i, series) => put(&mut lanes.inputs, *i, l, &series[p]),
+                    Component::Output(c, series) => put(&mut lanes.outputs, *c, l, &series[p]),
                 }
             }
             lanes
         })
         .collect();
-    Lanes { signals, variants }
+    Lanes { signals, columns, variants }
 }
 
-fn grid(mechanism: &Mechanism) -> Vec<Vec<f64>> {
+/// The columns of a candidate for every choice of its inner parameters.
+fn variants(
+    setup: &Setup,
+    mechanism: &Mechanism,
+    candidate: &Candidate,
+    index: usize,
+    along: &Along<'_>,
+    spectra: &Spectra<'_>,
+) -> Vec<(Variant, Vec<Vec<Component>>)> {
+    let mut out = Vec::new();
+    let Some(scales) = inner_scales(mechanism, candidate, along, setup) else { return out };
+    let Some(law) = Law::new(setup, mechanism, candidate, along) else { return out };
+    for inner in grid(mechanism, candidate, &scales, spectra) {
+        let count = mechanism.linear.len();
+        let column = |linear: &[f64], inner: &[f64]| law.components(&mechanism.values(linear, inner)?);
+        let mut secant = None;
+        let columns: Option<Vec<Vec<Component>>> = if count == 0 {
+            let whole = column(&[], &inner);
+            let size = |c: &Option<Vec<Component>>| c.as_deref().map_or(0.0, largest);
+            let tiny: Vec<f64> = inner.iter().map(|v| v * 1e-6).collect();
+            let vanishes = inner.len() == 1
+                && (!mechanism.states.is_empty() || size(&column(&[], &tiny)) < 1e-3 * size(&whole));
+            if size(&whole) == 0.0 {
+                continue;
+            }
+            secant = Some(vanishes);
+            whole.map(|c| vec![c])
+        } else {
+            (0..count)
+                .map(|i| {
+                    let unit: Vec<f64> = (0..count).map(|j| f64::from(u8::from(i == j))).collect();
+                    column(&unit, &inner)
+                })
+                .collect()
+        };
+        let Some(columns) = columns else { continue };
+        let variant =
+            Variant { candidate: index, inner, scales: scales.clone(), columns: 0..0, secant };
+        out.push((variant, columns));
+    }
+    out
+}
+
+fn largest(components: &[Component]) -> f64 {
+    components
+        .iter()
+        .flat_map(|c| match c {
+            Component::Force(_, s) | Component::Input(_, s) | Component::Output(_, s) => s.iter().flatten(),
+        })
+        .fold(0.0f64, |m, v| m.max(v.abs()))
+}
+
+/// A mechanism's law along given states, for any values of its parameters.
+struct Law<'a> {
+    setup: &'a Setup,
+    mechanism: &'a Mechanism,
+    candidate: &'a Candidate,
+    along: &'a Along<'a>,
+    /// The law less what it stands in for, the reaction; parameters marked.
+    change: Vec<Expr>,
+    marked: Vec<String>,
+    memory: Option<Recall>,
+    /// For a parameter: derivative of each equation's residual, along the states.
+    slopes: Vec<(usize, Vec<Vec<f64>>)>,
+}
+
+impl<'a> Law<'a> {
+    fn new(
+        setup: &'a Setup,
+        mechanism: &'a Mechanism,
+        candidate: &'a Candidate,
+        along: &'a Along<'a>,
+    ) -> Option<Law<'a>> {
+        let model = &setup.model;
+        // The file's own names may also be names of the model: mark them.
+        let own = |n: &str| mechanism.parameters().any(|p| p == n) || mechanism.states.iter().any(|s| s.name == n);
+        let rename = |n: &str| if own(n) { format!("mechanism#{n}") } else { n.to_string() };
+        let mut change = vec![candidate.translate(model, &mechanism.law, &rename) - candidate.base(model)];
+        if let Some(reaction) = &mechanism.reaction {
+            change.push(candidate.translate(model, reaction, &rename));
+        }
+        let marked = mechanism.parameters().map(|n| format!("mechanism#{n}")).collect();
+        let memory = if mechanism.states.is_empty() {
+            None
+        } else {
+            Some(Recall::new(setup, mechanism, candidate, along)?)
+        };
+        let mut slopes = Vec::new();
+        if let Place::Parameter(p) = &candidate.place {
+            let name = &model.parameters[*p].name;
+            for (e, equation) in model.equations.iter().enumerate() {
+                let slope = equation.residual().derivative(name, 0).simplify();
+                if slope != Expr::Num(0.0) {
+                    slopes.push((e, along.eval(&[slope], &[])?.pop()?));
+                }
+            }
+        }
+        Some(Law { setup, mechanism, candidate, along, change, marked, memory, slopes })
+    }
+
+    /// What the law does at these values of its own parameters.
+    fn components(&self, values: &[f64]) -> Option<Vec<Component>> {
+        let changes: Vec<Vec<Vec<f64>>> = match &self.memory {
+            Some(recall) => {
+                let mut law = recall.law(self.setup, values)?;
+                if self.mechanism.on.replaces() {
+                    let base = self.along.eval(&[self.candidate.base(&self.setup.model)], &[])?.pop()?;
+                    for (l, b) in law[0].iter_mut().flatten().zip(base.iter().flatten()) {
+                        *l -= b;
+                    }
+                }
+                law
+            }
+            None => {
+                let extra: Vec<(&str, f64)> =
+                    self.marked.iter().map(String::as_str).zip(values.iter().copied()).collect();
+                self.along.eval(&self.change, &extra)?
+            }
+        };
+        let mut changes = changes.into_iter();
+        let change = changes.next()?;
+        let sign = if self.candidate.mirrored { -1.0 } else { 1.0 };
+        let nz = self.setup.system.nz;
+        Some(match &self.candidate.place {
+            Place::Motion(m) | Place::Load { motion: m, .. } | Place::Spring { motion: m, .. } => {
+                vec![Component::Force(m.weights.iter().map(|w| w * sign).collect(), change)]
+            }
+            Place::Pair { own, other } => {
+                let mut parts = vec![Component::Force(own.weights.clone(), change)];
+                parts.extend(changes.next().map(|r| Component::Force(other.weights.clone(), r)));
+                parts
+            }
+            Place::Equation(e) => vec![Component::Force(unit(nz, *e), change)],
+            Place::Input(i) => vec![Component::Input(*i, change)],
+            Place::Measurement(c) => vec![Component::Output(*c, change)],
+            Place::Parameter(_) => self
+                .slopes
+                .iter()
+                .map(|(e, slope)| {
+                    let force = change
+                        .iter()
+                        .zip(slope)
+                        .map(|(c, s)| c.iter().zip(s).map(|(c, s)| c * s).collect())
+                        .collect();
+                    Component::Force(unit(nz, *e), force)
+                })
+                .collect(),
+        })
+    }
+}
+
+fn unit(n: usize, at: usize) -> Vec<f64> {
+    let mut v = vec![0.0; n];
+    v[at] = 1.0;
+    v
+}
+
+/// A mechanism with states, simulated with the motion that drives it given: a small model whose inputs are
+/// the placeholders along the machine's states and whose output is the law.
+struct Recall {
+    system: System,
+    /// One environment per piece.
+    environments: Vec<Environment>,
+    /// Start of its states per piece.
+    starts: Vec<Vec<f64>>,
+}
+
+impl Recall {
+    fn new(setup: &Setup, mechanism: &Mechanism, candidate: &Candidate, along: &Along<'_>) -> Option<Recall> {
+        let keep = |n: &str| n.to_string();
+        // Every placeholder in use becomes an input.
+        let laws: Vec<&Expr> = std::iter::once(&mechanism.law).chain(&mechanism.reaction).collect();
+        let sides = mechanism.states.iter().flat_map(|s| [&s.lhs, &s.rhs]);
+        let mut used: Vec<(String, u8)> = Vec::new();
+        for e in laws.iter().copied().chain(sides) {
+            for (name, primes) in e.variables() {
+                let own = mechanism.parameters().any(|p| p == &*name)
+                    || mechanism.states.iter().any(|s| s.name == *name)
+                    || matches!(&*name, "t" | "pi");
+                if !own && !used.iter().any(|u| *u.0 == *name && u.1 == primes) {
+                    used.push((name.to_string(), primes));
+                }
+            }
+        }
+        let signal = |name: &str, primes: u8| format!("{name}#{primes}");
+        let put = |e: &Expr| {
+            e.substitute(&|n, p| {
+                used.iter().any(|u| u.0 == n && u.1 == p).then(|| Expr::var(&signal(n, p)))
+            })
+        };
+        let none = Unit::dimensionless;
+        let mut model = Model {
+            name: String::new(),
+            inputs: used
+                .iter()
+                .map(|(n, p)| {
+                    let name = signal(n, *p);
+                    Input { channel: name.clone(), name, unit: none(), hold: Hold::Linear }
+                })
+                .collect(),
+            states: mechanism
+                .states
+                .iter()
+                .map(|s| State { name: s.name.clone(), unit: none(), order: 1, channel: None, initial: vec![] })
+                .collect(),
+            parameters: mechanism
+                .parameters()
+                .map(|n| Parameter { name: n.to_string(), value: 1.0, unit: None, std: None, fixed: false })
+                .collect(),
+            equations: mechanism
+                .states
+                .iter()
+                .map(|s| Equation { name: s.name.clone(), lhs: put(&s.lhs), rhs: put(&s.rhs) })
+                .collect(),
+            measurements: laws
+                .iter()
+                .enumerate()
+                .map(|(i, l)| Measurement { channel: format!("law{i}"), expr: put(l), unit: none() })
+                .collect(),
+        };
+        model.recompute_orders();
+        let system = System::compile(&model).ok()?;
+        let exprs: Vec<Expr> = used
+            .iter()
+            .map(|(n, p)| candidate.translate(&setup.model, &Expr::prime(n, *p), &keep))
+            .collect();
+        let series = along.eval(&exprs, &[])?;
+        let environments = setup
+            .data
+            .pieces
+            .iter()
+            .enumerate()
+            .map(|(i, piece)| Environment {
+                start: piece.start,
+                dt: piece.dt,
+                len: piece.len,
+                inputs: series
+                    .iter()
+                    .map(|s| Signal::new(Hold::Linear, piece.dt, &s[i], |_| Vec::new()))
+                    .collect(),
+                forces: Vec::new(),
+            })
+            .collect();
+        let starts = memory_starts(setup, mechanism, candidate, along, &model)?;
+        Some(Recall { system, environments, starts })
+    }
+
+    /// The law (and the reaction) per piece.
+    fn law(&self, setup: &Setup, values: &[f64]) -> Option<Vec<Vec<Vec<f64>>>> {
+        let mut out = vec![Vec::new(); self.system.ny];
+        for (environment, start) in self.environments.iter().zip(&self.starts) {
+            let n = environment.len;
+            let method = Method::Rk4 { substeps: 2 };
+            let run = integrate(&self.system, environment, values, start, 0..n, method, &Seeds::default());
+            if run.diverged.is_some() {
+                return None;
+            }
+            for (c, out) in out.iter_mut().enumerate() {
+                out.push(run.y[c * n..(c + 1) * n].to_vec());
+            }
+        }
+        debug_assert_eq!(out[0].len(), setup.data.pieces.len());
+        Some(out)
+    }
+}
+
+/// Likely start values of a mechanism's own states per piece, in the order of its chains.
+fn memory_starts(
+    setup: &Setup,
+    mechanism: &Mechanism,
+    candidate: &Candidate,
+    along: &Along<'_>,
+    model: &Model,
+) -> Option<Vec<Vec<f64>>> {
+    let keep = |n: &str| n.to_string();
+    let mut starts = vec![Vec::new(); setup.data.pieces.len()];
+    for (memory, state) in mechanism.states.iter().zip(&model.states) {
+        for primes in 0..state.order {
+            let series = match memory.start.get(primes) {
+                Some(e) => Some(along.eval(&[candidate.translate(&setup.model, e, &keep)], &[])?.pop()?),
+                None => None,
+            };
+            for (p, start) in starts.iter_mut().enumerate() {
+                let v = series.as_ref().and_then(|s| s[p].first().copied()).unwrap_or(0.0);
+                start.push(if v.is_finite() { v } else { 0.0 });
+            }
+        }
+    }
+    Some(starts)
+}
+
+/// Likely start values per piece of the states that a candidate brings along.
+pub fn first_states(
+    setup: &Setup,
+    mechanism: &Mechanism,
+    candidate: &Candidate,
+    along: &Along<'_>,
+) -> Option<Vec<Vec<f64>>> {
+    let mut model = setup.model.clone();
+    let values = vec![1.0; mechanism.parameters().count()];
+    let instance = candidate.insert(&mut model, mechanism, &values);
+    model.states.retain(|s| instance.states.contains(&s.name));
+    memory_starts(setup, mechanism, candidate, along, &model)
+}
+
+/// All choices of the inner parameters' first values.
+fn grid(
+    mechanism: &Mechanism,
+    candidate: &Candidate,
+    scales: &[f64],
+    spectra: &Spectra<'_>,
+) -> Vec<Vec<f64>> {
     let mut out: Vec<Vec<f64>> = vec![Vec::new()];
-    for inner in &mechanism.inner {
+    for (inner, scale) in mechanism.inner.iter().zip(scales) {
+        let mut values: Vec<f64> = inner.grid.iter().map(|g| g * scale).collect();
+        if let Some(variable) = &inner.spectral {
+            let proposed = spectra.propose(candidate, variable);
+            values.extend(proposed.into_iter().filter(|v| *v >= inner.low * scale && *v <= inner.high * scale));
+        }
         out = out
             .iter()
             .flat_map(|head| {
-                inner.grid.iter().map(move |g| {
-                    let mut v = head.clone();
-                    v.push(*g);
-                    v
+                values.iter().map(move |v| {
+                    let mut head = head.clone();
+                    head.push(*v);
+                    head
                 })
             })
             .collect();
@@ -284,7 +569,23 @@ pub struct Projected {
 
 /// Projects a segment's rows off its initial states.
 pub fn project(rows: SegmentRows, nx: usize) -> Projected {
+    project_columns(rows, nx, None)
+}
+
+/// [`project`] with each column the sum of several lanes.
+fn project_columns(rows: SegmentRows, nx: usize, columns: Option<&[Range<usize>]>) -> Projected {
     let SegmentRows { rows: m, mut r, jx, mut jp, mut signals, .. } = rows;
+    if let Some(columns) = columns
+        && columns.len() * m != signals.len()
+    {
+        let mut sums = vec![0.0; columns.len() * m];
+        for (lanes, sum) in columns.iter().zip(sums.chunks_mut(m)) {
+            for lane in lanes.clone() {
+                sum.iter_mut().zip(&signals[lane * m..(lane + 1) * m]).for_each(|(a, b)| *a += b);
+            }
+        }
+        signals = sums;
+    }
     let mut q = jx;
     qr::orthonormalise(&mut q, m, nx);
     for column in std::iter::once(&mut r[..]).chain(jp.chunks_mut(m)).chain(signals.chunks_mut(m)) {
@@ -301,16 +602,17 @@ pub fn gram(
     scale: &[f64],
     point: &Point,
     signals: &[SignalLanes],
+    columns: &[Range<usize>],
     blocks: Vec<Range<usize>>,
 ) -> Gram {
     let nx = setup.system.nx;
     let np = setup.free.len();
-    let lanes = signals.first().map_or(0, |s| s.lanes);
+    let lanes = columns.len();
     let rows = setup.with_problem(level, scale, |p| p.rows(point, true, Some(signals)));
     let parts: Vec<Gram> = rows
         .into_par_iter()
         .map(|rows| {
-            let s = project(rows, nx);
+            let s = project_columns(rows, nx, Some(columns));
             let m = s.rows;
             let j = |a: usize| &s.jp[a * m..(a + 1) * m];
             let g = |a: usize| &s.g[a * m..(a + 1) * m];
@@ -483,10 +785,11 @@ pub fn screen(
     point: &Point,
 ) -> Vec<Scored> {
     let along = Along::smoothed(setup, level, scale, point);
-    let lanes = lanes(setup, library, candidates, &along);
+    let spectra = Spectra::new(setup, level, scale, point, &along);
+    let lanes = lanes(setup, library, candidates, &along, &spectra);
     let blocks: Vec<Range<usize>> = lanes.variants.iter().map(|v| v.columns.clone()).collect();
-    let gram = gram(setup, level, scale, point, &lanes.signals, blocks);
-    let mut best: Vec<Option<Scored>> = vec![None; candidates.len()];
+    let gram = gram(setup, level, scale, point, &lanes.signals, &lanes.columns, blocks);
+    let mut found: Vec<Vec<Scored>> = vec![Vec::new(); candidates.len()];
     for (index, variant) in lanes.variants.iter().enumerate() {
         let candidate = &candidates[variant.candidate];
         let mechanism = &library[candidate.mechanism];
@@ -497,37 +800,42 @@ pub fn screen(
         };
         let Some(regressed) = gram.regress(index, &positive, 0.0) else { continue };
         let (gain, values) = match variant.secant {
-            None => {
-                let mut values = regressed.coefficients.clone();
-                values.extend(&variant.inner);
-                (regressed.gain, values)
-            }
+            None => (regressed.gain, mechanism.values(&regressed.coefficients, &variant.inner)),
             Some(scalable) => {
                 let c = regressed.coefficients[0];
                 if scalable && c < 3.0 {
-                    (regressed.gain, variant.inner.iter().map(|v| v * c).collect())
+                    let inner: Vec<f64> = variant.inner.iter().map(|v| v * c).collect();
+                    (regressed.gain, mechanism.values(&[], &inner))
                 } else {
                     // Gain with the coefficient held at one: c(2 − 1/c) of the best.
                     let gain = if c > 0.0 { regressed.gain * (2.0 / c - 1.0 / (c * c)) } else { 0.0 };
-                    (gain, variant.inner.clone())
+                    (gain, mechanism.values(&[], &variant.inner))
                 }
             }
         };
-        if gain <= 0.0 || gain.is_nan() {
+        let Some(values) = values else { continue };
+        if gain <= 0.0 || gain.is_nan() || !values.iter().all(|v| v.is_finite()) {
             continue;
         }
-        let slot = &mut best[variant.candidate];
-        if slot.as_ref().is_none_or(|s| gain > s.gain) {
-            *slot = Some(Scored {
-                candidate: variant.candidate,
-                gain,
-                values,
-                shift: regressed.shift,
-                scales: variant.scales.clone(),
-            });
-        }
+        found[variant.candidate].push(Scored {
+            candidate: variant.candidate,
+            gain,
+            values,
+            shift: regressed.shift,
+            scales: variant.scales.clone(),
+            others: Vec::new(),
+        });
     }
-    let mut scored: Vec<Scored> = best.into_iter().flatten().collect();
+    let mut scored: Vec<Scored> = found
+        .into_iter()
+        .filter_map(|mut variants| {
+            variants.sort_by(|a, b| b.gain.total_cmp(&a.gain));
+            let mut rest = variants.into_iter();
+            let mut best = rest.next()?;
+            best.others = rest.take(2).map(|v| (v.gain, v.values, v.shift)).collect();
+            Some(best)
+        })
+        .collect();
     scored.sort_by(|a, b| b.gain.total_cmp(&a.gain).then(a.candidate.cmp(&b.candidate)));
     scored
 }

@@ -8,9 +8,10 @@ use rayon::prelude::*;
 
 use crate::candidate::{Candidate, Instance, candidates};
 use crate::evidence::{Evidence, folds, kappa, weigh};
-use crate::library::{Mechanism, On};
+use crate::library::Mechanism;
 use crate::place::{Place, places};
-use crate::screen::{Scored, screen};
+use crate::along::Along;
+use crate::screen::{Scored, first_states, screen};
 use crate::{Observer, Stage};
 
 /// Number of segments of the levels.
@@ -104,6 +105,36 @@ fn limits(iterations: usize) -> Limits {
     Limits { iterations, tolerance: 1e-5 }
 }
 
+/// Start values for another model of the same data: states of the same name keep theirs, new ones get
+/// `fresh` (their chains in order, per piece; zero where there is none).
+fn transfer(from: &Setup, level: &Level, starts: &[Vec<f64>], to: &Setup, fresh: &[Vec<f64>]) -> Vec<Vec<f64>> {
+    level
+        .segments
+        .iter()
+        .zip(starts)
+        .map(|(segment, old)| {
+            let mut x = vec![0.0; to.system.nx];
+            let mut new = fresh.get(segment.piece).into_iter().flatten();
+            for (j, state) in to.model.states.iter().enumerate() {
+                let known = from.model.state(&state.name).map(|i| from.system.offsets[i]);
+                for k in 0..state.order {
+                    x[to.system.offsets[j] + k] = match known {
+                        Some(at) => old.get(at + k).copied().unwrap_or(0.0),
+                        None => new.next().copied().unwrap_or(0.0),
+                    };
+                }
+            }
+            x
+        })
+        .collect()
+}
+
+/// The same segments with the priors of another model's states.
+fn same_level(setup: &Setup, level: &Level) -> Level {
+    let priors = level.segments.iter().map(|s| setup.start_prior(s.piece, s.range.start)).collect();
+    Level { segments: level.segments.clone(), priors }
+}
+
 /// Residual RMS per channel in SI.
 pub fn rms(fit: &Fit, scale: &[f64]) -> Vec<f64> {
     fit.rss.iter().zip(&fit.count).zip(scale).map(|((r, n), s)| s * (r / (*n).max(1) as f64).sqrt()).collect()
@@ -151,6 +182,8 @@ impl<'a> Search<'a> {
             free.extend(candidate.free(mechanism, first, scales));
             out.push(Part { candidate: candidate.clone(), instance, scales: scales.clone() });
         }
+        let memory: Vec<String> = out.iter().flat_map(|p: &Part| p.instance.states.clone()).collect();
+        let _ = memory;
         Ok((from.with_model(model, free)?, out))
     }
 
@@ -222,14 +255,40 @@ impl<'a> Search<'a> {
         for (p, v) in setup.model.parameters.iter_mut().zip(&shifted) {
             p.value = *v;
         }
-        let hats = setup.starts(&base.level, &shifted);
-        let points = [
-            Point { parameters: shifted.clone(), starts: old.starts.clone() },
-            Point { parameters: plain, starts: old.starts.clone() },
+        let mechanism = &self.library[candidate.mechanism];
+        let fresh = if mechanism.states.is_empty() {
+            Vec::new()
+        } else {
+            let along = Along::smoothed(&base.setup, &base.level, scale, &base.fit.point);
+            first_states(&base.setup, mechanism, candidate, &along)?
+        };
+        let level = same_level(&setup, &base.level);
+        let kept = transfer(&base.setup, &base.level, &old.starts, &setup, &fresh);
+        let mut hats = setup.starts(&level, &shifted);
+        // What the mechanism remembers has its own likely start.
+        for (h, k) in hats.iter_mut().zip(&kept) {
+            for (j, state) in setup.model.states.iter().enumerate() {
+                if base.setup.model.state(&state.name).is_none() {
+                    let at = setup.system.offsets[j]..setup.system.offsets[j] + state.order;
+                    h[at.clone()].copy_from_slice(&k[at]);
+                }
+            }
+        }
+        let mut points = vec![
+            Point { parameters: shifted.clone(), starts: kept.clone() },
+            Point { parameters: plain, starts: kept.clone() },
             Point { parameters: shifted, starts: hats },
         ];
-        let fit = setup.fit(&base.level, scale, &points, limits(iterations));
-        fit.cost.is_finite().then(|| Fitted { setup, parts, level: base.level.clone(), fit })
+        // Other choices of the inner parameters: the score test is only of first order.
+        for (_, values, shift) in &scored.others {
+            let mut parameters: Vec<f64> = old.parameters.iter().chain(values).copied().collect();
+            for (f, d) in base.setup.free.iter().zip(shift) {
+                parameters[f.index] = (parameters[f.index] + d).clamp(f.lower, f.upper);
+            }
+            points.push(Point { parameters, starts: kept.clone() });
+        }
+        let fit = setup.fit(&level, scale, &points, limits(iterations));
+        fit.cost.is_finite().then(|| Fitted { setup, parts, level, fit })
     }
 
     /// `fitted` without part `index`, refitted.
@@ -241,9 +300,10 @@ impl<'a> Search<'a> {
         let (setup, kept) = self.assemble(&fitted.setup.holds, head, &parts, &fitted.setup).ok()?;
         let mut parameters = head.to_vec();
         parameters.extend(parts.iter().flat_map(|p| p.1.iter().copied()));
-        let point = Point { parameters, starts: fitted.fit.point.starts.clone() };
-        let fit = setup.fit(&fitted.level, scale, &[point], limits(iterations));
-        Some(Fitted { setup, parts: kept, level: fitted.level.clone(), fit })
+        let level = same_level(&setup, &fitted.level);
+        let starts = transfer(&fitted.setup, &level, &fitted.fit.point.starts, &setup, &[]);
+        let fit = setup.fit(&level, scale, &[Point { parameters, starts }], limits(iterations));
+        Some(Fitted { setup, parts: kept, level, fit })
     }
 
     /// Tries the other holds of every input; switches where the cost falls by more than `margin`.
@@ -289,7 +349,7 @@ impl<'a> Search<'a> {
         let complexity = |f: &Fitted| -> (f64, f64) {
             f.parts.iter().fold((0.0, 0.0), |(p, s), part| {
                 let m = &self.library[part.candidate.mechanism];
-                (p + (m.linear.len() + m.inner.len()) as f64, s + m.surcharge)
+                (p + m.parameters().count() as f64, s + m.surcharge)
             })
         };
         let ((p0, s0), (p1, s1)) = (complexity(old), complexity(new));
@@ -578,9 +638,10 @@ impl<'a> Search<'a> {
         let (setup, kept) = self.assemble(&fitted.setup.holds, head, &parts, &fitted.setup).ok()?;
         let mut parameters = head.to_vec();
         parameters.extend(parts.iter().flat_map(|p| p.1.iter().copied()));
-        let point = Point { parameters, starts: fitted.fit.point.starts.clone() };
-        let fit = setup.fit(&fitted.level, scale, &[point], limits(3));
-        Some(Fitted { setup, parts: kept, level: fitted.level.clone(), fit })
+        let level = same_level(&setup, &fitted.level);
+        let starts = transfer(&fitted.setup, &level, &fitted.fit.point.starts, &setup, &[]);
+        let fit = setup.fit(&level, scale, &[Point { parameters, starts }], limits(3));
+        Some(Fitted { setup, parts: kept, level, fit })
     }
 
     /// The model without the winner, from the winner's parameters.
@@ -591,7 +652,8 @@ impl<'a> Search<'a> {
                 *p = chosen.fit.point.parameters[i];
             }
         }
-        let points = [Point { parameters, starts: chosen.fit.point.starts.clone() }];
+        let starts = transfer(&chosen.setup, &current.level, &chosen.fit.point.starts, &current.setup, &[]);
+        let points = [Point { parameters, starts }];
         let fit = current.setup.fit(&current.level, scale, &points, limits(15));
         if fit.cost < current.fit.cost { Fitted { fit, ..current.clone() } } else { current.clone() }
     }
@@ -621,11 +683,7 @@ impl<'a> Search<'a> {
         let complexity = |f: &Fitted| -> f64 {
             f.parts.iter().map(|p| self.library[p.candidate.mechanism].complexity()).sum()
         };
-        let priority = |c: usize| match self.library[open[c].mechanism].on {
-            On::Motion | On::Equation => 0,
-            On::Input => 1,
-            On::Measurement => 2,
-        };
+        let priority = |c: usize| self.library[open[c].mechanism].rank;
         let mut best = 0;
         for i in 1..weighed.len() {
             let (a, b) = (&weighed[best], &weighed[i]);

@@ -153,7 +153,7 @@ pub fn test(setup: &Setup, level: &Level, scale: &[f64], point: &Point) -> Optio
                     force[k * lanes + l] = if v.is_finite() { *v } else { 0.0 };
                 }
             }
-            SignalLanes { lanes, weights, force, inputs: Vec::new() }
+            SignalLanes { lanes, weights, force, ..SignalLanes::default() }
         })
         .collect();
     let (nx, ny, np) = (setup.system.nx, setup.system.ny, setup.free.len());

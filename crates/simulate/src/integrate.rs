@@ -99,6 +99,8 @@ pub struct SignalLanes {
     pub force: Vec<f64>,
     /// Changes of inputs: (input, `samples × lanes`).
     pub inputs: Vec<(usize, Vec<f64>)>,
+    /// Changes of outputs: (channel, `samples × lanes`).
+    pub outputs: Vec<(usize, Vec<f64>)>,
 }
 
 impl Seeds {
@@ -1302,6 +1304,14 @@ impl<'a> Core<'a> {
                 let d = &self.out_d[reg as usize * lanes..][..lanes];
                 for (l, v) in d.iter().enumerate() {
                     self.result.dy[(l * ny + c) * n + row] = *v;
+                }
+            }
+            let first = self.seeds.parameters.len() + self.seeds.initial.len();
+            let count = self.seeds.signals.lanes;
+            let k = ((self.s / self.env.dt).round() as usize).min(self.env.len.saturating_sub(1));
+            for (c, change) in &self.seeds.signals.outputs {
+                for (l, v) in change[k * count..(k + 1) * count].iter().enumerate() {
+                    self.result.dy[((first + l) * ny + c) * n + row] += v;
                 }
             }
         }

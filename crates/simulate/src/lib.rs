@@ -2,7 +2,7 @@
 mod integrate;
 pub mod rigs;
 mod signal;
-mod small;
+pub mod small;
 
 pub use integrate::{Environment, Force, Method, Seeds, SignalLanes, Trajectory, integrate};
 pub use signal::{FINE, Signal};

@@ -1,7 +1,7 @@
 //! LU of the mass matrix: a few equations, factored thousands of times a second.
 
 /// Factors `a` (`n × n`, row major) in place with partial pivoting; `false` when singular.
-pub(crate) fn factor(a: &mut [f64], pivots: &mut [usize], n: usize) -> bool {
+pub fn factor(a: &mut [f64], pivots: &mut [usize], n: usize) -> bool {
     for k in 0..n {
         let mut p = k;
         for i in k + 1..n {
@@ -31,7 +31,7 @@ pub(crate) fn factor(a: &mut [f64], pivots: &mut [usize], n: usize) -> bool {
 }
 
 /// Solves for `lanes` right-hand sides at once; `b` is `n × lanes`, row major.
-pub(crate) fn solve(a: &[f64], pivots: &[usize], n: usize, b: &mut [f64], lanes: usize) {
+pub fn solve(a: &[f64], pivots: &[usize], n: usize, b: &mut [f64], lanes: usize) {
     if n == 1 {
         let inverse = 1.0 / a[0];
         b[..lanes].iter_mut().for_each(|x| *x *= inverse);

@@ -1,0 +1,222 @@
+//! First values for frequencies: where the residual's spectrum has lines.
+//!
+//! A ripple over position (cogging) or over time (a periodic disturbance) has a likelihood with very many
+//! narrow maxima; no fit finds the right one from afar. Two spectra propose: that of the force which the
+//! equation leaves over along the smoothed states (over position: Σ F e^{−i n q}, no even sampling needed),
+//! and, over time, that of the residual of the outputs. A line counts by its power and by its power over
+//! the running median of its neighbours. What is proposed goes through the score test like everything else.
+
+use std::sync::Mutex;
+
+use greybox_calibrate::{Level, Point, Setup, qr};
+use greybox_model::Expr;
+
+use crate::along::Along;
+use crate::candidate::Candidate;
+use crate::diagnosis::left_over;
+use crate::locate::spectrum;
+use crate::place::Place;
+
+/// Lines proposed by each spectrum, by power and again by prominence.
+const LINES: usize = 6;
+/// Neighbours of the running median.
+const NEIGHBOURS: usize = 31;
+/// Most values of the spectral variable that are tried.
+const MOST: usize = 3000;
+/// Deviations beyond this many standard deviations are clipped.
+const CLIP: f64 = 6.0;
+
+/// Proposals of angular frequencies for the candidates of one screening.
+pub struct Spectra<'a> {
+    setup: &'a Setup,
+    level: &'a Level,
+    scale: &'a [f64],
+    point: &'a Point,
+    along: &'a Along<'a>,
+    /// Those already made: (equation, variable) and the values.
+    known: Mutex<Vec<(usize, Expr, Vec<f64>)>>,
+}
+
+impl<'a> Spectra<'a> {
+    /// For the model of `setup` at `point`.
+    pub fn new(setup: &'a Setup, level: &'a Level, scale: &'a [f64], point: &'a Point, along: &'a Along<'a>) -> Self {
+        Spectra { setup, level, scale, point, along, known: Mutex::new(Vec::new()) }
+    }
+
+    /// Angular frequencies over `variable` (an expression in the mechanism's placeholders), strongest first.
+    pub fn propose(&self, candidate: &Candidate, variable: &Expr) -> Vec<f64> {
+        let variable = candidate.translate(&self.setup.model, variable, &|n| n.to_string());
+        let equation = match &candidate.place {
+            Place::Equation(e) => Some(*e),
+            _ => candidate.motion().and_then(|m| m.weights.iter().position(|w| *w != 0.0)),
+        };
+        let Some(equation) = equation else { return Vec::new() };
+        let found = |known: &Vec<(usize, Expr, Vec<f64>)>| {
+            known.iter().find(|k| k.0 == equation && k.1 == variable).map(|k| k.2.clone())
+        };
+        if let Ok(known) = self.known.lock()
+            && let Some(values) = found(&known)
+        {
+            return values;
+        }
+        let values = if variable == Expr::var("t") { self.over_time(equation) } else { self.over(equation, &variable) };
+        if let Ok(mut known) = self.known.lock() {
+            known.push((equation, variable, values.clone()));
+        }
+        values
+    }
+
+    /// The force that an equation leaves over, without its linear part, clipped.
+    fn force(&self, equation: usize) -> Option<Vec<Vec<f64>>> {
+        let force = left_over(self.setup, self.along, equation)?;
+        let model = &self.setup.model;
+        let mut regressors = vec![Expr::Num(1.0)];
+        for state in &model.states {
+            regressors.extend((0..state.order.min(2)).map(|p| Expr::prime(&state.name, p as u8)));
+        }
+        regressors.extend(model.inputs.iter().map(|i| Expr::var(&i.name)));
+        let columns = self.along.eval(&regressors, &[])?;
+        let n: usize = force.iter().map(Vec::len).sum();
+        let mut q: Vec<f64> = Vec::with_capacity(n * columns.len());
+        for c in &columns {
+            q.extend(c.iter().flatten().map(|v| if v.is_finite() { *v } else { 0.0 }));
+        }
+        qr::orthonormalise(&mut q, n, columns.len());
+        let mut f: Vec<f64> = force.iter().flatten().map(|v| if v.is_finite() { *v } else { 0.0 }).collect();
+        qr::project_off(&q, n, &mut f);
+        let limit = CLIP * (qr::dot(&f, &f) / n.max(1) as f64).sqrt();
+        let mut rest = f.into_iter().map(|v| v.clamp(-limit, limit));
+        Some(force.iter().map(|piece| rest.by_ref().take(piece.len()).collect()).collect())
+    }
+
+    fn over_time(&self, equation: usize) -> Vec<f64> {
+        let mut values = Vec::new();
+        let mut of = |series: &[Vec<f64>]| {
+            let pieces = &self.setup.data.pieces;
+            let Some((x, piece)) = series.iter().zip(pieces).max_by_key(|(x, _)| x.len()) else { return };
+            let (frequency, power) = spectrum(x, piece.dt);
+            // A window's main lobe is four lines wide: refine by the parabola through the peak.
+            let step = frequency.get(1).copied().unwrap_or(0.0);
+            for i in lines(&power) {
+                let (a, b, c) = (power[i.max(1) - 1], power[i], power[(i + 1).min(power.len() - 1)]);
+                let bend = a - 2.0 * b + c;
+                let shift = if bend < 0.0 { (0.5 * (a - c) / bend).clamp(-0.5, 0.5) } else { 0.0 };
+                values.push(2.0 * std::f64::consts::PI * step * (i as f64 + shift));
+            }
+        };
+        if let Some(force) = self.force(equation) {
+            of(&force);
+        }
+        for residual in self.residuals() {
+            of(&residual);
+        }
+        distinct(values)
+    }
+
+    /// Residuals of the outputs, `[channel][piece][sample]`.
+    fn residuals(&self) -> Vec<Vec<Vec<f64>>> {
+        let rows = self.setup.with_problem(self.level, self.scale, |p| p.rows(self.point, false, None));
+        (0..self.setup.system.ny)
+            .map(|c| {
+                let mut out: Vec<Vec<f64>> = self.setup.data.pieces.iter().map(|p| vec![0.0; p.len]).collect();
+                for (segment, rows) in self.level.segments.iter().zip(&rows) {
+                    let n = segment.range.len();
+                    out[segment.piece][segment.range.clone()].copy_from_slice(&rows.r[c * n..(c + 1) * n]);
+                }
+                out
+            })
+            .collect()
+    }
+
+    /// Lines of the force over a variable that is not evenly sampled.
+    fn over(&self, equation: usize, variable: &Expr) -> Vec<f64> {
+        let Some(force) = self.force(equation) else { return Vec::new() };
+        let Some(mut of) = self.along.eval(std::slice::from_ref(variable), &[]) else { return Vec::new() };
+        let Some(q) = of.pop() else { return Vec::new() };
+        let pairs: Vec<(f64, f64)> = q
+            .iter()
+            .flatten()
+            .zip(force.iter().flatten())
+            .filter(|(q, f)| q.is_finite() && f.is_finite())
+            .map(|(q, f)| (*q, *f))
+            .collect();
+        let low = pairs.iter().fold(f64::INFINITY, |m, p| m.min(p.0));
+        let high = pairs.iter().fold(f64::NEG_INFINITY, |m, p| m.max(p.0));
+        if !(high > low) {
+            return Vec::new();
+        }
+        let step = 0.4 / (high - low) * 2.0;
+        // No finer than the samples resolve: half a turn of phase between neighbours.
+        let mut jumps: Vec<f64> = q.iter().flat_map(|q| q.windows(2).map(|w| (w[1] - w[0]).abs())).collect();
+        jumps.sort_by(f64::total_cmp);
+        let jump = jumps.get(jumps.len() * 9 / 10).copied().unwrap_or(0.0);
+        let count = ((std::f64::consts::PI / jump.max(1e-300) / step) as usize).clamp(8, MOST);
+        // e^{−i n q} by rotation from one n to the next.
+        let turns: Vec<(f64, f64)> = pairs.iter().map(|(q, _)| ((step * q).cos(), -(step * q).sin())).collect();
+        let mut phasors: Vec<(f64, f64)> = vec![(1.0, 0.0); pairs.len()];
+        let power: Vec<f64> = (0..count)
+            .map(|_| {
+                let (mut re, mut im) = (0.0, 0.0);
+                for ((z, (c, s)), (_, f)) in phasors.iter_mut().zip(&turns).zip(&pairs) {
+                    *z = (z.0 * c - z.1 * s, z.0 * s + z.1 * c);
+                    re += z.0 * f;
+                    im += z.1 * f;
+                }
+                re * re + im * im
+            })
+            .collect();
+        distinct(lines(&power).into_iter().map(|i| step * (i + 1) as f64).collect())
+    }
+}
+
+/// Indices of the strongest local maxima, by power and by power over the running median.
+fn lines(power: &[f64]) -> Vec<usize> {
+    let n = power.len();
+    let peaks: Vec<usize> =
+        (1..n.saturating_sub(1)).filter(|&i| power[i] > power[i - 1] && power[i] >= power[i + 1]).collect();
+    let prominence: Vec<f64> = peaks
+        .iter()
+        .map(|&i| {
+            let (a, b) = (i.saturating_sub(NEIGHBOURS / 2), (i + NEIGHBOURS / 2 + 1).min(n));
+            let mut near = power[a..b].to_vec();
+            near.sort_by(f64::total_cmp);
+            power[i] / near[near.len() / 2].max(1e-300)
+        })
+        .collect();
+    let best = |value: &dyn Fn(usize) -> f64| -> Vec<usize> {
+        let mut order: Vec<usize> = (0..peaks.len()).collect();
+        order.sort_by(|&a, &b| value(b).total_cmp(&value(a)).then(a.cmp(&b)));
+        order.into_iter().take(LINES).map(|i| peaks[i]).collect()
+    };
+    let mut out = best(&|i| power[peaks[i]]);
+    for i in best(&|i| prominence[i]) {
+        if !out.contains(&i) {
+            out.push(i);
+        }
+    }
+    out
+}
+
+fn distinct(values: Vec<f64>) -> Vec<f64> {
+    let mut out: Vec<f64> = Vec::new();
+    for v in values {
+        if v > 0.0 && v.is_finite() && !out.iter().any(|o| (o / v - 1.0).abs() < 1e-3) {
+            out.push(v);
+        }
+    }
+    out
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn strong_and_prominent_lines_are_both_proposed() {
+        // A steep continuum with a weak line far out: only its prominence shows it.
+        let mut power: Vec<f64> = (0..400).map(|i| 1e6 / (1.0 + (i as f64).powi(3)) * (1.5 + (i as f64 * 2.3).sin())).collect();
+        power[300] += 1.0;
+        assert!(lines(&power).contains(&300));
+        assert!(!lines(&power)[..LINES].contains(&300));
+    }
+}
