@@ -931,7 +931,13 @@ impl<'a> Core<'a> {
             } else {
                 (lo * fhi - hi * flo) / (fhi - flo)
             };
-            let t = t.clamp(lo + 1e-3 * (hi - lo), hi - 1e-3 * (hi - lo));
+            // (A state that overflows within the step leaves no slack to interpolate.)
+            let t = if t.is_finite() { t } else { 0.5 * (lo + hi) };
+            let (least, most) = (lo + 1e-3 * (hi - lo), hi - 1e-3 * (hi - lo));
+            if !(least <= most) {
+                break;
+            }
+            let t = t.clamp(least, most);
             self.trial(t, true);
             let f = self.least_slack(end);
             if f < 0.0 {
