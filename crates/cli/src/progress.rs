@@ -72,6 +72,7 @@ impl Observer for Progress {
                 }
                 Stage::Fitting { candidates } => format!("fitting the best {candidates}"),
                 Stage::Lengthening { segments } => format!("going on with {segments} longer segments"),
+                Stage::Whitening => "searching again with coloured noise modelled".to_owned(),
                 Stage::Simulating => "simulating whole recordings".to_owned(),
             },
         );

@@ -23,6 +23,8 @@ pub const FOLDS: usize = 10;
 pub struct Folds {
     /// Held-out sum of squares per fold.
     pub sse: Vec<f64>,
+    /// Sum of squares per block at the optimum.
+    pub blocks: Vec<f64>,
 }
 
 /// Comparison of a richer model with a simpler one.
@@ -40,6 +42,25 @@ pub struct Evidence {
     pub improving: f64,
     /// Smallest κ over the channels.
     pub kappa: f64,
+    /// Of all changes in the blocks' sums of squares, the share that is for the better: near one where an
+    /// effect acts rarely and nothing else suffers for it.
+    pub focus: f64,
+    /// The residuals were whitened.
+    pub whitened: bool,
+}
+
+impl Evidence {
+    /// No evidence.
+    pub const NONE: Evidence = Evidence {
+        score: 0.0,
+        drop: 0.0,
+        held_out: 0.0,
+        t: 0.0,
+        improving: 0.0,
+        kappa: 1.0,
+        focus: 0.0,
+        whitened: false,
+    };
 }
 
 /// κ per channel: information per sample of an autocorrelated residual.
@@ -149,38 +170,46 @@ pub fn folds(setup: &Setup, level: &Level, scale: &[f64], point: &Point) -> Fold
             sse
         })
         .collect();
-    Folds { sse }
+    Folds { sse, blocks: blocks.iter().map(|b| b.0).collect() }
+}
+
+/// What a comparison knows of each of the two models.
+pub struct Side<'a> {
+    /// Residual sum of squares per channel (innovations, where the residual is whitened).
+    pub rss: &'a [f64],
+    /// Held-out errors.
+    pub folds: &'a Folds,
+    /// Parameters beyond the nominal ones.
+    pub parameters: f64,
+    /// Surcharges of its mechanisms.
+    pub surcharge: f64,
 }
 
 /// Weighs the richer model (`new`) against the simpler (`old`), both fitted with the same scale.
-pub fn weigh(
-    old_rss: &[f64],
-    new_rss: &[f64],
-    count: &[usize],
-    kappa: &[f64],
-    extra_parameters: f64,
-    surcharge: f64,
-    old_folds: &Folds,
-    new_folds: &Folds,
-) -> Evidence {
+pub fn weigh(old: &Side<'_>, new: &Side<'_>, count: &[usize], kappa: &[f64], whitened: bool) -> Evidence {
     let effective: f64 = count.iter().zip(kappa).map(|(n, k)| *n as f64 * k).sum();
-    let mut score = -extra_parameters * effective.max(2.0).ln() - 2.0 * surcharge;
+    let mut score = -(new.parameters - old.parameters) * effective.max(2.0).ln()
+        - 2.0 * (new.surcharge - old.surcharge);
     for c in 0..count.len() {
-        if new_rss[c] > 0.0 && old_rss[c] > 0.0 {
-            score += count[c] as f64 * kappa[c] * (old_rss[c] / new_rss[c]).ln();
+        if new.rss[c] > 0.0 && old.rss[c] > 0.0 {
+            score += count[c] as f64 * kappa[c] * (old.rss[c] / new.rss[c]).ln();
         }
     }
-    let (old, new): (f64, f64) = (old_rss.iter().sum(), new_rss.iter().sum());
-    let differences: Vec<f64> = old_folds.sse.iter().zip(&new_folds.sse).map(|(a, b)| a - b).collect();
+    let (before, after): (f64, f64) = (old.rss.iter().sum(), new.rss.iter().sum());
+    let differences: Vec<f64> = old.folds.sse.iter().zip(&new.folds.sse).map(|(a, b)| a - b).collect();
     let k = differences.len().max(1) as f64;
     let mean = differences.iter().sum::<f64>() / k;
     let variance = differences.iter().map(|d| (d - mean).powi(2)).sum::<f64>() / (k - 1.0).max(1.0);
+    let changes = || old.folds.blocks.iter().zip(&new.folds.blocks).map(|(a, b)| a - b);
+    let all: f64 = changes().map(f64::abs).sum();
     Evidence {
         score,
-        drop: 1.0 - new / old.max(1e-300),
-        held_out: differences.iter().sum::<f64>() / old_folds.sse.iter().sum::<f64>().max(1e-300),
+        drop: 1.0 - after / before.max(1e-300),
+        held_out: differences.iter().sum::<f64>() / old.folds.sse.iter().sum::<f64>().max(1e-300),
         t: mean / (variance / k).sqrt().max(1e-300),
         improving: differences.iter().filter(|d| **d > 0.0).count() as f64 / k,
         kappa: kappa.iter().copied().fold(1.0, f64::min),
+        focus: changes().map(|d| d.max(0.0)).sum::<f64>() / all.max(1e-300),
+        whitened,
     }
 }

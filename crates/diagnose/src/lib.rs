@@ -36,6 +36,8 @@ pub enum Stage {
         /// How many.
         segments: usize,
     },
+    /// Searching again with a model of the coloured noise.
+    Whitening,
     /// Simulating whole recordings.
     Simulating,
 }

@@ -1,13 +1,15 @@
 //! The search: short-list by the score test, fit, decide, and again; on short segments first, on longer
 //! ones later.
 
+use std::sync::Arc;
+
 use greybox_calibrate::{Fit, Free, Level, Limits, Point, Setup, free_parameters};
 use greybox_model::system::CompileError;
 use greybox_model::{Hold, Model};
 use rayon::prelude::*;
 
 use crate::candidate::{Candidate, Instance, candidates};
-use crate::evidence::{Evidence, folds, kappa, weigh};
+use crate::evidence::{Evidence, Side, folds, kappa, weigh};
 use crate::library::Mechanism;
 use crate::place::{Place, places};
 use crate::along::Along;
@@ -183,8 +185,10 @@ impl<'a> Search<'a> {
             out.push(Part { candidate: candidate.clone(), instance, scales: scales.clone() });
         }
         let memory: Vec<String> = out.iter().flat_map(|p: &Part| p.instance.states.clone()).collect();
-        let _ = memory;
-        Ok((from.with_model(model, free)?, out))
+        let setup = from.with_model(model, free)?;
+        // The names come from the model itself.
+        let setup = setup.with_carried(&memory).unwrap_or(setup);
+        Ok((setup, out))
     }
 
     /// Parts of a fitted model with their present values.
@@ -345,22 +349,46 @@ impl<'a> Search<'a> {
         self.weigh_with(old, new, scale, &kappa)
     }
 
+    /// The evidence for `new` over `old`; where residuals are whitened, by the profile likelihood: each
+    /// model with the noise model that suits its own residual.
     fn weigh_with(&self, old: &Fitted, new: &Fitted, scale: &[f64], kappa: &[f64]) -> Evidence {
-        let complexity = |f: &Fitted| -> (f64, f64) {
+        let price = |f: &Fitted| -> (f64, f64) {
             f.parts.iter().fold((0.0, 0.0), |(p, s), part| {
                 let m = &self.library[part.candidate.mechanism];
                 (p + m.parameters().count() as f64, s + m.surcharge)
             })
         };
-        let ((p0, s0), (p1, s1)) = (complexity(old), complexity(new));
-        let old_folds = folds(&old.setup, &old.level, scale, &old.fit.point);
-        let new_folds = folds(&new.setup, &new.level, scale, &new.fit.point);
-        weigh(&old.fit.rss, &new.fit.rss, &new.fit.count, kappa, p1 - p0, s1 - s0, &old_folds, &new_folds)
+        let whitened = new.setup.noise.is_some();
+        let rss = |f: &Fitted| if whitened { innovations(f, scale) } else { f.fit.rss.clone() };
+        let folds = |f: &Fitted| folds(&f.setup, &f.level, scale, &f.fit.point);
+        let ((p0, s0), (p1, s1)) = (price(old), price(new));
+        let (old_rss, new_rss) = (rss(old), rss(new));
+        let (old_folds, new_folds) = (folds(old), folds(new));
+        weigh(
+            &Side { rss: &old_rss, folds: &old_folds, parameters: p0, surcharge: s0 },
+            &Side { rss: &new_rss, folds: &new_folds, parameters: p1, surcharge: s1 },
+            &new.fit.count,
+            kappa,
+            whitened,
+        )
     }
 
     /// Whether the improvement is to be believed.
-    fn believable(&self, e: &Evidence, tried: usize, share: f64, first: bool) -> bool {
-        let threshold = 2.0 * (tried.max(1) as f64).ln() + 6.0;
+    fn believable(&self, e: &Evidence, mechanism: &Mechanism, share: f64, first: bool, loose: bool) -> bool {
+        let threshold = 2.0 * (self.all.len().max(1) as f64).ln() + 6.0;
+        // An effect that acts rarely is seen in few folds: it must pay much where it acts and cost nothing
+        // elsewhere, and the baseline must have shown a misfit while its segments were short.
+        let rare = mechanism.rare
+            && loose
+            && e.score > (4.0 * threshold).max(60.0)
+            && e.drop > if e.whitened { 0.01 } else { 0.05 }
+            && e.focus > 0.85;
+        if rare {
+            return true;
+        }
+        if e.whitened {
+            return e.score > threshold && e.drop > 0.003 && e.held_out > 0.0015 && e.t > 1.5 && e.improving >= 0.6;
+        }
         let enough = (e.drop > 0.02 && e.held_out > 0.01)
             || (e.kappa > 0.8 && e.drop > 0.005 && e.held_out > 0.004 && e.t > 2.5);
         let steady = (e.t > 2.0 && e.improving >= 0.6) || (e.t > 1.5 && e.improving >= 0.8);
@@ -386,10 +414,10 @@ impl<'a> Search<'a> {
         Some(self.without(fitted, index, scale, 10)?.fit.rss.iter().sum())
     }
 
-    /// Runs all levels.
+    /// Runs all levels; again on whitened residuals where what is left over is coloured.
     pub fn run(&self) -> Found {
         let sigma = self.nominal.data.sigma.clone();
-        let mut scale: Vec<f64> = self.nominal.data.spread.iter().map(|s| s.max(1e-300)).collect();
+        let scale: Vec<f64> = self.nominal.data.spread.iter().map(|s| s.max(1e-300)).collect();
         self.observer.stage(Stage::Calibrating);
         let level = self.nominal.level(LEVELS[0]);
         let start = Point {
@@ -398,167 +426,317 @@ impl<'a> Search<'a> {
         };
         let fit = self.nominal.fit(&level, &scale, &[start], limits(30));
         let mut calibrated = Fitted { setup: self.nominal.clone(), parts: Vec::new(), level, fit };
-        scale = next_scale(&calibrated.fit, &scale, &sigma);
-        self.method(&mut calibrated, &scale);
-        calibrated = self.refit(&calibrated, &scale, 15);
-        calibrated = self.redecide_holds(&calibrated, &scale, 0.02);
-        let mut current = calibrated.clone();
-        let mut accepted: Vec<Accepted> = Vec::new();
+        let mut state = State {
+            scale: next_scale(&calibrated.fit, &scale, &sigma),
+            current: calibrated.clone(),
+            accepted: Vec::new(),
+            loose: true,
+            sigma,
+        };
+        self.method(&mut calibrated, &state.scale);
+        calibrated = self.refit(&calibrated, &state.scale, 15);
+        calibrated = self.redecide_holds(&calibrated, &state.scale, 0.02);
+        state.current = calibrated.clone();
+        // Only a baseline that misses something already on short segments may lack a rare effect: on long
+        // ones a fit may also be stuck.
+        state.loose = state.misfit() > 1.05;
         for (step, &count) in LEVELS.iter().enumerate() {
-            if step > 0 {
-                let same = calibrated.setup.level(count).segments == calibrated.level.segments;
-                if same {
-                    continue;
-                }
-                self.observer.stage(Stage::Lengthening { segments: count });
-                calibrated = self.relevel(&calibrated, count, &scale, 20);
-                current = if current.parts.is_empty() {
-                    calibrated.clone()
-                } else {
-                    self.relevel(&current, count, &scale, 20)
-                };
-                scale = next_scale(&current.fit, &scale, &sigma);
-                current = self.refit(&current, &scale, 10);
-                current = self.redecide_holds(&current, &scale, 0.002);
-                if !current.parts.is_empty() {
-                    self.prune(&mut current, &mut accepted, &scale);
-                }
+            if step > 0 && !self.lengthen(&mut calibrated, &mut state, count) {
+                continue;
             }
-            self.level(&mut calibrated, &mut current, &mut accepted, &mut scale, &sigma);
+            self.level(&mut calibrated, &mut state);
         }
+        self.reconsider(&calibrated, &mut state);
+        if self.is_coloured(&state, 0.6) {
+            self.observer.stage(Stage::Whitening);
+            self.whitened(&mut calibrated, &mut state);
+        }
+        let current = state.current;
         let better_holds = (0..current.setup.holds.len())
             .filter(|&i| current.setup.holds[i] != self.nominal.holds[i])
             .map(|i| (i, self.nominal.holds[i], current.setup.holds[i]))
             .collect();
-        Found { calibrated, improved: current, accepted, better_holds, scale }
+        Found { calibrated, improved: current, accepted: state.accepted, better_holds, scale: state.scale }
+    }
+
+    /// Goes on with `count` segments; `false` when they are the same as before.
+    fn lengthen(&self, calibrated: &mut Fitted, state: &mut State, count: usize) -> bool {
+        if calibrated.setup.level(count).segments == calibrated.level.segments {
+            return false;
+        }
+        self.observer.stage(Stage::Lengthening { segments: count });
+        *calibrated = self.relevel(calibrated, count, &state.scale, 20);
+        state.current = if state.current.parts.is_empty() {
+            calibrated.clone()
+        } else {
+            self.relevel(&state.current, count, &state.scale, 20)
+        };
+        state.rescale();
+        state.current = self.refit(&state.current, &state.scale, 10);
+        state.current = self.redecide_holds(&state.current, &state.scale, 0.002);
+        if !state.current.parts.is_empty() {
+            self.prune(state);
+        }
+        true
+    }
+
+    fn is_coloured(&self, state: &State, below: f64) -> bool {
+        let f = &state.current;
+        kappa(&f.setup, &f.level, &state.scale, &f.fit.point).iter().any(|k| *k < below)
+    }
+
+    /// The second pass: the noise has a model of its own (an autoregression per channel), residuals,
+    /// sensitivities and candidates are whitened by it, and models are compared by the likelihood of
+    /// their innovations.
+    fn whitened(&self, calibrated: &mut Fitted, state: &mut State) {
+        for &count in &LEVELS[1..] {
+            let plain = Setup { noise: None, ..state.current.setup.clone() };
+            state.current = Fitted { setup: plain, ..state.current.clone() };
+            if state.current.setup.level(count).segments != state.current.level.segments {
+                state.current = self.relevel(&state.current, count, &state.scale, 20);
+                *calibrated = if state.current.parts.is_empty() {
+                    state.current.clone()
+                } else {
+                    self.relevel(calibrated, count, &state.scale, 20)
+                };
+            }
+            state.whiten();
+            state.current = self.refit(&state.current, &state.scale, 10);
+            let samples = state.current.fit.count.iter().sum::<usize>().max(1) as f64;
+            state.current = self.redecide_holds(&state.current, &state.scale, 4.0 / samples);
+            state.whiten();
+            self.level(calibrated, state);
+        }
+        self.reconsider(calibrated, state);
+        let plain = Setup { noise: None, ..state.current.setup.clone() };
+        let fit = plain.fit(&state.current.level, &state.scale, &[state.current.fit.point.clone()], limits(0));
+        let noise = state.current.setup.noise.clone();
+        state.current = Fitted { setup: Setup { noise, ..plain }, fit, ..state.current.clone() };
     }
 
     /// One level: rounds until nothing more is believable.
-    fn level(
-        &self,
-        calibrated: &mut Fitted,
-        current: &mut Fitted,
-        accepted: &mut Vec<Accepted>,
-        scale: &mut Vec<f64>,
-        sigma: &[f64],
-    ) {
-        while current.parts.len() < MOST_MECHANISMS {
-            let misfit = rms(&current.fit, scale).iter().zip(sigma).map(|(r, s)| r / s).fold(0.0, f64::max);
-            let coloured =
-                kappa(&current.setup, &current.level, scale, &current.fit.point).iter().any(|k| *k < 0.8);
-            if misfit < 1.03 && !coloured {
+    fn level(&self, calibrated: &mut Fitted, state: &mut State) {
+        while state.current.parts.len() < MOST_MECHANISMS {
+            if state.misfit() < 1.03 && !self.is_coloured(state, 0.8) && state.current.setup.noise.is_none() {
                 break;
             }
-            let taken = |c: &Candidate| {
-                current.parts.iter().any(|p| {
-                    p.candidate == *c
-                        || (p.candidate.place == c.place
-                            && self.library[p.candidate.mechanism]
-                                .refines
-                                .contains(&self.library[c.mechanism].kind))
-                })
-            };
+            if !self.round(calibrated, state) {
+                break;
+            }
+        }
+    }
+
+    /// One round: the best candidate, if it is believable.
+    fn round(&self, calibrated: &mut Fitted, state: &mut State) -> bool {
+        let current = &state.current;
+        let scale = state.scale.clone();
+        let taken = |c: &Candidate| {
+            current.parts.iter().any(|p| {
+                p.candidate == *c
+                    || (p.candidate.place == c.place
+                        && self.library[p.candidate.mechanism]
+                            .refines
+                            .contains(&self.library[c.mechanism].kind))
+            })
+        };
+        let open: Vec<Candidate> = self.all.iter().filter(|c| !taken(c)).cloned().collect();
+        self.observer.stage(Stage::Screening { candidates: open.len(), found: current.parts.len() });
+        let scored = screen(&current.setup, self.library, &open, &current.level, &scale, &current.fit.point);
+        let least = if current.setup.noise.is_some() { 0.001 } else { 0.003 };
+        let short = self.short_list(&open, &scored, least);
+        if short.is_empty() {
+            return false;
+        }
+        self.observer.stage(Stage::Fitting { candidates: short.len() });
+        let trials: Vec<(usize, Fitted)> = short
+            .par_iter()
+            .filter_map(|s| self.trial(current, &open[s.candidate], s, &scale).map(|f| (s.candidate, f)))
+            .collect();
+        let Some((winner, chosen, rivals, evidence)) = self.decide(calibrated, current, &open, trials, &scale)
+        else {
+            return false;
+        };
+        // Control: the smaller model from the winner's parameters. If that is better than it was, the
+        // baseline had been stuck.
+        let control = self.control(current, &chosen, &scale);
+        let evidence = if control.fit.cost < current.fit.cost * 0.999 {
+            if current.parts.is_empty() && current.setup.noise.is_none() {
+                *calibrated = control.clone();
+            }
+            state.current = control;
+            self.weigh(&state.current, &chosen, &scale)
+        } else {
+            evidence
+        };
+        let total: f64 = calibrated_rss(calibrated, &scale);
+        let share = if evidence.whitened {
+            1.0
+        } else {
+            (state.current.fit.rss.iter().sum::<f64>() - chosen.fit.rss.iter().sum::<f64>()) / total.max(1e-300)
+        };
+        let mechanism = &self.library[winner.mechanism];
+        self.observer.weighed(&mechanism.kind, &evidence, share);
+        if !self.believable(&evidence, mechanism, share, state.current.parts.is_empty(), state.loose) {
+            return false;
+        }
+        self.accept(state, winner, chosen, rivals, evidence);
+        true
+    }
+
+    /// The strongest candidates, no more than two of a kind.
+    fn short_list<'s>(&self, open: &[Candidate], scored: &'s [Scored], least: f64) -> Vec<&'s Scored> {
+        let mut short: Vec<&Scored> = Vec::new();
+        for s in scored {
+            let kind = &self.library[open[s.candidate].mechanism].kind;
+            let of_kind =
+                short.iter().filter(|o| self.library[open[o.candidate].mechanism].kind == *kind).count();
+            if s.gain > least && of_kind < 2 && short.len() < SHORT_LIST {
+                short.push(s);
+            }
+        }
+        short
+    }
+
+    /// Takes a winner over, and settles what follows from it: its simpler parts, the scale, the hold, the
+    /// mechanisms that no longer pay.
+    fn accept(
+        &self,
+        state: &mut State,
+        winner: Candidate,
+        chosen: Fitted,
+        rivals: Vec<Rival>,
+        evidence: Evidence,
+    ) {
+        let scale = state.scale.clone();
+        // A refinement has replaced its simpler relative.
+        let before = state.accepted.clone();
+        state.accepted.retain(|a| chosen.parts.iter().any(|p| p.candidate == a.candidate));
+        match self.split(&chosen, &scale) {
+            Some(split) => {
+                let whole = Rival {
+                    candidate: winner.clone(),
+                    instance: chosen.parts[chosen.parts.len() - 1].instance.clone(),
+                    evidence,
+                    equivalent: true,
+                };
+                for part in &split.parts[chosen.parts.len() - 1..] {
+                    // A part that was there before keeps its own evidence.
+                    if let Some(known) = before.iter().find(|a| a.candidate == part.candidate) {
+                        let mut known = known.clone();
+                        known.rivals.retain(|r| r.candidate != winner);
+                        known.rivals.insert(0, whole.clone());
+                        state.accepted.push(known);
+                        continue;
+                    }
+                    // What was tried beside the whole is no equal of its parts alone.
+                    let mut others = vec![whole.clone()];
+                    others.extend(
+                        rivals
+                            .iter()
+                            .filter(|r| !split.parts.iter().any(|p| p.candidate == r.candidate))
+                            .map(|r| Rival { equivalent: false, ..r.clone() }),
+                    );
+                    state.accepted.push(Accepted {
+                        candidate: part.candidate.clone(),
+                        evidence,
+                        rivals: others,
+                    });
+                }
+                state.current = split;
+            }
+            None => {
+                state.current = chosen;
+                state.accepted.push(Accepted { candidate: winner, evidence, rivals });
+            }
+        }
+        if state.current.setup.noise.is_some() {
+            state.whiten();
+            self.method(&mut state.current, &state.scale);
+            state.current = self.refit(&state.current, &state.scale, 10);
+            state.whiten();
+            state.current = self.refit(&state.current, &state.scale, 5);
+        } else {
+            state.rescale();
+            self.method(&mut state.current, &state.scale);
+            state.current = self.refit(&state.current, &state.scale, 10);
+            let holds = state.current.setup.holds.clone();
+            state.current = self.redecide_holds(&state.current, &state.scale, 0.002);
+            if state.current.setup.holds != holds {
+                state.rescale();
+                self.method(&mut state.current, &state.scale);
+                state.current = self.refit(&state.current, &state.scale, 10);
+            }
+            state.rescale();
+            state.current = self.refit(&state.current, &state.scale, 5);
+        }
+        self.prune(state);
+    }
+
+    /// Every mechanism again, with all others in place and the segments at their longest: what else could
+    /// stand in its stead? The better (or the simpler of equals) takes its place; the others are the
+    /// alternatives of the report.
+    fn reconsider(&self, calibrated: &Fitted, state: &mut State) {
+        for index in 0..state.current.parts.len() {
+            let Some(base) = self.without(&state.current, index, &state.scale, 12) else { continue };
+            let part = state.current.parts[index].clone();
+            let taken = |c: &Candidate| base.parts.iter().any(|p| p.candidate == *c);
             let open: Vec<Candidate> = self.all.iter().filter(|c| !taken(c)).cloned().collect();
-            self.observer.stage(Stage::Screening { candidates: open.len(), found: current.parts.len() });
+            self.observer.stage(Stage::Screening { candidates: open.len(), found: base.parts.len() });
             let scored =
-                screen(&current.setup, self.library, &open, &current.level, scale, &current.fit.point);
-            let mut short: Vec<&Scored> = Vec::new();
+                screen(&base.setup, self.library, &open, &base.level, &state.scale, &base.fit.point);
+            let relatives = &self.library[part.candidate.mechanism].about.confused_with;
+            let mut short = self.short_list(&open, &scored, 0.003);
+            // Those it is confused with at the same place, even where the score test ranks them low.
             for s in &scored {
-                let kind = open[s.candidate].mechanism;
-                let of_kind = short.iter().filter(|o| open[o.candidate].mechanism == kind).count();
-                if s.gain > 0.003 && of_kind < 2 && short.len() < SHORT_LIST {
+                let c = &open[s.candidate];
+                let kind = &self.library[c.mechanism].kind;
+                if relatives.contains(kind)
+                    && !short.iter().any(|o| self.library[open[o.candidate].mechanism].kind == *kind)
+                {
                     short.push(s);
                 }
             }
-            if short.is_empty() {
-                break;
-            }
             self.observer.stage(Stage::Fitting { candidates: short.len() });
-            let trials: Vec<(usize, Fitted)> = short
+            let mut trials: Vec<(usize, Fitted)> = short
                 .par_iter()
-                .filter_map(|s| {
-                    let candidate = &open[s.candidate];
-                    self.trial(current, candidate, s, scale).map(|f| (s.candidate, f))
-                })
+                .filter(|s| open[s.candidate] != part.candidate)
+                .filter_map(|s| self.trial(&base, &open[s.candidate], s, &state.scale).map(|f| (s.candidate, f)))
                 .collect();
+            if let Some(own) = open.iter().position(|c| *c == part.candidate) {
+                // The fit that stands, its part at the end like that of the others.
+                let mut standing = state.current.clone();
+                standing.parts.remove(index);
+                standing.parts.push(part.clone());
+                trials.push((own, standing));
+            }
             let Some((winner, chosen, rivals, evidence)) =
-                self.decide(calibrated, current, &open, trials, scale)
+                self.decide(calibrated, &base, &open, trials, &state.scale)
             else {
-                break;
+                continue;
             };
-            // Control: the smaller model from the winner's parameters. If that is better than it was,
-            // the baseline had been stuck.
-            let control = self.control(current, &chosen, scale);
-            let evidence = if control.fit.cost < current.fit.cost * 0.999 {
-                if current.parts.is_empty() {
-                    *calibrated = control.clone();
+            let known = state.accepted.iter_mut().find(|a| a.candidate == part.candidate);
+            if winner == part.candidate {
+                if let Some(known) = known {
+                    // Sums that equal it exactly stay declared.
+                    let whole: Vec<Rival> = known
+                        .rivals
+                        .iter()
+                        .filter(|r| r.equivalent && !rivals.iter().any(|n| n.candidate == r.candidate))
+                        .cloned()
+                        .collect();
+                    known.rivals = rivals;
+                    known.rivals.extend(whole);
+                    known.evidence = evidence;
                 }
-                *current = control;
-                self.weigh(current, &chosen, scale)
-            } else {
-                evidence
-            };
-            let total: f64 = calibrated_rss(calibrated, scale);
-            let share = (current.fit.rss.iter().sum::<f64>() - chosen.fit.rss.iter().sum::<f64>())
-                / total.max(1e-300);
-            self.observer.weighed(&self.library[winner.mechanism].kind, &evidence, share);
-            if !self.believable(&evidence, self.all.len(), share, current.parts.is_empty()) {
+                continue;
+            }
+            let mechanism = &self.library[winner.mechanism];
+            self.observer.weighed(&mechanism.kind, &evidence, 1.0);
+            state.accepted.retain(|a| a.candidate != part.candidate);
+            self.accept(state, winner, chosen, rivals, evidence);
+            if index >= state.current.parts.len() {
                 break;
             }
-            // A refinement has replaced its simpler relative.
-            let before = accepted.clone();
-            accepted.retain(|a| chosen.parts.iter().any(|p| p.candidate == a.candidate));
-            match self.split(&chosen, scale) {
-                Some(split) => {
-                    let whole = Rival {
-                        candidate: winner.clone(),
-                        instance: chosen.parts[chosen.parts.len() - 1].instance.clone(),
-                        evidence,
-                        equivalent: true,
-                    };
-                    for part in &split.parts[chosen.parts.len() - 1..] {
-                        // A part that was there before keeps its own evidence.
-                        if let Some(known) = before.iter().find(|a| a.candidate == part.candidate) {
-                            let mut known = known.clone();
-                            known.rivals.retain(|r| r.candidate != winner);
-                            known.rivals.insert(0, whole.clone());
-                            accepted.push(known);
-                            continue;
-                        }
-                        // What was tried beside the whole is no equal of its parts alone.
-                        let mut others = vec![whole.clone()];
-                        others.extend(
-                            rivals
-                                .iter()
-                                .filter(|r| !split.parts.iter().any(|p| p.candidate == r.candidate))
-                                .map(|r| Rival { equivalent: false, ..r.clone() }),
-                        );
-                        accepted.push(Accepted {
-                            candidate: part.candidate.clone(),
-                            evidence,
-                            rivals: others,
-                        });
-                    }
-                    *current = split;
-                }
-                None => {
-                    *current = chosen;
-                    accepted.push(Accepted { candidate: winner, evidence, rivals });
-                }
-            }
-            *scale = next_scale(&current.fit, scale, sigma);
-            self.method(current, scale);
-            *current = self.refit(current, scale, 10);
-            let holds = current.setup.holds.clone();
-            *current = self.redecide_holds(current, scale, 0.002);
-            if current.setup.holds != holds {
-                *scale = next_scale(&current.fit, scale, sigma);
-                self.method(current, scale);
-                *current = self.refit(current, scale, 10);
-            }
-            *scale = next_scale(&current.fit, scale, sigma);
-            *current = self.refit(current, scale, 5);
-            self.prune(current, accepted, scale);
         }
     }
 
@@ -718,25 +896,65 @@ impl<'a> Search<'a> {
     }
 
     /// Drops what no longer pays.
-    fn prune(&self, current: &mut Fitted, accepted: &mut Vec<Accepted>, scale: &[f64]) {
+    fn prune(&self, state: &mut State) {
         let mut index = 0;
-        while current.parts.len() > 1 && index < current.parts.len() {
-            let Some(smaller) = self.without(current, index, scale, 12) else {
+        while state.current.parts.len() > 1 && index < state.current.parts.len() {
+            let Some(smaller) = self.without(&state.current, index, &state.scale, 12) else {
                 index += 1;
                 continue;
             };
-            let e = self.weigh(&smaller, current, scale);
-            if e.score < 10.0 || e.drop < 0.01 {
-                let gone = current.parts[index].candidate.clone();
+            let e = self.weigh(&smaller, &state.current, &state.scale);
+            let least = if e.whitened { 0.003 } else { 0.01 };
+            if e.score < 10.0 || e.drop < least {
+                let gone = state.current.parts[index].candidate.clone();
                 self.observer.dropped(&self.library[gone.mechanism].kind);
-                accepted.retain(|a| a.candidate != gone);
-                *current = smaller;
+                state.accepted.retain(|a| a.candidate != gone);
+                state.current = smaller;
                 index = 0;
             } else {
                 index += 1;
             }
         }
     }
+}
+
+/// Where the search stands.
+struct State {
+    current: Fitted,
+    accepted: Vec<Accepted>,
+    /// Residual scale per channel, SI.
+    scale: Vec<f64>,
+    /// Noise per channel, SI.
+    sigma: Vec<f64>,
+    /// Rare effects may be believed.
+    loose: bool,
+}
+
+impl State {
+    /// Largest residual RMS over the noise.
+    fn misfit(&self) -> f64 {
+        rms(&self.current.fit, &self.scale).iter().zip(&self.sigma).map(|(r, s)| r / s).fold(0.0, f64::max)
+    }
+
+    fn rescale(&mut self) {
+        self.scale = next_scale(&self.current.fit, &self.scale, &self.sigma);
+    }
+
+    /// The noise model that suits the current residual, and its innovations as the scale.
+    fn whiten(&mut self) {
+        let f = &self.current;
+        let noise = f.setup.autoregressions(&f.level, &self.scale, &f.fit.point);
+        for ((s, a), sigma) in self.scale.iter_mut().zip(&noise).zip(&self.sigma) {
+            *s = (*s * a.variance().sqrt()).max(0.2 * sigma);
+        }
+        self.current.setup.noise = Some(Arc::new(noise));
+    }
+}
+
+/// Sum of squared innovations per channel, each model with the noise model of its own residual.
+fn innovations(f: &Fitted, scale: &[f64]) -> Vec<f64> {
+    let noise = f.setup.autoregressions(&f.level, scale, &f.fit.point);
+    noise.iter().zip(&f.fit.count).map(|(a, n)| a.variance() * *n as f64).collect()
 }
 
 fn calibrated_rss(calibrated: &Fitted, scale: &[f64]) -> f64 {
