@@ -1,4 +1,5 @@
 //! Stretches that go on from one another against the run that was never cut.
+#![allow(missing_docs, clippy::unwrap_used)]
 
 mod common;
 use common::*;
