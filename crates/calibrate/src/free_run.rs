@@ -1,6 +1,6 @@
 //! Free-run simulation of whole recordings, and how well it fits.
 
-use greybox_simulate::{Seeds, integrate};
+use greybox_simulate::{Seeds, Simulation, integrate};
 use rayon::prelude::*;
 
 use crate::problem::{Limits, Point, Segment};
@@ -137,12 +137,21 @@ impl Setup {
             .collect()
     }
 
-    /// Outputs of simulations restarted every window, `y[c * n + k]`.
+    /// Outputs of simulations restarted every window, `y[c * n + k]`. What was before a window stays
+    /// known to delayed expressions.
     fn windowed(&self, piece: usize, run: &FreeRun, parameters: &[f64], window: f64) -> Vec<f64> {
         let data = &self.data.pieces[piece];
         let (n, ny) = (data.len, self.system.ny);
         let length = ((window / data.dt).round() as usize).max(2);
         let mut y = vec![0.0; ny * n];
+        let simulation = Simulation {
+            system: &self.system,
+            environment: &self.environments[piece],
+            parameters,
+            method: self.method,
+            seeds: &Seeds::default(),
+        };
+        let mut before = None;
         let mut a = 0;
         while a < n {
             let b = (a + length).min(n);
@@ -154,16 +163,8 @@ impl Setup {
                     *x = hat[a];
                 }
             }
-            let seeds = Seeds::default();
-            let part = integrate(
-                &self.system,
-                &self.environments[piece],
-                parameters,
-                &x0,
-                a..b,
-                self.method,
-                &seeds,
-            );
+            let (part, carry) = simulation.run_on(&x0, a..b, before.as_ref(), &[]);
+            before = Some(carry);
             for c in 0..ny {
                 y[c * n + a..c * n + b].copy_from_slice(&part.y[c * (b - a)..(c + 1) * (b - a)]);
             }

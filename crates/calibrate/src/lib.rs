@@ -8,4 +8,4 @@ pub mod setup;
 pub use data::{Data, DataError, Hats, PieceData};
 pub use free_run::{FreeRun, Score, window_length};
 pub use problem::{Ending, Fit, Free, Limits, Point, Problem, Segment, SegmentRows, StartPrior};
-pub use setup::{Level, Setup, free_parameters};
+pub use setup::{Level, Setup, UnknownState, free_parameters};

@@ -9,11 +9,21 @@
 //! conditions: short segments keep the problem convex, long ones give it power). The initial states
 //! are eliminated segment by segment: Householder QR of \[J_x | J_p | r\] leaves a small triangle per
 //! segment, and the triangles are stacked and factored again.
+//!
+//! **What goes on from segment to segment.** A free initial state is harmless where a sensor sees the
+//! state and ruinous where none does: the memory of a friction or of an actuator, free again every
+//! second, can be whatever the residual likes. Such states are *carried*
+//! ([`Problem::carried`]): free, or given, only where a piece begins, and after that where the segment
+//! before has left them. Delayed expressions remember what was before the segment in any case. Then
+//! the segments of a piece are simulated one after the other. The sensitivities to the parameters go
+//! through the seams; that of a segment's carried states to the *free* initial states of the segments
+//! before it is left out of the Jacobian (the step is Gauss–Newton's with this approximation; the
+//! cost that decides on a step is the true one).
 
 use std::ops::Range;
 
 use greybox_model::System;
-use greybox_simulate::{Environment, Method, Seeds, SignalLanes, Trajectory, integrate};
+use greybox_simulate::{Carry, Environment, Method, Seeds, SignalLanes, Simulation, Trajectory, has_history};
 use rayon::prelude::*;
 
 use crate::qr;
@@ -65,6 +75,8 @@ pub struct Problem<'a> {
     pub free: &'a [Free],
     /// Residual scale per channel.
     pub scale: &'a [f64],
+    /// Entries of the state vector that a segment takes over from the one that ends where it starts.
+    pub carried: &'a [usize],
 }
 
 /// A point of the search.
@@ -84,7 +96,8 @@ pub struct SegmentRows {
     pub rows: usize,
     /// Residual (measured − simulated)/scale.
     pub r: Vec<f64>,
-    /// −∂r/∂x₀, one column per state (zero for pinned ones).
+    /// −∂r/∂x₀, one column per state (zero for pinned ones and for those carried from the segment
+    /// before).
     pub jx: Vec<f64>,
     /// −∂r/∂p, one column per free parameter.
     pub jp: Vec<f64>,
@@ -145,19 +158,80 @@ struct Reduced {
 impl Problem<'_> {
     /// Simulates every segment and returns its rows; with `jacobian` false only the residuals.
     pub fn rows(&self, point: &Point, jacobian: bool, signals: Option<&[SignalLanes]>) -> Vec<SegmentRows> {
-        (0..self.segments.len())
+        if self.carried.is_empty() && !has_history(self.system) {
+            return (0..self.segments.len())
+                .into_par_iter()
+                .map(|i| self.segment_rows(i, point, jacobian, signals, None).0)
+                .collect();
+        }
+        let chains: Vec<Vec<(usize, SegmentRows)>> = self
+            .chains()
             .into_par_iter()
-            .map(|i| self.segment_rows(i, point, jacobian, signals))
-            .collect()
+            .map(|chain| {
+                let mut before = None;
+                chain
+                    .into_iter()
+                    .map(|i| {
+                        let (rows, carry) = self.segment_rows(i, point, jacobian, signals, before.as_ref());
+                        before = carry;
+                        (i, rows)
+                    })
+                    .collect()
+            })
+            .collect();
+        let mut rows: Vec<(usize, SegmentRows)> = chains.into_iter().flatten().collect();
+        rows.sort_by_key(|(i, _)| *i);
+        rows.into_iter().map(|(_, rows)| rows).collect()
     }
 
+    /// The segments (by index) in runs of one piece in which each starts where the one before ended.
+    pub fn chains(&self) -> Vec<Vec<usize>> {
+        let mut order: Vec<usize> = (0..self.segments.len()).collect();
+        order.sort_by_key(|&i| (self.segments[i].piece, self.segments[i].range.start));
+        let mut chains: Vec<Vec<usize>> = Vec::new();
+        for i in order {
+            let goes_on = |chain: &&mut Vec<usize>| {
+                chain.last().is_some_and(|&last| {
+                    let (a, b) = (&self.segments[last], &self.segments[i]);
+                    a.piece == b.piece && a.range.end == b.range.start
+                })
+            };
+            match chains.last_mut().filter(goes_on) {
+                Some(chain) => chain.push(i),
+                None => chains.push(vec![i]),
+            }
+        }
+        chains
+    }
+
+    /// Per segment, whether it goes on from another one, which gives it its carried states.
+    fn continued(&self) -> Vec<bool> {
+        let mut continued = vec![false; self.segments.len()];
+        for &i in self.chains().iter().flat_map(|chain| &chain[1..]) {
+            continued[i] = true;
+        }
+        continued
+    }
+
+    /// Writes where the carried states really started into `point`.
+    fn take_over(&self, rows: &[SegmentRows], continued: &[bool], point: &mut Point) {
+        for ((start, rows), _) in point.starts.iter_mut().zip(rows).zip(continued).filter(|(_, c)| **c) {
+            let t = &rows.trajectory;
+            if t.n > 0 {
+                self.carried.iter().for_each(|&j| start[j] = t.x[j * t.n]);
+            }
+        }
+    }
+
+    /// Rows of segment `i`, and where it ended if the next one may have to know.
     fn segment_rows(
         &self,
         i: usize,
         point: &Point,
         jacobian: bool,
         signals: Option<&[SignalLanes]>,
-    ) -> SegmentRows {
+        before: Option<&Carry>,
+    ) -> (SegmentRows, Option<Carry>) {
         let segment = &self.segments[i];
         let (nx, ny, np) = (self.system.nx, self.system.ny, self.free.len());
         let start = &point.starts[i];
@@ -171,15 +245,21 @@ impl Problem<'_> {
         } else {
             Seeds::default()
         };
-        let mut trajectory = integrate(
-            self.system,
-            &self.environments[segment.piece],
-            &point.parameters,
-            start,
-            segment.range.clone(),
-            self.method,
-            &seeds,
-        );
+        let simulation = Simulation {
+            system: self.system,
+            environment: &self.environments[segment.piece],
+            parameters: &point.parameters,
+            method: self.method,
+            seeds: &seeds,
+        };
+        let range = segment.range.clone();
+        let (mut trajectory, carry) = if self.carried.is_empty() && !has_history(self.system) {
+            (simulation.run(start, range), None)
+        } else {
+            let (trajectory, carry) = simulation.run_on(start, range, before, self.carried);
+            (trajectory, Some(carry))
+        };
+        let taken_over = |j: usize| before.is_some() && self.carried.contains(&j);
         let n = segment.range.len();
         let rows = ny * n + nx;
         let mut r = vec![0.0; rows];
@@ -194,7 +274,7 @@ impl Problem<'_> {
         }
         for j in 0..nx {
             let (mean, std) = prior[j];
-            if std > 0.0 && std.is_finite() {
+            if std > 0.0 && std.is_finite() && !taken_over(j) {
                 r[ny * n + j] = (mean - start[j]) / std;
             }
         }
@@ -221,7 +301,7 @@ impl Problem<'_> {
             columns = take(&trajectory.dy, np + nx, seeds.signals.lanes);
             for j in 0..nx {
                 let (_, std) = prior[j];
-                if std == 0.0 {
+                if std == 0.0 || taken_over(j) {
                     jx[j * rows..(j + 1) * rows].fill(0.0);
                 } else if std.is_finite() {
                     jx[j * rows + ny * n + j] = 1.0 / std;
@@ -234,7 +314,7 @@ impl Problem<'_> {
             }
             trajectory.dy = Vec::new();
         }
-        SegmentRows { rows, r, jx, jp, signals: columns, trajectory }
+        (SegmentRows { rows, r, jx, jp, signals: columns, trajectory }, carry)
     }
 
     fn prior_cost(&self, parameters: &[f64]) -> f64 {
@@ -279,6 +359,10 @@ impl Problem<'_> {
         for f in self.free {
             point.parameters[f.index] = point.parameters[f.index].clamp(f.lower, f.upper);
         }
+        let continued = self.continued();
+        let pinned = |i: usize, j: usize| {
+            self.start_priors[i][j].1 == 0.0 || (continued[i] && self.carried.contains(&j))
+        };
         let mut lambda = 1e-3;
         let mut ending = Ending::Limit;
         let mut iterations = 0;
@@ -289,9 +373,15 @@ impl Problem<'_> {
             iterations += 1;
             let reduced: Vec<Reduced> = rows
                 .par_iter()
-                .map(|s| {
+                .enumerate()
+                .map(|(i, s)| {
                     let mut a = Vec::with_capacity(width * s.rows);
                     a.extend_from_slice(&s.jx);
+                    for j in (0..nx).filter(|&j| pinned(i, j)) {
+                        // The state's own row says that it does not move; without it the elimination
+                        // would take a row of the measurements for this column.
+                        a[j * s.rows + s.rows - nx + j] = 1.0;
+                    }
                     a.extend_from_slice(&s.jp);
                     a.extend_from_slice(&s.r);
                     Reduced { triangle: qr::triangle(&mut a, s.rows, width) }
@@ -317,7 +407,7 @@ impl Problem<'_> {
                     let dx = qr::back_substitute(&red.triangle, width, nx, &rhs);
                     let shrink = 1.0 / (1.0 + 0.1 * lambda.min(1e6));
                     for (j, d) in dx.iter().enumerate() {
-                        if self.start_priors[i][j].1 != 0.0 {
+                        if !pinned(i, j) {
                             trial.starts[i][j] += d * shrink;
                         }
                     }
@@ -350,6 +440,7 @@ impl Problem<'_> {
             }
         }
         let rows = self.rows(&point, false, None);
+        self.take_over(&rows, &continued, &mut point);
         let (rss, count) = self.rss(&rows);
         Fit { cost: self.cost_of(&rows, &point), point, rss, count, iterations, ending }
     }

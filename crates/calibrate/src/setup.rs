@@ -31,6 +31,20 @@ pub struct Setup {
     pub method: Method,
     /// Parameters to fit with priors and bounds.
     pub free: Vec<Free>,
+    /// STUB
+    pub noise: Option<Arc<Vec<Stub>>>,
+    /// Entries of the state vector carried from segment to segment (see [`Problem::carried`]).
+    pub carried: Vec<usize>,
+}
+
+/// A name that is no state of the model.
+#[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
+#[error("the model has no state `{name}` to carry from segment to segment; its states are {available}")]
+pub struct UnknownState {
+    /// What was asked for.
+    pub name: String,
+    /// What there is.
+    pub available: String,
 }
 
 /// A choice of segments with the priors of their starts.
@@ -65,13 +79,17 @@ impl Setup {
             environments,
             method: Method::Rk4 { substeps: 1 },
             free,
+            carried: Vec::new(),
+            noise: None,
         };
         let tolerance: Vec<f64> = setup.data.spread.iter().map(|s| 1e-3 * s).collect();
         setup.choose_method(&tolerance);
         Ok(setup)
     }
 
-    /// The same data with another model of the same measurements (a mechanism added).
+    /// The same data with another model of the same measurements (a mechanism added). No state is
+    /// carried any more, since the entries of the state vector are others: ask again with
+    /// [`with_carried`](Self::with_carried).
     ///
     /// # Errors
     /// When the model does not compile.
@@ -86,7 +104,32 @@ impl Setup {
         } else {
             Arc::new(Hats::new(&model, &self.data))
         };
-        Ok(Setup { model, system, hats, free, ..self.clone() })
+        Ok(Setup { model, system, hats, free, carried: Vec::new(), ..self.clone() })
+    }
+
+    /// The same with the states of these names (all entries of their chains) carried from segment to
+    /// segment instead of free in each: the memory of a mechanism, which no sensor sees.
+    ///
+    /// # Errors
+    /// [`UnknownState`] when a name is no state of the model.
+    pub fn with_carried(&self, names: &[String]) -> Result<Setup, UnknownState> {
+        let mut carried = Vec::new();
+        for name in names {
+            let j = self.model.state(name).ok_or_else(|| UnknownState {
+                name: name.clone(),
+                available: self
+                    .model
+                    .states
+                    .iter()
+                    .map(|s| format!("`{}`", s.name))
+                    .collect::<Vec<_>>()
+                    .join(", "),
+            })?;
+            carried.extend(self.system.offsets[j]..self.system.offsets[j] + self.system.orders[j]);
+        }
+        carried.sort_unstable();
+        carried.dedup();
+        Ok(Setup { carried, ..self.clone() })
     }
 
     /// The same with other holds.
@@ -265,6 +308,7 @@ impl Setup {
             start_priors: &level.priors,
             free: &self.free,
             scale,
+            carried: &self.carried,
         })
     }
 
@@ -333,4 +377,16 @@ pub fn free_parameters(model: &Model) -> Vec<Free> {
             Free { index, mean: p.value, std, lower, upper }
         })
         .collect()
+}
+
+/// STUB
+#[derive(Debug, Clone)]
+pub struct Stub;
+impl Stub {
+    /// STUB
+    pub fn variance(&self) -> f64 { 1.0 }
+}
+impl Setup {
+    /// STUB
+    pub fn autoregressions(&self, _: &Level, _: &[f64], _: &Point) -> Vec<Stub> { vec![Stub; self.system.ny] }
 }

@@ -15,7 +15,7 @@ use crate::library::{Mechanism, MechanismError, built_in};
 use crate::locate::{Location, force, locate};
 use crate::place::Place;
 use crate::screen::project;
-use crate::search::{Fitted, Found, Search, rms};
+use crate::search::{Fitted, Found, Search, raw_rss, rms};
 use crate::surface::{Surface, Variable};
 use crate::{Observer, Stage};
 
@@ -128,10 +128,14 @@ pub struct Finding {
     pub channel: Option<String>,
     /// Input, for a fault of the actuation.
     pub input: Option<String>,
+    /// Parameter, for one that drifts.
+    pub drifting: Option<String>,
     /// The law in the model's names.
     pub expression: String,
     /// Parameters: name in the report, index in the improved model, estimate.
     pub parameters: Vec<(String, usize, Estimate)>,
+    /// Further figures that follow from the parameters (a resonance frequency, Hz): name, estimate.
+    pub figures: Vec<(String, Estimate)>,
     /// Share of the calibrated model's misfit that is lost without it.
     pub share_explained: f64,
     /// Probability among the explanations tried.
@@ -321,9 +325,9 @@ fn conclude(
     };
     let scale = residual_scale(&improved, &found.scale);
     let calibrated_scale = residual_scale(&calibrated, &found.scale);
-    let intervals = |f: &Fitted, scale: &[f64]| interval_widths(f, scale);
-    let calibrated_widths = intervals(&calibrated, &calibrated_scale);
-    let improved_widths = intervals(&improved, &scale);
+    let calibrated_widths = Uncertainty::of(&calibrated, &calibrated_scale).widths();
+    let uncertainty = Uncertainty::of(&improved, &scale);
+    let improved_widths = uncertainty.widths();
     let value_of = |f: &Fitted, widths: &[f64], index: usize| {
         let value = f.fit.point.parameters[index];
         let width = f.setup.free.iter().position(|x| x.index == index).map(|i| widths[i]);
@@ -378,11 +382,11 @@ fn conclude(
     // Mechanisms, remainder, verdict.
     let surface = surface(&improved, &scale);
     let misfit =
-        rms(&improved.fit, &found.scale).iter().zip(&train.sigma).map(|(r, s)| r / s).fold(0.0, f64::max);
+        residual_rms(&improved, &found.scale).iter().zip(&train.sigma).map(|(r, s)| r / s).fold(0.0, f64::max);
     let fired = |gain: f64, ratio: f64| {
         surface.as_ref().is_some_and(|s| s.gain > gain && s.t > 2.5) && misfit > ratio
     };
-    let full: f64 = improved.fit.rss.iter().sum();
+    let full: f64 = raw_rss(&improved, &found.scale).iter().sum();
     let base = search.rss_at(&calibrated, &improved, &found.scale);
     let explained = 1.0 - full / base.max(1e-300);
     let verdict = if improved.parts.is_empty() {
@@ -394,7 +398,7 @@ fn conclude(
     };
     let significant = if improved.parts.is_empty() { fired(0.2, 1.3) } else { fired(0.05, 1.1) };
     let mut mechanisms = if verdict == Verdict::MissingPhysics {
-        findings(&improved, &found, library, search, &scale, base, full, &train_role, &improved_widths)
+        findings(&improved, &found, library, search, &scale, base, full, &train_role, &uncertainty)
     } else {
         Vec::new()
     };
@@ -422,7 +426,16 @@ fn conclude(
     })
 }
 
+/// Residual RMS per channel, SI, whatever the noise model.
+fn residual_rms(fitted: &Fitted, scale: &[f64]) -> Vec<f64> {
+    let rss = raw_rss(fitted, scale);
+    rss.iter().zip(&fitted.fit.count).zip(scale).map(|((r, n), s)| s * (r / (*n).max(1) as f64).sqrt()).collect()
+}
+
 fn residual_scale(fitted: &Fitted, scale: &[f64]) -> Vec<f64> {
+    if fitted.setup.noise.is_some() {
+        return scale.to_vec(); // that of the innovations
+    }
     rms(&fitted.fit, scale).iter().zip(&fitted.setup.data.sigma).map(|(r, s)| r.max(0.7 * s)).collect()
 }
 
@@ -492,78 +505,136 @@ fn with_parameters(fitted: &Fitted, parameters: Option<Vec<f64>>, scale: &[f64])
     Fitted { fit, ..fitted.clone() }
 }
 
-/// Half widths of the 95 % intervals of the free parameters: the larger of the Gauss–Newton and the
-/// block-sandwich covariance, with a t quantile for the number of blocks.
-pub fn interval_widths(fitted: &Fitted, scale: &[f64]) -> Vec<f64> {
-    let setup = &fitted.setup;
-    let (nx, ny, np) = (setup.system.nx, setup.system.ny, setup.free.len());
-    if np == 0 {
-        return Vec::new();
-    }
-    let rows = setup.with_problem(&fitted.level, scale, |p| p.rows(&fitted.fit.point, true, None));
-    let total: usize = fitted.level.segments.iter().map(|s| s.range.len()).sum();
-    let length = (total / 40).max(1);
-    let mut h = vec![0.0; np * np];
-    let mut scores: Vec<Vec<f64>> = Vec::new();
-    let (mut rss, mut count) = (0.0, 0usize);
-    for (segment, rows) in fitted.level.segments.iter().zip(rows) {
-        let p = project(rows, nx);
-        let (n, m) = (segment.range.len(), p.rows);
-        rss += qr::dot(&p.r, &p.r);
-        count += ny * n;
-        for a in 0..np {
-            for b in 0..np {
-                h[a * np + b] += qr::dot(&p.jp[a * m..(a + 1) * m], &p.jp[b * m..(b + 1) * m]);
+/// Covariance of the free parameters, twice: Gauss–Newton, and the sandwich over blocks of samples; of any
+/// figure, the larger of the two variances counts.
+#[derive(Debug, Clone)]
+pub struct Uncertainty {
+    /// Number of free parameters.
+    np: usize,
+    /// σ² (JᵀJ + Λ)⁻¹.
+    naive: Vec<f64>,
+    /// H⁻¹ (Σ s sᵀ) H⁻¹ over the blocks' scores.
+    sandwich: Vec<f64>,
+    /// Quantile of Student's t.
+    t: f64,
+}
+
+impl Uncertainty {
+    /// At the optimum of a fit.
+    pub fn of(fitted: &Fitted, scale: &[f64]) -> Uncertainty {
+        let setup = &fitted.setup;
+        let (nx, ny, np) = (setup.system.nx, setup.system.ny, setup.free.len());
+        if np == 0 {
+            return Uncertainty { np, naive: Vec::new(), sandwich: Vec::new(), t: 2.0 };
+        }
+        let rows = setup.with_problem(&fitted.level, scale, |p| p.rows(&fitted.fit.point, true, None));
+        let total: usize = fitted.level.segments.iter().map(|s| s.range.len()).sum();
+        let length = (total / 40).max(1);
+        let mut h = vec![0.0; np * np];
+        let mut scores: Vec<Vec<f64>> = Vec::new();
+        let (mut rss, mut count) = (0.0, 0usize);
+        for (segment, rows) in fitted.level.segments.iter().zip(rows) {
+            let p = project(rows, nx);
+            let (n, m) = (segment.range.len(), p.rows);
+            rss += qr::dot(&p.r, &p.r);
+            count += ny * n;
+            for a in 0..np {
+                for b in 0..np {
+                    h[a * np + b] += qr::dot(&p.jp[a * m..(a + 1) * m], &p.jp[b * m..(b + 1) * m]);
+                }
+            }
+            let parts = (n as f64 / length as f64).round().max(1.0) as usize;
+            for b in 0..parts {
+                let (from, to) = (b * n / parts, (b + 1) * n / parts);
+                let score = |a: usize| -> f64 {
+                    let column = &p.jp[a * m..(a + 1) * m];
+                    (0..ny).map(|c| c * n + from..c * n + to).map(|r| qr::dot(&column[r.clone()], &p.r[r])).sum()
+                };
+                scores.push((0..np).map(score).collect());
             }
         }
-        let parts = (n as f64 / length as f64).round().max(1.0) as usize;
-        for b in 0..parts {
-            let (from, to) = (b * n / parts, (b + 1) * n / parts);
-            scores.push(
-                (0..np)
-                    .map(|a| {
-                        (0..ny)
-                            .map(|c| {
-                                let r = c * n + from..c * n + to;
-                                qr::dot(&p.jp[a * m..(a + 1) * m][r.clone()], &p.r[r])
-                            })
-                            .sum()
-                    })
-                    .collect(),
-            );
+        for (i, f) in setup.free.iter().enumerate() {
+            if f.std.is_finite() && f.std > 0.0 {
+                h[i * np + i] += 1.0 / (f.std * f.std);
+            }
         }
-    }
-    for (i, f) in setup.free.iter().enumerate() {
-        if f.std.is_finite() && f.std > 0.0 {
-            h[i * np + i] += 1.0 / (f.std * f.std);
+        let d: Vec<f64> = (0..np).map(|i| h[i * np + i].max(1e-300).sqrt()).collect();
+        let scaled: Vec<f64> = (0..np * np).map(|i| h[i] / (d[i / np] * d[i % np])).collect();
+        let inverse: Vec<Vec<f64>> = (0..np)
+            .map(|i| {
+                let mut e = vec![0.0; np];
+                e[i] = 1.0;
+                let column = qr::solve_spd(&scaled, np, &e);
+                column.iter().zip(&d).map(|(x, dj)| x / (dj * d[i])).collect()
+            })
+            .collect();
+        let variance = rss / (count.saturating_sub(np)).max(1) as f64;
+        let blocks = scores.len();
+        let freedom = (blocks as f64 - np as f64).max(2.0);
+        use statrs::distribution::{ContinuousCDF, StudentsT};
+        let t = StudentsT::new(0.0, 1.0, freedom).map_or(2.0, |s| s.inverse_cdf(0.975));
+        let moved: Vec<Vec<f64>> =
+            scores.iter().map(|s| inverse.iter().map(|row| qr::dot(row, s)).collect()).collect();
+        let inflate = blocks as f64 / freedom;
+        let (mut naive, mut sandwich) = (vec![0.0; np * np], vec![0.0; np * np]);
+        for a in 0..np {
+            for b in 0..np {
+                naive[a * np + b] = inverse[a][b] * variance;
+                sandwich[a * np + b] = inflate * moved.iter().map(|m| m[a] * m[b]).sum::<f64>();
+            }
         }
+        Uncertainty { np, naive, sandwich, t }
     }
-    let d: Vec<f64> = (0..np).map(|i| h[i * np + i].max(1e-300).sqrt()).collect();
-    let scaled: Vec<f64> = (0..np * np).map(|i| h[i] / (d[i / np] * d[i % np])).collect();
-    let inverse: Vec<Vec<f64>> = (0..np)
-        .map(|i| {
-            let mut e = vec![0.0; np];
-            e[i] = 1.0;
-            qr::solve_spd(&scaled, np, &e)
-        })
+
+    /// Half width of the 95 % interval of a figure with this gradient in the free parameters.
+    pub fn width(&self, gradient: &[f64]) -> f64 {
+        let form = |m: &[f64]| -> f64 {
+            (0..self.np).map(|a| gradient[a] * qr::dot(&m[a * self.np..(a + 1) * self.np], gradient)).sum()
+        };
+        self.t * form(&self.naive).max(form(&self.sandwich)).max(0.0).sqrt()
+    }
+
+    /// Half widths of the 95 % intervals of all free parameters.
+    pub fn widths(&self) -> Vec<f64> {
+        (0..self.np)
+            .map(|i| {
+                let at = i * self.np + i;
+                self.t * self.naive[at].max(self.sandwich[at]).max(0.0).sqrt()
+            })
+            .collect()
+    }
+}
+
+/// A figure that follows from a mechanism's parameters, with its interval by the delta method.
+fn figure(
+    improved: &Fitted,
+    uncertainty: &Uncertainty,
+    mechanism: &Mechanism,
+    part: &crate::search::Part,
+    e: &greybox_model::Expr,
+) -> Option<Estimate> {
+    let model = &improved.setup.model;
+    let own: Vec<(&str, usize)> = mechanism
+        .parameters()
+        .zip(&part.instance.names)
+        .filter_map(|(plain, name)| Some((plain, model.parameter(name)?)))
         .collect();
-    let variance = rss / (count.saturating_sub(np)).max(1) as f64;
-    let blocks = scores.len();
-    let freedom = (blocks as f64 - np as f64).max(2.0);
-    use statrs::distribution::{ContinuousCDF, StudentsT};
-    let t = StudentsT::new(0.0, 1.0, freedom).map_or(2.0, |s| s.inverse_cdf(0.975));
-    (0..np)
-        .map(|i| {
-            let naive = inverse[i][i] * variance;
-            let sandwich: f64 = scores
-                .iter()
-                .map(|s| (0..np).map(|a| inverse[i][a] * s[a] / d[a]).sum::<f64>().powi(2))
-                .sum::<f64>()
-                * blocks as f64
-                / freedom;
-            t * naive.max(sandwich).max(0.0).sqrt() / d[i]
+    let parameters = &improved.fit.point.parameters;
+    let value = |e: &greybox_model::Expr| {
+        e.eval(&|n, _| match n {
+            "pi" => Some(std::f64::consts::PI),
+            _ => own.iter().find(|o| o.0 == n).map(|o| parameters[o.1]),
         })
-        .collect()
+        .filter(|v| v.is_finite())
+    };
+    let mut gradient = vec![0.0; improved.setup.free.len()];
+    for (plain, index) in &own {
+        if let Some(at) = improved.setup.free.iter().position(|f| f.index == *index) {
+            gradient[at] = value(&e.derivative(plain, 0))?;
+        }
+    }
+    let (v, w) = (value(e)?, uncertainty.width(&gradient));
+    Some(Estimate { value: v, ci95: Some((v - w, v + w)) })
 }
 
 fn surface(fitted: &Fitted, scale: &[f64]) -> Option<Surface> {
@@ -579,8 +650,9 @@ fn findings(
     base: f64,
     full: f64,
     train: &Role,
-    widths: &[f64],
+    uncertainty: &Uncertainty,
 ) -> Vec<Finding> {
+    let widths = uncertainty.widths();
     let mut setup = improved.setup.clone();
     for (p, v) in setup.model.parameters.iter_mut().zip(&improved.fit.point.parameters) {
         p.value = *v;
@@ -596,7 +668,7 @@ fn findings(
             let accepted = found.accepted.iter().find(|a| a.candidate == part.candidate);
             let without = search.rss_without(improved, i, &found.scale).unwrap_or(base);
             let evidence = accepted.map_or(
-                Evidence { score: 0.0, drop: 0.0, held_out: 0.0, t: 0.0, improving: 0.0, kappa: 1.0 },
+                Evidence::NONE,
                 |a| a.evidence,
             );
             // Posterior weights of the explanations tried; equivalent ones share their weight.
@@ -639,17 +711,26 @@ fn findings(
                     Some((name.clone(), index, estimate))
                 })
                 .collect();
-            let (channel, input) = match &part.candidate.place {
-                Place::Measurement(c) => (Some(setup.model.measurements[*c].channel.clone()), None),
-                Place::Input(u) => (None, Some(setup.model.inputs[*u].name.clone())),
-                _ => (None, None),
-            };
+            let (mut channel, mut input, mut drifting) = (None, None, None);
+            match &part.candidate.place {
+                Place::Measurement(c) => channel = Some(setup.model.measurements[*c].channel.clone()),
+                Place::Input(u) => input = Some(setup.model.inputs[*u].name.clone()),
+                Place::Parameter(p) => drifting = Some(setup.model.parameters[*p].name.clone()),
+                _ => {}
+            }
+            let figures = mechanism
+                .report
+                .iter()
+                .filter_map(|(name, e)| Some((name.clone(), figure(improved, uncertainty, mechanism, part, e)?)))
+                .collect();
             Finding {
                 kind: mechanism.kind.clone(),
                 signature: mechanism.about.signature.clone(),
                 equations: part.candidate.place.equations(&setup.model),
                 channel,
                 input,
+                drifting,
+                figures,
                 expression: part.instance.expression.to_string(),
                 parameters,
                 share_explained: ((without - full) / base.max(1e-300)).clamp(0.0, 1.0),
@@ -844,7 +925,7 @@ pub fn calibrate(
     let window = window_length(&durations, train.pieces.iter().map(|p| p.dt).fold(0.0, f64::max));
     let fitted = polish_baseline(&found.calibrated, &nominal.values(), &found.scale);
     let scale = residual_scale(&fitted, &found.scale);
-    let widths = interval_widths(&fitted, &scale);
+    let widths = Uncertainty::of(&fitted, &scale).widths();
     let values = &fitted.fit.point.parameters;
     let mut calibrated = model.clone();
     for (p, v) in calibrated.parameters.iter_mut().zip(values) {

@@ -411,7 +411,7 @@ impl<'a> Search<'a> {
 
     /// Residual sum of squares of a model without its part `index`, refitted.
     pub fn rss_without(&self, fitted: &Fitted, index: usize, scale: &[f64]) -> Option<f64> {
-        Some(self.without(fitted, index, scale, 10)?.fit.rss.iter().sum())
+        Some(raw_rss(&self.without(fitted, index, scale, 10)?, scale).iter().sum())
     }
 
     /// Runs all levels; again on whitened residuals where what is left over is coloured.
@@ -508,10 +508,6 @@ impl<'a> Search<'a> {
             self.level(calibrated, state);
         }
         self.reconsider(calibrated, state);
-        let plain = Setup { noise: None, ..state.current.setup.clone() };
-        let fit = plain.fit(&state.current.level, &state.scale, &[state.current.fit.point.clone()], limits(0));
-        let noise = state.current.setup.noise.clone();
-        state.current = Fitted { setup: Setup { noise, ..plain }, fit, ..state.current.clone() };
     }
 
     /// One level: rounds until nothing more is believable.
@@ -957,9 +953,12 @@ fn innovations(f: &Fitted, scale: &[f64]) -> Vec<f64> {
     noise.iter().zip(&f.fit.count).map(|(a, n)| a.variance() * *n as f64).collect()
 }
 
+/// Residual sum of squares per channel of a fitted model, not whitened, in units of `scale`.
+pub fn raw_rss(fitted: &Fitted, scale: &[f64]) -> Vec<f64> {
+    let plain = Setup { noise: None, ..fitted.setup.clone() };
+    plain.with_problem(&fitted.level, scale, |p| p.rss(&p.rows(&fitted.fit.point, false, None)).0)
+}
+
 fn calibrated_rss(calibrated: &Fitted, scale: &[f64]) -> f64 {
-    let rows = calibrated
-        .setup
-        .with_problem(&calibrated.level, scale, |p| p.rows(&calibrated.fit.point, false, None));
-    calibrated.setup.with_problem(&calibrated.level, scale, |p| p.rss(&rows)).0.iter().sum()
+    raw_rss(calibrated, scale).iter().sum()
 }

@@ -22,6 +22,11 @@
 //!
 //! (Hiskens & Pai, "Trajectory sensitivity analysis of hybrid systems", IEEE Trans. Circuits Syst. I
 //! 47(2), 2000).
+//!
+//! **Going on.** A stretch may start where another ended ([`Simulation::run_on`]): hidden states, their
+//! tangents and the past of delayed expressions go on, while other states start anew. Where those
+//! jump, a delayed expression jumps one delay later; the step across that instant loses its order,
+//! and the saltation of the sensitivity to the delay there, proportional to the jump, is left out.
 
 use greybox_model::Hold;
 use greybox_model::system::System;
@@ -184,18 +189,21 @@ struct Stage {
 }
 
 /// Past values of a delayed expression.
-#[derive(Debug, Clone, Default)]
+#[derive(Debug, Clone, Default, PartialEq)]
 struct History {
     s: Vec<f64>,
     value: Vec<f64>,
     slope: Vec<f64>,
     lanes: Vec<f64>,
+    /// Entries before this one belong to earlier stretches and stay as they are.
+    own: usize,
 }
 
 impl History {
     fn push(&mut self, s: f64, value: f64, slope: f64, lanes: &[f64]) {
         if let Some(&last) = self.s.last()
             && s <= last
+            && self.s.len() > self.own
         {
             // A second visit to the same instant (an event): the newer values count.
             let n = lanes.len();
@@ -222,6 +230,15 @@ impl History {
             return (self.value[n - 1], 0.0, n - 1, 0.0);
         }
         let h = self.s[i + 1] - self.s[i];
+        if h <= 0.0 {
+            // Two entries at one instant, where a stretch went on from another: the newer one counts.
+            return (
+                self.value[i + 1] + (s - self.s[i + 1]) * self.slope[i + 1],
+                self.slope[i + 1],
+                i + 1,
+                0.0,
+            );
+        }
         let w = (s - self.s[i]) / h;
         let (y0, y1, d0, d1) = (self.value[i], self.value[i + 1], self.slope[i] * h, self.slope[i + 1] * h);
         if w > 1.0 {
@@ -232,6 +249,189 @@ impl History {
         let value = y0 + w * (d0 + w * (c2 + w * c3));
         let slope = (d0 + w * (2.0 * c2 + 3.0 * w * c3)) / h;
         (value, slope, i, w)
+    }
+
+    /// What a stretch from `s` on may still read with a delay of at most `tau`.
+    fn recent(&self, s: f64, tau: f64, lanes: usize) -> History {
+        let from = self.s.partition_point(|&t| t <= s - tau).saturating_sub(1);
+        let mut kept = History {
+            s: self.s[from..].to_vec(),
+            value: self.value[from..].to_vec(),
+            slope: self.slope[from..].to_vec(),
+            lanes: self.lanes[from * lanes..].to_vec(),
+            own: 0,
+        };
+        kept.own = kept.s.len();
+        kept
+    }
+
+    /// The same with its lanes laid out for other seeds.
+    fn with_lanes(&self, map: &LaneMap) -> History {
+        History { lanes: map.apply(&self.lanes, self.s.len()), ..self.clone() }
+    }
+}
+
+/// Where each lane of a stretch comes from among the lanes of the stretch before it.
+struct LaneMap {
+    from: usize,
+    source: Vec<Option<usize>>,
+}
+
+impl LaneMap {
+    fn new(before: &Carry, seeds: &Seeds) -> LaneMap {
+        let parameters = seeds.parameters.iter().map(|p| before.parameters.iter().position(|q| q == p));
+        // Another stretch's initial states are not this one's.
+        let initial = seeds.initial.iter().map(|_| None);
+        let first = before.parameters.len() + before.initial;
+        let same = before.signals == seeds.signals.lanes;
+        let signals = (0..seeds.signals.lanes).map(|l| same.then_some(first + l));
+        LaneMap { from: first + before.signals, source: parameters.chain(initial).chain(signals).collect() }
+    }
+
+    fn apply(&self, rows: &[f64], count: usize) -> Vec<f64> {
+        let mut out = Vec::with_capacity(count * self.source.len());
+        for r in 0..count {
+            out.extend(self.source.iter().map(|l| l.map_or(0.0, |l| rows[r * self.from + l])));
+        }
+        out
+    }
+}
+
+/// Where a stretch ended: what the next one needs to go on from there.
+///
+/// It holds the state and its tangents at sample [`sample`](Carry::sample), and as much of the past
+/// of every delayed expression (of the equations and of the measurements) as the delays can reach
+/// back. Made and used by [`Simulation::run_on`].
+#[derive(Debug, Clone, PartialEq)]
+pub struct Carry {
+    sample: usize,
+    x: Vec<f64>,
+    dx: Vec<f64>,
+    reach: Vec<f64>,
+    h_next: f64,
+    start_s: f64,
+    /// Lanes of `dx` and of the histories: these parameters, so many initial states and signals.
+    parameters: Vec<usize>,
+    initial: usize,
+    signals: usize,
+    rhs_history: Vec<History>,
+    out_history: Vec<History>,
+}
+
+impl Carry {
+    /// The sample at which it holds.
+    pub fn sample(&self) -> usize {
+        self.sample
+    }
+
+    /// The state there.
+    pub fn state(&self) -> &[f64] {
+        &self.x
+    }
+}
+
+/// Whether a stretch depends on what was before it by more than its initial state: an equation
+/// delays something else than a plain input (whose past is known anyway), or a measurement delays
+/// anything.
+pub fn has_history(system: &System) -> bool {
+    !system.output.delays.is_empty() || system.rhs.delays.iter().any(|d| !input_leaf(system, d.arg_leaf))
+}
+
+/// Everything a simulation needs apart from where it starts and ends.
+#[derive(Debug, Clone, Copy)]
+pub struct Simulation<'a> {
+    /// The compiled model.
+    pub system: &'a System,
+    /// Inputs and forces; one input signal per input of the model.
+    pub environment: &'a Environment,
+    /// Parameter values, SI (`system.np`).
+    pub parameters: &'a [f64],
+    /// Integration.
+    pub method: Method,
+    /// Directions of the sensitivities.
+    pub seeds: &'a Seeds,
+}
+
+impl Simulation<'_> {
+    /// Samples `range` from state `x0` (`system.nx` entries: the chains q, q', … in the order of the
+    /// states, SI) at the first of them. Delayed expressions hold their initial value before it.
+    pub fn run(&self, x0: &[f64], range: std::ops::Range<usize>) -> Trajectory {
+        let s = range.start as f64 * self.environment.dt;
+        Core::new(self, x0, s).run(range, false)
+    }
+
+    /// Samples `range`, going on from where another stretch ended.
+    ///
+    /// The states `carried` (indices of the state vector) start where `before` ended, with their
+    /// tangents, whatever `x0` says; the other states start at `x0`. The delayed expressions remember
+    /// what `before` remembers; where the state jumps (`x0` is not where the other stretch ended),
+    /// they jump with it. Before the first sample of all they hold their initial value.
+    ///
+    /// Sensitivities to parameters and to signals go on. Those to the initial state belong to the
+    /// stretch: the initial states of earlier stretches have no lane here, and a carried state no
+    /// initial value of its own (its lane, if seeded, is zero).
+    ///
+    /// The returned [`Carry`] belongs to sample `range.end`, one step beyond the last one of the
+    /// result, where the environment reaches so far; else to the last one. A stretch that starts there
+    /// with that very state (all entries carried) continues as if it had never been cut. After a
+    /// divergence it holds the last good state, with zero tangents.
+    ///
+    /// `before` must come from the same system, environment and parameters; one that does not belong
+    /// to sample `range.start`, or to a system of other dimensions, is not used.
+    ///
+    /// ```
+    /// # use greybox_model::{Model, System};
+    /// use greybox_simulate::{Environment, Method, Seeds, Simulation};
+    /// # let model = Model::from_toml(r#"
+    /// # [parameters]
+    /// # a = { value = 2.0, unit = "1/s" }
+    /// # [states]
+    /// # x = { unit = "m", initial = 1.0 }
+    /// # [equations]
+    /// # decay = "x' + a*x = 0"
+    /// # "#, "model.toml").unwrap();
+    /// # let system = System::compile(&model).unwrap();
+    /// let environment = Environment { start: 0.0, dt: 0.01, len: 100, inputs: vec![], forces: vec![] };
+    /// let simulation = Simulation {
+    ///     system: &system,
+    ///     environment: &environment,
+    ///     parameters: &[2.0],
+    ///     method: Method::Rk4 { substeps: 1 },
+    ///     seeds: &Seeds::default(),
+    /// };
+    /// let whole = simulation.run(&[1.0], 0..100);
+    /// let (_, carry) = simulation.run_on(&[1.0], 0..40, None, &[]);
+    /// let (rest, _) = simulation.run_on(&[f64::NAN], 40..100, Some(&carry), &[0]);
+    /// assert_eq!(rest.y, whole.y[40..]);
+    /// ```
+    pub fn run_on(
+        &self,
+        x0: &[f64],
+        range: std::ops::Range<usize>,
+        before: Option<&Carry>,
+        carried: &[usize],
+    ) -> (Trajectory, Carry) {
+        let s = range.start as f64 * self.environment.dt;
+        let end = range.end.min(self.environment.len.saturating_sub(1)).max(range.start);
+        let mut x0 = x0.to_vec();
+        let before = before.filter(|b| {
+            b.sample == range.start
+                && b.x.len() == self.system.nx
+                && b.rhs_history.len() == self.system.rhs.delays.len()
+                && b.out_history.len() == self.system.output.delays.len()
+        });
+        if let Some(before) = before {
+            for &i in carried {
+                x0[i] = before.x[i];
+            }
+        }
+        let mut core = Core::new(self, &x0, s);
+        if let Some(before) = before {
+            core.go_on(before, carried);
+        }
+        let trajectory = core.run(range, true);
+        let carry = core.into_carry(end, &trajectory);
+        (trajectory, carry)
     }
 }
 
@@ -258,8 +458,7 @@ pub fn integrate(
     method: Method,
     seeds: &Seeds,
 ) -> Trajectory {
-    let mut core = Core::new(system, env, parameters, x0, range.start as f64 * env.dt, method, seeds);
-    core.run(range)
+    Simulation { system, environment: env, parameters, method, seeds }.run(x0, range)
 }
 
 struct Core<'a> {
@@ -291,6 +490,10 @@ struct Core<'a> {
     gactive: Vec<bool>,
     h_next: f64,
     fresh: bool,
+    /// Whether the delayed expressions remember this stretch's start.
+    begun: bool,
+    /// Whether a step left every reasonable bound after the last recorded sample.
+    lost: bool,
     zero_hold: bool,
     events_here: usize,
     rhs_history: Vec<History>,
@@ -304,15 +507,8 @@ struct Core<'a> {
 }
 
 impl<'a> Core<'a> {
-    fn new(
-        system: &'a System,
-        env: &'a Environment,
-        parameters: &'a [f64],
-        x0: &[f64],
-        s: f64,
-        method: Method,
-        seeds: &'a Seeds,
-    ) -> Core<'a> {
+    fn new(simulation: &Simulation<'a>, x0: &[f64], s: f64) -> Core<'a> {
+        let Simulation { system, environment: env, parameters, method, seeds } = *simulation;
         let (nx, nz) = (system.nx, system.nz);
         let lanes = seeds.lanes();
         let (tableau, substeps, tolerance) = match method {
@@ -435,6 +631,8 @@ impl<'a> Core<'a> {
             gactive,
             h_next: env.dt,
             fresh: false,
+            begun: false,
+            lost: false,
             zero_hold: env.inputs.iter().any(|u| u.hold() == Hold::Zero),
             events_here: 0,
             rhs_history: vec![History::default(); tape.delays.len()],
@@ -449,7 +647,54 @@ impl<'a> Core<'a> {
         }
     }
 
-    fn run(&mut self, range: std::ops::Range<usize>) -> Trajectory {
+    /// Takes over what `before` remembers, and its tangents of the states `carried`.
+    fn go_on(&mut self, before: &Carry, carried: &[usize]) {
+        let map = LaneMap::new(before, self.seeds);
+        let lanes = self.lanes;
+        for &i in carried {
+            let row = map.apply(&before.dx[i * map.from..(i + 1) * map.from], 1);
+            self.dx[i * lanes..(i + 1) * lanes].copy_from_slice(&row);
+        }
+        for (reach, old) in self.reach.iter_mut().zip(&before.reach) {
+            *reach = reach.max(*old);
+        }
+        self.h_next = before.h_next;
+        self.start_s = before.start_s;
+        self.rhs_history = before.rhs_history.iter().map(|h| h.with_lanes(&map)).collect();
+        self.out_history = before.out_history.iter().map(|h| h.with_lanes(&map)).collect();
+    }
+
+    /// What the next stretch needs, at `sample`; `trajectory` is what was recorded up to there.
+    fn into_carry(self, sample: usize, trajectory: &Trajectory) -> Carry {
+        let (nx, n, lanes) = (self.system.nx, trajectory.n, self.lanes);
+        let s = sample as f64 * self.env.dt;
+        let (x, dx) = if (self.lost || trajectory.diverged.is_some()) && n > 0 {
+            ((0..nx).map(|i| trajectory.x[i * n + n - 1]).collect(), vec![0.0; nx * lanes])
+        } else {
+            (self.x, self.dx)
+        };
+        let keep = |histories: &[History], taus: Vec<f64>| {
+            histories.iter().zip(taus).map(|(h, tau)| h.recent(s, tau.max(0.0), lanes)).collect()
+        };
+        let rhs = self.system.rhs.delays.iter().map(|d| self.stages[0].regs[d.tau as usize]).collect();
+        let out = self.system.output.delays.iter().map(|d| self.out_regs[d.tau as usize]).collect();
+        Carry {
+            sample,
+            x,
+            dx,
+            reach: self.reach,
+            h_next: self.h_next,
+            start_s: self.start_s,
+            parameters: self.seeds.parameters.clone(),
+            initial: self.seeds.initial.len(),
+            signals: self.seeds.signals.lanes,
+            rhs_history: keep(&self.rhs_history, rhs),
+            out_history: keep(&self.out_history, out),
+        }
+    }
+
+    /// Records the samples of `range`; with `go_on` the state then moves on to sample `range.end`.
+    fn run(&mut self, range: std::ops::Range<usize>, go_on: bool) -> Trajectory {
         let n = range.len();
         let (nx, ny, lanes) = (self.system.nx, self.system.ny, self.lanes);
         self.result = Trajectory {
@@ -461,38 +706,48 @@ impl<'a> Core<'a> {
         };
         self.start_modes();
         for (row, k) in range.clone().enumerate() {
-            let s0 = k as f64 * self.env.dt;
-            self.s = s0;
+            self.s = k as f64 * self.env.dt;
             self.record(row);
             if self.result.diverged.is_some() {
                 self.freeze(row, n);
                 break;
             }
-            if row + 1 == n {
-                break;
-            }
-            self.events_here = 0;
-            if self.zero_hold {
-                self.fresh = false;
-            }
-            let s1 = (k + 1) as f64 * self.env.dt;
-            for (at, delay) in self.breakpoints(s0) {
-                self.advance(at);
-                self.jump_of_delay(delay, at, s1);
-            }
-            let substeps = self.substeps;
-            if self.tolerance.is_none() && substeps > 1 {
-                let h = self.env.dt / substeps as f64;
-                for i in 1..substeps {
-                    let at = s0 + i as f64 * h;
-                    if at > self.s {
-                        self.advance(at);
-                    }
+            if row + 1 < n {
+                self.cross_interval(k);
+            } else if go_on && k + 1 < self.env.len {
+                self.cross_interval(k);
+                self.lost = self.result.diverged.take().is_some();
+                if !self.lost && !self.out_history.is_empty() {
+                    self.observe();
                 }
             }
-            self.advance(s1);
         }
         std::mem::take(&mut self.result)
+    }
+
+    /// From sample `k` to the next.
+    fn cross_interval(&mut self, k: usize) {
+        let s0 = k as f64 * self.env.dt;
+        let s1 = (k + 1) as f64 * self.env.dt;
+        self.events_here = 0;
+        if self.zero_hold {
+            self.fresh = false;
+        }
+        for (at, delay) in self.breakpoints(s0) {
+            self.advance(at);
+            self.jump_of_delay(delay, at, s1);
+        }
+        let substeps = self.substeps;
+        if self.tolerance.is_none() && substeps > 1 {
+            let h = self.env.dt / substeps as f64;
+            for i in 1..substeps {
+                let at = s0 + i as f64 * h;
+                if at > self.s {
+                    self.advance(at);
+                }
+            }
+        }
+        self.advance(s1);
     }
 
     /// Instants inside (s0, s0 + dt) at which a delayed zero-order-hold input jumps.
@@ -859,11 +1114,14 @@ impl<'a> Core<'a> {
     fn begin(&mut self, to: f64) {
         let mid = 0.5 * (self.s + to);
         self.eval(0, self.s, mid);
-        if self.rhs_history.iter().any(|h| h.s.is_empty()) {
-            // The very start: what was before it is the expression's initial value.
-            self.remember(0);
-            self.eval(0, self.s, mid);
-            self.remember(0); // with the slope that follows from it
+        if !self.begun {
+            self.begun = true;
+            if !self.rhs_history.is_empty() {
+                // The very start: what was before it is the expression's initial value.
+                self.remember(0);
+                self.eval(0, self.s, mid);
+                self.remember(0); // with the slope that follows from it
+            }
         }
         for _ in 0..8 {
             let mut changed = false;
@@ -1264,6 +1522,33 @@ impl<'a> Core<'a> {
         for i in 0..nx {
             self.result.x[i * n + row] = self.x[i];
         }
+        self.observe();
+        let out = &system.output;
+        for (c, &reg) in out.outputs.iter().enumerate() {
+            self.result.y[c * n + row] = self.out_regs[reg as usize];
+        }
+        if lanes > 0 {
+            for (c, &reg) in out.outputs.iter().enumerate() {
+                let d = &self.out_d[reg as usize * lanes..][..lanes];
+                for (l, v) in d.iter().enumerate() {
+                    self.result.dy[(l * ny + c) * n + row] = *v;
+                }
+            }
+            let first = self.seeds.parameters.len() + self.seeds.initial.len();
+            let count = self.seeds.signals.lanes;
+            let k = ((self.s / self.env.dt).round() as usize).min(self.env.len.saturating_sub(1));
+            for (c, change) in &self.seeds.signals.outputs {
+                for (l, v) in change[k * count..(k + 1) * count].iter().enumerate() {
+                    self.result.dy[((first + l) * ny + c) * n + row] += v;
+                }
+            }
+        }
+    }
+
+    /// The outputs and their tangents now, into `out_regs` and `out_d`; delayed ones remember it.
+    fn observe(&mut self) {
+        let system = self.system;
+        let (nx, lanes) = (system.nx, self.lanes);
         // The output belongs to the instant of the sample: inputs with the value they take then.
         let inside = self.s + 1e-6 * self.env.dt;
         if system.output_needs_z {
@@ -1301,25 +1586,8 @@ impl<'a> Core<'a> {
             self.output_delays();
         }
         out.eval_natural(&mut self.out_regs, &mut self.out_modes);
-        for (c, &reg) in out.outputs.iter().enumerate() {
-            self.result.y[c * n + row] = self.out_regs[reg as usize];
-        }
         if lanes > 0 {
             out.tangent(&self.out_regs, &self.out_modes, &[], lanes, &self.out_active, &mut self.out_d);
-            for (c, &reg) in out.outputs.iter().enumerate() {
-                let d = &self.out_d[reg as usize * lanes..][..lanes];
-                for (l, v) in d.iter().enumerate() {
-                    self.result.dy[(l * ny + c) * n + row] = *v;
-                }
-            }
-            let first = self.seeds.parameters.len() + self.seeds.initial.len();
-            let count = self.seeds.signals.lanes;
-            let k = ((self.s / self.env.dt).round() as usize).min(self.env.len.saturating_sub(1));
-            for (c, change) in &self.seeds.signals.outputs {
-                for (l, v) in change[k * count..(k + 1) * count].iter().enumerate() {
-                    self.result.dy[((first + l) * ny + c) * n + row] += v;
-                }
-            }
         }
     }
 
@@ -1339,7 +1607,9 @@ impl<'a> Core<'a> {
             let history = &mut self.out_history[i];
             let slope = match history.s.last() {
                 Some(&s) if self.s > s => (value - history.value[history.value.len() - 1]) / (self.s - s),
-                _ => 0.0,
+                // Where the stretch goes on from another, which left its slope here.
+                Some(_) => history.slope[history.slope.len() - 1],
+                None => 0.0,
             };
             let slope = match (delay.arg_leaf.map(|l| l as usize), self.fresh) {
                 (Some(l), true) if (System::STATES..System::STATES + system.nx).contains(&l) => {

@@ -4,5 +4,7 @@ pub mod rigs;
 mod signal;
 pub mod small;
 
-pub use integrate::{Environment, Force, Method, Seeds, SignalLanes, Trajectory, integrate};
+pub use integrate::{
+    Carry, Environment, Force, Method, Seeds, SignalLanes, Simulation, Trajectory, has_history, integrate,
+};
 pub use signal::{FINE, Signal};

@@ -1,0 +1,157 @@
+//! Memory that no sensor sees, and delays, through the seams of the segments.
+#![allow(missing_docs, clippy::unwrap_used)]
+
+mod common;
+use common::*;
+use greybox_calibrate::{Level, Segment};
+use greybox_model::Model;
+
+const BOUC_WEN: &str = r#"
+name = "Bouc–Wen oscillator"
+[inputs]
+f = { unit = "N" }
+[states]
+x = { unit = "m" }
+z = { unit = "m", measured = false, initial = 0 }
+[parameters]
+m  = { value = 1.0, unit = "kg", fixed = true }
+c  = { value = 1.5, unit = "N s/m", fixed = true }
+k  = { value = 20.0, unit = "N/m", fixed = true }
+kh = { value = 30.0, unit = "N/m" }
+be = { value = 8.0, unit = "1/m" }
+ga = { value = 4.0, unit = "1/m" }
+[equations]
+mass = "m*x'' + c*x' + k*x + kh*z = f"
+hysteresis = "z' = x' - be*abs(x')*z - ga*x'*abs(z)"
+"#;
+
+const DELAYED: &str = r#"
+name = "Delayed feedback"
+[inputs]
+f = { unit = "N" }
+[states]
+x = { unit = "m" }
+[parameters]
+m   = { value = 1.0, unit = "kg", fixed = true }
+c   = { value = 1.5, unit = "N s/m" }
+k   = { value = 20.0, unit = "N/m" }
+g   = { value = 8.0, unit = "N/m" }
+tau = { value = 0.3, unit = "s" }
+[equations]
+mass = "m*x'' + c*x' + k*x + g*delay(x, tau) = f"
+"#;
+
+const DT: f64 = 0.02;
+
+fn noisy(y: &[Vec<f64>], sigma: f64, seed: u64) -> Vec<Vec<f64>> {
+    y.iter().map(|y| y.iter().zip(normal(seed, y.len())).map(|(y, e)| y + sigma * e).collect()).collect()
+}
+
+/// The model with other first values of the free parameters.
+fn off(model: &Model, by: &[f64]) -> Model {
+    let mut model = model.clone();
+    for (p, f) in model.parameters.iter_mut().filter(|p| !p.fixed).zip(by) {
+        p.value *= f;
+    }
+    model
+}
+
+#[test]
+fn hysteresis_is_recovered_when_its_memory_is_carried() {
+    let truth = Model::from_toml(BOUC_WEN, "model.toml").unwrap();
+    let f = force(1, 3000, DT, 1.5, 8.0);
+    let clean = measure(&truth, &f, DT, &[0.0; 3]);
+    let sigma = 0.01 * greybox_calibrate::data::spread(&clean[0]);
+    let names = ["kh", "be", "ga"];
+    let (mut carried_worst, mut free_worst) = (0.0f64, 0.0f64);
+    for seed in 10..14 {
+        let free = setup(&off(&truth, &[0.7, 1.4, 0.6]), &f, DT, &noisy(&clean, sigma, seed));
+        let carried = free.with_carried(&["z".to_string()]).unwrap();
+        assert_eq!(carried.carried, [2]);
+        let level = carried.level(15);
+        assert_eq!(level.segments.len(), 15);
+        let scale = [sigma];
+        let got = fit(&carried, &level, &scale);
+        let rows = carried.with_problem(&level, &scale, |p| p.rows(&got.point, true, None));
+        let errors = carried.with_problem(&level, &scale, |p| standard_errors(p, &got.point));
+        for (i, segment) in rows.iter().enumerate() {
+            let column = &segment.jx[2 * segment.rows..3 * segment.rows];
+            assert!(column.iter().all(|v| *v == 0.0));
+            let t = &segment.trajectory;
+            if i > 0 {
+                assert!(segment.jx[..segment.rows].iter().any(|v| *v != 0.0));
+                // Where the memory was left is where it goes on, and the point says so.
+                assert_eq!(got.point.starts[i][2], t.x[2 * t.n]);
+            }
+        }
+        let plain = fit(&free, &level, &scale);
+        for (j, name) in names.iter().enumerate() {
+            let value = |f: &greybox_calibrate::Fit| f.point.parameters[3 + j];
+            let exact = truth.parameters[3 + j].value;
+            let z = (value(&got) - exact) / errors[j];
+            eprintln!(
+                "P seed {seed} {name}: {:.3} ± {:.3} (z {z:.2}), free {:.3}",
+                value(&got),
+                errors[j],
+                value(&plain)
+            );
+            assert!(z.abs() < 4.0, "{name}: {} ± {}", value(&got), errors[j]);
+            carried_worst = carried_worst.max((value(&got) / exact - 1.0).abs());
+            free_worst = free_worst.max((value(&plain) / exact - 1.0).abs());
+        }
+        let reduced = got.cost / got.count[0] as f64;
+        assert!((0.85..1.1).contains(&reduced), "{reduced}");
+    }
+    eprintln!("P worst relative error: carried {carried_worst:.3}, free {free_worst:.3}");
+}
+
+#[test]
+fn delayed_feedback_keeps_its_past_in_short_segments() {
+    let truth = Model::from_toml(DELAYED, "model.toml").unwrap();
+    let f = force(2, 3000, DT, 1.5, 8.0);
+    let clean = measure(&truth, &f, DT, &[0.0; 2]);
+    let sigma = 0.01 * greybox_calibrate::data::spread(&clean[0]);
+    let scale = [sigma];
+    let mut bias = [[0.0f64; 4]; 2];
+    let seeds = 4;
+    for seed in 0..seeds {
+        let s = setup(&off(&truth, &[1.2, 0.9, 0.8, 1.2]), &f, DT, &noisy(&clean, sigma, 20 + seed));
+        let level = s.level(60);
+        // One sample short of the next: nothing goes on there.
+        let cut = Level {
+            segments: level
+                .segments
+                .iter()
+                .map(|s| Segment { piece: s.piece, range: s.range.start..s.range.end - 1 })
+                .collect(),
+            priors: level.priors.clone(),
+        };
+        for (b, level) in bias.iter_mut().zip([&level, &cut]) {
+            let got = fit(&s, level, &scale);
+            for (j, b) in b.iter_mut().enumerate() {
+                *b += (got.point.parameters[1 + j] / truth.parameters[1 + j].value - 1.0) / seeds as f64;
+            }
+        }
+    }
+    eprintln!("P relative bias of c, k, g, tau: going on {:.4?}, cut {:.4?}", bias[0], bias[1]);
+}
+
+#[test]
+fn a_gap_between_segments_starts_a_new_chain() {
+    let model = Model::from_toml(BOUC_WEN, "model.toml").unwrap();
+    let f = force(1, 400, DT, 1.5, 8.0);
+    let clean = measure(&model, &f, DT, &[0.0; 3]);
+    let s = setup(&model, &f, DT, &clean).with_carried(&["z".to_string()]).unwrap();
+    let segments: Vec<Segment> =
+        [200..300, 0..100, 100..180, 300..400].map(|range| Segment { piece: 0, range }).into();
+    let priors = segments.iter().map(|g| s.start_prior(0, g.range.start)).collect();
+    let level = Level { segments, priors };
+    s.with_problem(&level, &[1.0], |p| assert_eq!(p.chains(), [vec![1, 2], vec![0, 3]]));
+    // What is asked for is said when it is not there; another model carries nothing.
+    let error = s.with_carried(&["y".to_string()]).unwrap_err();
+    assert_eq!(
+        error.to_string(),
+        "the model has no state `y` to carry from segment to segment; its states are `x`, `z`"
+    );
+    assert!(s.with_model(model, vec![]).unwrap().carried.is_empty());
+}
