@@ -31,8 +31,6 @@ pub struct Setup {
     pub method: Method,
     /// Parameters to fit with priors and bounds.
     pub free: Vec<Free>,
-    /// STUB
-    pub noise: Option<Arc<Vec<Stub>>>,
     /// Entries of the state vector carried from segment to segment (see [`Problem::carried`]).
     pub carried: Vec<usize>,
 }
@@ -80,7 +78,6 @@ impl Setup {
             method: Method::Rk4 { substeps: 1 },
             free,
             carried: Vec::new(),
-            noise: None,
         };
         let tolerance: Vec<f64> = setup.data.spread.iter().map(|s| 1e-3 * s).collect();
         setup.choose_method(&tolerance);
@@ -377,16 +374,4 @@ pub fn free_parameters(model: &Model) -> Vec<Free> {
             Free { index, mean: p.value, std, lower, upper }
         })
         .collect()
-}
-
-/// STUB
-#[derive(Debug, Clone)]
-pub struct Stub;
-impl Stub {
-    /// STUB
-    pub fn variance(&self) -> f64 { 1.0 }
-}
-impl Setup {
-    /// STUB
-    pub fn autoregressions(&self, _: &Level, _: &[f64], _: &Point) -> Vec<Stub> { vec![Stub; self.system.ny] }
 }

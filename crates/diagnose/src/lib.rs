@@ -46,8 +46,12 @@ pub enum Stage {
 pub trait Observer: Sync {
     /// A stage begins.
     fn stage(&self, _stage: Stage) {}
+    /// A candidate of a round was fitted.
+    fn tried(&self, _kind: &str, _expression: &str, _evidence: &evidence::Evidence) {}
     /// The best candidate of a round was weighed.
     fn weighed(&self, _kind: &str, _evidence: &evidence::Evidence, _share: f64) {}
+    /// The score test's ranking: kind and share of the residual that it may explain.
+    fn screened(&self, _ranking: &[(&str, f64)]) {}
     /// A mechanism no longer pays and was dropped.
     fn dropped(&self, _kind: &str) {}
 }

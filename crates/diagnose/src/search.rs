@@ -538,6 +538,9 @@ impl<'a> Search<'a> {
         let open: Vec<Candidate> = self.all.iter().filter(|c| !taken(c)).cloned().collect();
         self.observer.stage(Stage::Screening { candidates: open.len(), found: current.parts.len() });
         let scored = screen(&current.setup, self.library, &open, &current.level, &scale, &current.fit.point);
+        let ranking: Vec<(&str, f64)> =
+            scored.iter().map(|s| (&*self.library[open[s.candidate].mechanism].kind, s.gain)).collect();
+        self.observer.screened(&ranking);
         let least = if current.setup.noise.is_some() { 0.001 } else { 0.003 };
         let short = self.short_list(&open, &scored, least);
         if short.is_empty() {
@@ -853,6 +856,12 @@ impl<'a> Search<'a> {
             })
             .collect();
         weighed.sort_by(|a, b| b.2.score.total_cmp(&a.2.score).then(a.0.cmp(&b.0)));
+        for (c, f, e) in &weighed {
+            if let Some(part) = f.parts.last() {
+                let kind = &self.library[open[*c].mechanism].kind;
+                self.observer.tried(kind, &part.instance.expression.to_string(), e);
+            }
+        }
         let total = calibrated_rss(calibrated, scale);
         let complexity = |f: &Fitted| -> f64 {
             f.parts.iter().map(|p| self.library[p.candidate.mechanism].complexity()).sum()
