@@ -98,7 +98,7 @@ fn hysteresis_is_recovered_when_its_memory_is_carried() {
             s.with_problem(level, &scale, |p| standard_errors(p, &point))
         };
         let (with, without) = (of(&carried, &short), of(&free, &short));
-        eprintln!("P {seed} 15 {errors:.4?} carried 60 {with:.4?} free 60 {without:.4?}");
+        assert!(with.iter().zip(&without).all(|(a, b)| *a < 0.75 * b), "{with:?} {without:?}");
     }
 }
 
@@ -107,7 +107,7 @@ fn delayed_feedback_keeps_its_past_in_short_segments() {
     let truth = Model::from_toml(DELAYED, "model.toml").unwrap();
     let f = force(2, 3000, DT, 1.5, 8.0);
     let clean = measure(&truth, &f, DT, &[0.0; 2]);
-    let sigma = 0.0005 * greybox_calibrate::data::spread(&clean[0]);
+    let sigma = 0.005 * greybox_calibrate::data::spread(&clean[0]);
     let scale = [sigma];
     let mut bias = [[0.0f64; 4]; 2];
     let seeds = 4;
@@ -125,19 +125,27 @@ fn delayed_feedback_keeps_its_past_in_short_segments() {
         };
         for (b, level) in bias.iter_mut().zip([&level, &cut]) {
             let got = fit(&s, level, &scale);
-            let errors = s.with_problem(level, &scale, |p| standard_errors(p, &got.point));
-            eprintln!(
-                "P {:.4?} {errors:.4?} {:?} {}",
-                &got.point.parameters[1..],
-                got.ending,
-                got.cost / 3000.0
-            );
             for (j, b) in b.iter_mut().enumerate() {
                 *b += (got.point.parameters[1 + j] / truth.parameters[1 + j].value - 1.0) / seeds as f64;
             }
         }
     }
-    eprintln!("P relative bias of c, k, g, tau: going on {:.4?}, cut {:.4?}", bias[0], bias[1]);
+    // Measured: 8, 3, 9 and 5 % going on (half a segment's length is delayed; the errors are what 30
+    // iterations leave), 88, 16, 37 and 77 % when every segment forgets.
+    for (on, cut) in bias[0].iter().zip(&bias[1]) {
+        assert!(on.abs() < 0.1 && on.abs() < 0.3 * cut.abs(), "{bias:?}");
+    }
+    // From there longer segments are as good as the noise allows.
+    let s = setup(&off(&truth, &[1.2, 0.9, 0.8, 1.2]), &f, DT, &noisy(&clean, sigma, 20));
+    let (short, level) = (s.level(60), s.level(8));
+    let point = s.stitch(&short, &fit(&s, &short, &scale).point, &level, &scale);
+    let got = s.fit(&level, &scale, &[point], greybox_calibrate::Limits::default());
+    let point = got.point;
+    let errors = s.with_problem(&level, &scale, |p| standard_errors(p, &point));
+    for (j, error) in errors.iter().enumerate() {
+        let z = (point.parameters[1 + j] - truth.parameters[1 + j].value) / error;
+        assert!(z.abs() < 4.0, "{}: {z:.2} standard errors", truth.parameters[1 + j].name);
+    }
 }
 
 #[test]
