@@ -16,14 +16,16 @@
 //! ([`Problem::carried`]): free, or given, only where a piece begins, and after that where the segment
 //! before has left them. Delayed expressions remember what was before the segment in any case. Then
 //! the segments of a piece are simulated one after the other. The sensitivities to the parameters go
-//! through the seams; that of a segment's carried states to the *free* initial states of the segments
-//! before it is left out of the Jacobian (the step is Gauss–Newton's with this approximation; the
-//! cost that decides on a step is the true one).
+//! through the seams; that of a segment's carried states and delayed expressions to the *free* initial
+//! states of the segments before it is left out of the Jacobian: the step is Gauss–Newton's with this
+//! approximation, the cost that decides on a step is the true one. Where a delay is long against the
+//! segments the last digits come slowly; longer segments bring them.
 //!
 //! **Coloured noise.** With [`Problem::noise`] residuals and Jacobians are whitened channel by channel
-//! and segment by segment before anything else sees them ([`crate::noise_model`]); times the scale²
-//! over the innovation variance the cost is then −2 ln of the likelihood of autoregressive noise but
-//! for a constant, if the noise of different segments is taken as independent.
+//! and segment by segment before anything else sees them ([`crate::noise_model`]). With the scale
+//! √v_p, the standard deviation of the innovations, the cost is −2 ln of the likelihood of
+//! autoregressive noise but for a constant, if the noise of different segments is independent. The
+//! rows of the priors are not touched.
 
 use std::ops::Range;
 
