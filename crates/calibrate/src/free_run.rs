@@ -75,7 +75,7 @@ impl Setup {
         if prior.iter().all(|p| p.1 == 0.0) {
             return x0;
         }
-        let fixed = Setup { free: Vec::new(), ..self.clone() };
+        let fixed = Setup { free: Vec::new(), noise: None, ..self.clone() };
         let mut horizons = Vec::new();
         let mut h = 60;
         while h < most {

@@ -1,11 +1,13 @@
 //! Parameter estimation by multiple shooting and output error.
 pub mod data;
 pub mod free_run;
+pub mod noise_model;
 pub mod problem;
 pub mod qr;
 pub mod setup;
 
 pub use data::{Data, DataError, Hats, PieceData};
 pub use free_run::{FreeRun, Score, window_length};
+pub use noise_model::Autoregression;
 pub use problem::{Ending, Fit, Free, Limits, Point, Problem, Segment, SegmentRows, StartPrior};
 pub use setup::{Level, Setup, UnknownState, free_parameters};

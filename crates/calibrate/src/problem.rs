@@ -16,9 +16,16 @@
 //! ([`Problem::carried`]): free, or given, only where a piece begins, and after that where the segment
 //! before has left them. Delayed expressions remember what was before the segment in any case. Then
 //! the segments of a piece are simulated one after the other. The sensitivities to the parameters go
-//! through the seams; that of a segment's carried states to the *free* initial states of the segments
-//! before it is left out of the Jacobian (the step is Gauss–Newton's with this approximation; the
-//! cost that decides on a step is the true one).
+//! through the seams; that of a segment's carried states and delayed expressions to the *free* initial
+//! states of the segments before it is left out of the Jacobian: the step is Gauss–Newton's with this
+//! approximation, the cost that decides on a step is the true one. Where a delay is long against the
+//! segments the last digits come slowly; longer segments bring them.
+//!
+//! **Coloured noise.** With [`Problem::noise`] residuals and Jacobians are whitened channel by channel
+//! and segment by segment before anything else sees them ([`crate::noise_model`]). With the scale
+//! √v_p, the standard deviation of the innovations, the cost is −2 ln of the likelihood of
+//! autoregressive noise but for a constant, if the noise of different segments is independent. The
+//! rows of the priors are not touched.
 
 use std::ops::Range;
 
@@ -26,6 +33,7 @@ use greybox_model::System;
 use greybox_simulate::{Carry, Environment, Method, Seeds, SignalLanes, Simulation, Trajectory, has_history};
 use rayon::prelude::*;
 
+use crate::noise_model::Autoregression;
 use crate::qr;
 
 /// One stretch of one piece with an initial state of its own.
@@ -77,6 +85,8 @@ pub struct Problem<'a> {
     pub scale: &'a [f64],
     /// Entries of the state vector that a segment takes over from the one that ends where it starts.
     pub carried: &'a [usize],
+    /// Noise per channel by which the rows of the measurements are whitened; `None`: as they are.
+    pub noise: Option<&'a [Autoregression]>,
 }
 
 /// A point of the search.
@@ -89,7 +99,8 @@ pub struct Point {
 }
 
 /// The linearised problem of one segment. Rows: channel by channel the samples of the segment,
-/// then one row per state for the prior on the start. Missing samples have zero rows.
+/// then one row per state for the prior on the start. Missing samples have zero rows, and so have
+/// those that whitening cannot form ([`Autoregression::whiten`]).
 #[derive(Debug, Clone)]
 pub struct SegmentRows {
     /// Number of rows.
@@ -252,6 +263,7 @@ impl Problem<'_> {
             method: self.method,
             seeds: &seeds,
         };
+        let n = segment.range.len();
         let range = segment.range.clone();
         let (mut trajectory, carry) = if self.carried.is_empty() && !has_history(self.system) {
             (simulation.run(start, range), None)
@@ -259,8 +271,17 @@ impl Problem<'_> {
             let (trajectory, carry) = simulation.run_on(start, range, before, self.carried);
             (trajectory, Some(carry))
         };
+        let missing: Vec<Vec<bool>> = match self.noise {
+            Some(_) => (0..ny).map(|c| self.missing(segment, c)).collect(),
+            None => Vec::new(),
+        };
+        // The rows of the measurements in one column, whitened.
+        let whiten = |column: &mut [f64]| {
+            for (c, model) in self.noise.unwrap_or_default().iter().enumerate().take(ny) {
+                model.whiten(&mut column[c * n..(c + 1) * n], &missing[c]);
+            }
+        };
         let taken_over = |j: usize| before.is_some() && self.carried.contains(&j);
-        let n = segment.range.len();
         let rows = ny * n + nx;
         let mut r = vec![0.0; rows];
         let measured = self.measured[segment.piece];
@@ -272,6 +293,7 @@ impl Problem<'_> {
                 r[c * n + k] = if e.is_finite() { e } else { 0.0 };
             }
         }
+        whiten(&mut r);
         for j in 0..nx {
             let (mean, std) = prior[j];
             if std > 0.0 && std.is_finite() && !taken_over(j) {
@@ -291,6 +313,7 @@ impl Problem<'_> {
                         column[c * n + k] = if y[k].is_nan() || !v.is_finite() { 0.0 } else { v };
                     }
                 }
+                whiten(column);
             }
             columns
         };
@@ -334,7 +357,13 @@ impl Problem<'_> {
         rows.iter().map(|s| qr::dot(&s.r, &s.r)).sum::<f64>() + self.prior_cost(&point.parameters)
     }
 
-    /// Residual sum of squares (in units of the scale) and number of samples per channel.
+    /// Which samples of channel `c` a segment misses.
+    fn missing(&self, segment: &Segment, c: usize) -> Vec<bool> {
+        self.measured[segment.piece][c][segment.range.clone()].iter().map(|v| v.is_nan()).collect()
+    }
+
+    /// Residual sum of squares (in units of the scale, whitened if the rows are) and number of rows
+    /// that count per channel.
     pub fn rss(&self, rows: &[SegmentRows]) -> (Vec<f64>, Vec<usize>) {
         let ny = self.system.ny;
         let (mut rss, mut count) = (vec![0.0; ny], vec![0; ny]);
@@ -342,10 +371,12 @@ impl Problem<'_> {
             let n = segment.range.len();
             for c in 0..ny {
                 rss[c] += qr::dot(&rows.r[c * n..(c + 1) * n], &rows.r[c * n..(c + 1) * n]);
-                count[c] += self.measured[segment.piece][c][segment.range.clone()]
-                    .iter()
-                    .filter(|v| !v.is_nan())
-                    .count();
+                let missing = self.missing(segment, c);
+                let lost = match self.noise.and_then(|noise| noise.get(c)) {
+                    Some(model) => model.lost(&missing),
+                    None => missing.iter().filter(|m| **m).count(),
+                };
+                count[c] += n - lost;
             }
         }
         (rss, count)

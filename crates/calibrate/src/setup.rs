@@ -7,6 +7,7 @@ use greybox_simulate::{Environment, Method, Seeds, integrate};
 use rayon::prelude::*;
 
 use crate::data::{Data, Hats};
+use crate::noise_model::{Autoregression, MOST};
 use crate::problem::{Fit, Free, Limits, Point, Problem, Segment, StartPrior, segments};
 
 /// Shortest segment, samples.
@@ -33,6 +34,9 @@ pub struct Setup {
     pub free: Vec<Free>,
     /// Entries of the state vector carried from segment to segment (see [`Problem::carried`]).
     pub carried: Vec<usize>,
+    /// Noise per channel by which fits are whitened (see [`Problem::noise`]); simulations and scores
+    /// do not use it.
+    pub noise: Option<Arc<Vec<Autoregression>>>,
 }
 
 /// A name that is no state of the model.
@@ -78,6 +82,7 @@ impl Setup {
             method: Method::Rk4 { substeps: 1 },
             free,
             carried: Vec::new(),
+            noise: None,
         };
         let tolerance: Vec<f64> = setup.data.spread.iter().map(|s| 1e-3 * s).collect();
         setup.choose_method(&tolerance);
@@ -306,7 +311,32 @@ impl Setup {
             free: &self.free,
             scale,
             carried: &self.carried,
+            noise: self.noise.as_ref().map(|noise| noise.as_slice()),
         })
+    }
+
+    /// What the residuals at a point say of the noise: one autoregression per channel, of the raw
+    /// residuals (measured − simulated, SI), whatever [`noise`](Self::noise) is now.
+    pub fn innovations(&self, level: &Level, scale: &[f64], point: &Point) -> Vec<Autoregression> {
+        let raw = Setup { noise: None, ..self.clone() };
+        let rows = raw.with_problem(level, scale, |p| p.rows(point, false, None));
+        (0..self.system.ny)
+            .map(|c| {
+                let residuals: Vec<Vec<f64>> = level
+                    .segments
+                    .iter()
+                    .zip(&rows)
+                    .map(|(s, rows)| {
+                        let n = s.range.len();
+                        let y = &self.data.pieces[s.piece].measured[c][s.range.clone()];
+                        let t = &rows.trajectory;
+                        y.iter().zip(&t.y[c * n..(c + 1) * n]).map(|(y, simulated)| y - simulated).collect()
+                    })
+                    .collect();
+                let stretches: Vec<&[f64]> = residuals.iter().map(Vec::as_slice).collect();
+                Autoregression::fit(&stretches, MOST)
+            })
+            .collect()
     }
 
     /// Fits from the cheapest of several starting points.

@@ -63,7 +63,6 @@ fn hysteresis_is_recovered_when_its_memory_is_carried() {
     let clean = measure(&truth, &f, DT, &[0.0; 3]);
     let sigma = 0.01 * greybox_calibrate::data::spread(&clean[0]);
     let names = ["kh", "be", "ga"];
-    let (mut carried_worst, mut free_worst) = (0.0f64, 0.0f64);
     for seed in 10..14 {
         let free = setup(&off(&truth, &[0.7, 1.4, 0.6]), &f, DT, &noisy(&clean, sigma, seed));
         let carried = free.with_carried(&["z".to_string()]).unwrap();
@@ -84,25 +83,23 @@ fn hysteresis_is_recovered_when_its_memory_is_carried() {
                 assert_eq!(got.point.starts[i][2], t.x[2 * t.n]);
             }
         }
-        let plain = fit(&free, &level, &scale);
         for (j, name) in names.iter().enumerate() {
             let value = |f: &greybox_calibrate::Fit| f.point.parameters[3 + j];
             let exact = truth.parameters[3 + j].value;
             let z = (value(&got) - exact) / errors[j];
-            eprintln!(
-                "P seed {seed} {name}: {:.3} ± {:.3} (z {z:.2}), free {:.3}",
-                value(&got),
-                errors[j],
-                value(&plain)
-            );
             assert!(z.abs() < 4.0, "{name}: {} ± {}", value(&got), errors[j]);
-            carried_worst = carried_worst.max((value(&got) / exact - 1.0).abs());
-            free_worst = free_worst.max((value(&plain) / exact - 1.0).abs());
         }
         let reduced = got.cost / got.count[0] as f64;
         assert!((0.85..1.1).contains(&reduced), "{reduced}");
+        // In short segments a memory that is free says little; carried, it says nearly as much.
+        let short = carried.level(60);
+        let of = |s: &greybox_calibrate::Setup, level: &Level| {
+            let point = fit(s, level, &scale).point;
+            s.with_problem(level, &scale, |p| standard_errors(p, &point))
+        };
+        let (with, without) = (of(&carried, &short), of(&free, &short));
+        assert!(with.iter().zip(&without).all(|(a, b)| *a < 0.75 * b), "{with:?} {without:?}");
     }
-    eprintln!("P worst relative error: carried {carried_worst:.3}, free {free_worst:.3}");
 }
 
 #[test]
@@ -110,7 +107,7 @@ fn delayed_feedback_keeps_its_past_in_short_segments() {
     let truth = Model::from_toml(DELAYED, "model.toml").unwrap();
     let f = force(2, 3000, DT, 1.5, 8.0);
     let clean = measure(&truth, &f, DT, &[0.0; 2]);
-    let sigma = 0.01 * greybox_calibrate::data::spread(&clean[0]);
+    let sigma = 0.005 * greybox_calibrate::data::spread(&clean[0]);
     let scale = [sigma];
     let mut bias = [[0.0f64; 4]; 2];
     let seeds = 4;
@@ -133,7 +130,22 @@ fn delayed_feedback_keeps_its_past_in_short_segments() {
             }
         }
     }
-    eprintln!("P relative bias of c, k, g, tau: going on {:.4?}, cut {:.4?}", bias[0], bias[1]);
+    // Measured: 8, 2, 9 and 3 % going on (a third of every segment hangs on the one before; these are
+    // what 30 iterations leave), 90, 14, 42 and 78 % when every segment forgets.
+    for (on, cut) in bias[0].iter().zip(&bias[1]) {
+        assert!(on.abs() < 0.1 && on.abs() < 0.3 * cut.abs(), "{bias:?}");
+    }
+    // From there longer segments are as good as the noise allows.
+    let s = setup(&off(&truth, &[1.2, 0.9, 0.8, 1.2]), &f, DT, &noisy(&clean, sigma, 20));
+    let (short, level) = (s.level(60), s.level(8));
+    let point = s.stitch(&short, &fit(&s, &short, &scale).point, &level, &scale);
+    let got = s.fit(&level, &scale, &[point], greybox_calibrate::Limits::default());
+    let point = got.point;
+    let errors = s.with_problem(&level, &scale, |p| standard_errors(p, &point));
+    for (j, error) in errors.iter().enumerate() {
+        let z = (point.parameters[1 + j] - truth.parameters[1 + j].value) / error;
+        assert!(z.abs() < 4.0, "{}: {z:.2} standard errors", truth.parameters[1 + j].name);
+    }
 }
 
 #[test]
@@ -154,4 +166,16 @@ fn a_gap_between_segments_starts_a_new_chain() {
         "the model has no state `y` to carry from segment to segment; its states are `x`, `z`"
     );
     assert!(s.with_model(model, vec![]).unwrap().carried.is_empty());
+}
+
+/// Restarted simulations of a model with a delay know what was before the window.
+#[test]
+fn windows_of_a_score_remember_what_was_before() {
+    let truth = Model::from_toml(DELAYED, "model.toml").unwrap();
+    let f = force(2, 1500, DT, 1.5, 8.0);
+    let clean = measure(&truth, &f, DT, &[0.0; 2]);
+    let s = setup(&truth, &f, DT, &clean);
+    let run = s.free_run(&s.values(), &[s.data.sigma[0]]);
+    let score = s.scores(&run, &s.values(), 1.0, None)[0];
+    assert!(score.nrmse < 1e-3 && score.nrmse_windowed < 5e-3, "{score:?}");
 }

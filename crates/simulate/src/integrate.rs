@@ -25,8 +25,9 @@
 //!
 //! **Going on.** A stretch may start where another ended ([`Simulation::run_on`]): hidden states, their
 //! tangents and the past of delayed expressions go on, while other states start anew. Where those
-//! jump, a delayed expression jumps one delay later; the step across that instant loses its order,
-//! and the saltation of the sensitivity to the delay there, proportional to the jump, is left out.
+//! jump, the past of a delayed expression is bent to the new start within the last eight steps, so that
+//! the trajectory stays a smooth function of the delay (a jump would pass the stages of the method
+//! one by one as the delay changes).
 
 use greybox_model::Hold;
 use greybox_model::system::System;
@@ -195,19 +196,22 @@ struct History {
     value: Vec<f64>,
     slope: Vec<f64>,
     lanes: Vec<f64>,
-    /// Entries before this one belong to earlier stretches and stay as they are.
-    own: usize,
+    /// Ends where another stretch did; the next entry tells where this one starts.
+    seam: bool,
 }
 
 impl History {
     fn push(&mut self, s: f64, value: f64, slope: f64, lanes: &[f64]) {
         if let Some(&last) = self.s.last()
             && s <= last
-            && self.s.len() > self.own
         {
-            // A second visit to the same instant (an event): the newer values count.
+            // A second visit to the same instant (an event, a new start): the newer values count.
             let n = lanes.len();
             let at = self.s.len() - 1;
+            if self.seam {
+                self.seam = false;
+                self.bend(value, lanes);
+            }
             self.value[at] = value;
             self.slope[at] = slope;
             self.lanes[at * n..].copy_from_slice(lanes);
@@ -217,6 +221,24 @@ impl History {
         self.value.push(value);
         self.slope.push(slope);
         self.lanes.extend_from_slice(lanes);
+    }
+
+    /// Bends the last [`BEND`] intervals so that they end at `value`, sensitivities alike.
+    fn bend(&mut self, value: f64, lanes: &[f64]) {
+        let (n, last) = (lanes.len(), self.s.len() - 1);
+        let first = last.saturating_sub(BEND);
+        let width = self.s[last] - self.s[first];
+        let jump = value - self.value[last];
+        let jumps: Vec<f64> = lanes.iter().zip(&self.lanes[last * n..]).map(|(new, old)| new - old).collect();
+        for i in first + 1..last {
+            let w = (self.s[i] - self.s[first]) / width;
+            let share = w * w * (3.0 - 2.0 * w);
+            self.value[i] += jump * share;
+            self.slope[i] += jump * 6.0 * w * (1.0 - w) / width;
+            for (l, jump) in self.lanes[i * n..(i + 1) * n].iter_mut().zip(&jumps) {
+                *l += jump * share;
+            }
+        }
     }
 
     /// Cubic Hermite value and slope at `s`, and the index and weight for the lanes.
@@ -230,15 +252,6 @@ impl History {
             return (self.value[n - 1], 0.0, n - 1, 0.0);
         }
         let h = self.s[i + 1] - self.s[i];
-        if h <= 0.0 {
-            // Two entries at one instant, where a stretch went on from another: the newer one counts.
-            return (
-                self.value[i + 1] + (s - self.s[i + 1]) * self.slope[i + 1],
-                self.slope[i + 1],
-                i + 1,
-                0.0,
-            );
-        }
         let w = (s - self.s[i]) / h;
         let (y0, y1, d0, d1) = (self.value[i], self.value[i + 1], self.slope[i] * h, self.slope[i + 1] * h);
         if w > 1.0 {
@@ -254,15 +267,13 @@ impl History {
     /// What a stretch from `s` on may still read with a delay of at most `tau`.
     fn recent(&self, s: f64, tau: f64, lanes: usize) -> History {
         let from = self.s.partition_point(|&t| t <= s - tau).saturating_sub(1);
-        let mut kept = History {
+        History {
             s: self.s[from..].to_vec(),
             value: self.value[from..].to_vec(),
             slope: self.slope[from..].to_vec(),
             lanes: self.lanes[from * lanes..].to_vec(),
-            own: 0,
-        };
-        kept.own = kept.s.len();
-        kept
+            seam: true,
+        }
     }
 
     /// The same with its lanes laid out for other seeds.
@@ -364,8 +375,9 @@ impl Simulation<'_> {
     ///
     /// The states `carried` (indices of the state vector) start where `before` ended, with their
     /// tangents, whatever `x0` says; the other states start at `x0`. The delayed expressions remember
-    /// what `before` remembers; where the state jumps (`x0` is not where the other stretch ended),
-    /// they jump with it. Before the first sample of all they hold their initial value.
+    /// what `before` remembers; where the state jumps (`x0` is not where the other stretch ended), they
+    /// bend to the new start within the last eight steps before it. Before the first sample of all
+    /// they hold their initial value.
     ///
     /// Sensitivities to parameters and to signals go on. Those to the initial state belong to the
     /// stretch: the initial states of earlier stretches have no lane here, and a carried state no
@@ -435,6 +447,9 @@ impl Simulation<'_> {
     }
 }
 
+/// Steps (samples for a measurement) within which the past of a delayed expression bends to a new
+/// start.
+const BEND: usize = 8;
 /// The trajectory's magnitude, relative to its inputs and start, beyond which it counts as diverged.
 const LIMIT: f64 = 1e9;
 /// Events in one sample interval beyond which events are no longer located (a contact that
