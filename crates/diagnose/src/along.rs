@@ -14,6 +14,57 @@ pub struct Along<'a> {
 }
 
 impl<'a> Along<'a> {
+    /// Smoothed by model and measurements together ([`crate::smoother`]): states, and the force that each
+    /// equation lacks.
+    pub fn observed(setup: &'a Setup, level: &Level, scale: &[f64], point: &Point) -> (Along<'a>, Vec<Vec<Vec<f64>>>) {
+        let first = Along::smoothed(setup, level, scale, point);
+        // Size of each equation's forces: its terms without highest derivatives, in quadrature.
+        let model = &setup.model;
+        let force: Vec<f64> = model
+            .equations
+            .iter()
+            .map(|equation| {
+                let residual = equation.residual();
+                let own: Vec<Expr> = residual
+                    .terms()
+                    .into_iter()
+                    .map(|(_, t)| t.clone())
+                    .filter(|t| {
+                        !t.variables().iter().any(|(n, p)| {
+                            model.state(n).is_some_and(|j| usize::from(*p) >= model.states[j].order)
+                        })
+                    })
+                    .collect();
+                let Some(values) = first.eval(&own, &[]) else { return 0.0 };
+                let (mut sum, mut count) = (0.0, 0usize);
+                for v in values.iter().flatten().flatten().filter(|v| v.is_finite()) {
+                    sum += v * v;
+                    count += 1;
+                }
+                (sum * own.len() as f64 / count.max(1) as f64).sqrt()
+            })
+            .enumerate()
+            .map(|(e, f)| {
+                // A mechanism's own equation is exact.
+                let memory = setup.carried.iter().any(|&i| {
+                    let j = setup.model.state(&setup.model.equations[e].name);
+                    j.is_some_and(|j| setup.system.offsets[j] == i)
+                });
+                if memory { 0.0 } else { f }
+            })
+            .collect();
+        let given = crate::smoother::Assumptions {
+            parameters: &point.parameters,
+            noise: &setup.data.sigma,
+            force: &force,
+            first: &first.states,
+            tolerance: &setup.hats.tolerance,
+        };
+        let smoothed = crate::smoother::smooth(setup, &given);
+        let along = Along { setup, states: smoothed.states, parameters: point.parameters.clone(), simulated: false };
+        (along, smoothed.forces)
+    }
+
     /// Smoothed measurements; unmeasured entries from the segments' trajectories.
     pub fn smoothed(setup: &'a Setup, level: &Level, scale: &[f64], point: &Point) -> Along<'a> {
         let unmeasured = setup.hats.tolerance.iter().any(|t| t.is_infinite());

@@ -9,6 +9,7 @@ pub mod place;
 pub mod screen;
 pub mod spectra;
 pub mod search;
+pub mod smoother;
 pub mod surface;
 
 pub use diagnosis::{Calibration, DiagnoseError, Diagnosis, Estimate, Options, Verdict, calibrate, diagnose};

@@ -948,9 +948,9 @@ impl State {
     /// The noise model that suits the current residual, and its innovations as the scale.
     fn whiten(&mut self) {
         let f = &self.current;
-        let noise = f.setup.autoregressions(&f.level, &self.scale, &f.fit.point);
+        let noise = f.setup.innovations(&f.level, &self.scale, &f.fit.point);
         for ((s, a), sigma) in self.scale.iter_mut().zip(&noise).zip(&self.sigma) {
-            *s = (*s * a.variance().sqrt()).max(0.2 * sigma);
+            *s = a.variance().sqrt().max(0.2 * sigma);
         }
         self.current.setup.noise = Some(Arc::new(noise));
     }
@@ -958,8 +958,9 @@ impl State {
 
 /// Sum of squared innovations per channel, each model with the noise model of its own residual.
 fn innovations(f: &Fitted, scale: &[f64]) -> Vec<f64> {
-    let noise = f.setup.autoregressions(&f.level, scale, &f.fit.point);
-    noise.iter().zip(&f.fit.count).map(|(a, n)| a.variance() * *n as f64).collect()
+    let noise = f.setup.innovations(&f.level, scale, &f.fit.point);
+    let relative = noise.iter().zip(scale).map(|(a, s)| a.variance() / (s * s));
+    relative.zip(&f.fit.count).map(|(v, n)| v * *n as f64).collect()
 }
 
 /// Residual sum of squares per channel of a fitted model, not whitened, in units of `scale`.

@@ -339,6 +339,11 @@ impl Carry {
     pub fn state(&self) -> &[f64] {
         &self.x
     }
+
+    /// Its sensitivities, `states × lanes` (parameters, initial states, signals).
+    pub fn tangents(&self) -> &[f64] {
+        &self.dx
+    }
 }
 
 /// Whether a stretch depends on what was before it by more than its initial state: an equation
