@@ -6,7 +6,7 @@ pub mod problem;
 pub mod qr;
 pub mod setup;
 
-pub use data::{Data, DataError, Hats, PieceData};
+pub use data::{Data, DataError, Hats, PieceData, spread};
 pub use free_run::{FreeRun, Score, window_length};
 pub use noise_model::Autoregression;
 pub use problem::{Ending, Fit, Free, Limits, Point, Problem, Segment, SegmentRows, StartPrior};

@@ -28,6 +28,7 @@
 //! rows of the priors are not touched.
 
 use std::ops::Range;
+use std::sync::Arc;
 
 use greybox_model::System;
 use greybox_simulate::{Carry, Environment, Method, Seeds, SignalLanes, Simulation, Trajectory, has_history};
@@ -168,7 +169,7 @@ struct Reduced {
 
 impl Problem<'_> {
     /// Simulates every segment and returns its rows; with `jacobian` false only the residuals.
-    pub fn rows(&self, point: &Point, jacobian: bool, signals: Option<&[SignalLanes]>) -> Vec<SegmentRows> {
+    pub fn rows(&self, point: &Point, jacobian: bool, signals: Option<&[Arc<SignalLanes>]>) -> Vec<SegmentRows> {
         if self.carried.is_empty() && !has_history(self.system) {
             return (0..self.segments.len())
                 .into_par_iter()
@@ -240,7 +241,7 @@ impl Problem<'_> {
         i: usize,
         point: &Point,
         jacobian: bool,
-        signals: Option<&[SignalLanes]>,
+        signals: Option<&[Arc<SignalLanes>]>,
         before: Option<&Carry>,
     ) -> (SegmentRows, Option<Carry>) {
         let segment = &self.segments[i];

@@ -237,6 +237,22 @@ impl Setup {
         prior
     }
 
+    /// Windows of about `length` samples, of at most `most` samples in all: where the data hold more, the
+    /// windows are spread evenly over them.
+    pub fn windows(&self, length: usize, most: usize) -> Level {
+        let total: usize = self.data.lengths().iter().sum();
+        let count = (total as f64 / length.max(1) as f64).round().max(1.0) as usize;
+        let all = segments(&self.data.lengths(), count, length.min(LEAST));
+        let wanted = (most / length.max(1)).max(4);
+        let chosen: Vec<Segment> = if all.len() <= wanted || total <= most {
+            all
+        } else {
+            (0..wanted).map(|i| all[(2 * i + 1) * all.len() / (2 * wanted)].clone()).collect()
+        };
+        let priors = chosen.iter().map(|s| self.start_prior(s.piece, s.range.start)).collect();
+        Level { segments: chosen, priors }
+    }
+
     /// About `count` segments over all pieces.
     pub fn level(&self, count: usize) -> Level {
         let segments = segments(&self.data.lengths(), count, LEAST);

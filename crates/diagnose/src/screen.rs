@@ -14,6 +14,7 @@
 //! differentiates measurements nor suffers from the bias of a wrong nominal parameter.
 
 use std::ops::Range;
+use std::sync::Arc;
 
 use greybox_calibrate::{Level, Point, SegmentRows, Setup, qr};
 use greybox_model::{Equation, Expr, Hold, Input, Measurement, Model, Parameter, State, System, Unit};
@@ -40,6 +41,10 @@ pub struct Variant {
     /// values are right; `Some(true)` when the coefficient may rescale the inner value.
     pub secant: Option<bool>,
 }
+
+/// Share of a column's sum of squares that the model's own parameters must leave over: less is a parameter
+/// under another name, and its coefficient would be rounding.
+const INDEPENDENT: f64 = 1e-4;
 
 /// What the score test says of a candidate's best variant.
 #[derive(Debug, Clone)]
@@ -71,7 +76,7 @@ enum Component {
 /// Exogenous signals of a set of candidates.
 pub struct Lanes {
     /// Per piece.
-    pub signals: Vec<SignalLanes>,
+    pub signals: Vec<Arc<SignalLanes>>,
     /// Each column is the sum of these lanes.
     pub columns: Vec<Range<usize>>,
     /// The variants behind the columns.
@@ -196,7 +201,7 @@ pub fn lanes(
                     Component::Output(c, series) => put(&mut lanes.outputs, *c, l, &series[p]),
                 }
             }
-            lanes
+            Arc::new(lanes)
         })
         .collect();
     Lanes { signals, columns, variants }
@@ -601,7 +606,7 @@ pub fn gram(
     level: &Level,
     scale: &[f64],
     point: &Point,
-    signals: &[SignalLanes],
+    signals: &[Arc<SignalLanes>],
     columns: &[Range<usize>],
     blocks: Vec<Range<usize>>,
 ) -> Gram {
@@ -739,7 +744,7 @@ impl Gram {
             gr[a] = self.gr[block.start + a] - (0..np).map(|i| jg(i, a) * base[i]).sum::<f64>();
         }
         let mut kept: Vec<usize> =
-            (0..n).filter(|&a| gg[a * n + a] > 1e-6 * self.gg[index][a * n + a]).collect();
+            (0..n).filter(|&a| gg[a * n + a] > INDEPENDENT * self.gg[index][a * n + a]).collect();
         let rr = self.remaining();
         loop {
             if kept.is_empty() {
@@ -784,8 +789,8 @@ pub fn screen(
     scale: &[f64],
     point: &Point,
 ) -> Vec<Scored> {
-    let along = Along::smoothed(setup, level, scale, point);
-    let spectra = Spectra::new(setup, level, scale, point, &along);
+    let (along, forces) = Along::observed(setup, level, scale, point);
+    let spectra = Spectra::new(setup, level, scale, point, &along, &forces);
     let lanes = lanes(setup, library, candidates, &along, &spectra);
     let blocks: Vec<Range<usize>> = lanes.variants.iter().map(|v| v.columns.clone()).collect();
     let gram = gram(setup, level, scale, point, &lanes.signals, &lanes.columns, blocks);

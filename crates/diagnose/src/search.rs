@@ -16,8 +16,15 @@ use crate::along::Along;
 use crate::screen::{Scored, first_states, screen};
 use crate::{Observer, Stage};
 
-/// Number of segments of the levels.
-pub const LEVELS: [usize; 3] = [60, 15, 4];
+/// Number of segments of the first and last level, where nothing else decides.
+const SEGMENTS: (usize, usize) = (60, 4);
+/// Longest segments of the first level, in periods of the fastest channel: beyond, a wrong stiffness turns
+/// the phase of the response round, and the score test's first order means nothing.
+const PERIODS: f64 = 3.0;
+/// Shortest segment, samples.
+const SHORTEST: usize = 40;
+/// Most samples that a level of the search looks at; longer recordings are seen through windows.
+const MOST_SAMPLES: usize = 9000;
 /// Most mechanisms that are looked for.
 const MOST_MECHANISMS: usize = 5;
 /// Most candidates that are fitted per round.
@@ -101,6 +108,35 @@ pub struct Search<'a> {
     pub keep_holds: bool,
     nominal: Setup,
     all: Vec<Candidate>,
+    /// Lengths of the segments, samples, level by level.
+    lengths: Vec<usize>,
+}
+
+/// Lengths of the segments: from a few periods of the fastest channel, by factors of four, to a quarter of
+/// the data.
+fn lengths(setup: &Setup) -> Vec<usize> {
+    let total: usize = setup.data.lengths().iter().sum();
+    let mut period = f64::INFINITY;
+    for piece in &setup.data.pieces {
+        for smooth in &piece.smooth {
+            let swing = greybox_calibrate::spread(&smooth.value);
+            let rate = (smooth.d1.iter().map(|v| v * v).sum::<f64>() / smooth.d1.len().max(1) as f64).sqrt();
+            if swing > 0.0 && rate > 0.0 {
+                period = period.min(2.0 * std::f64::consts::PI * swing / rate / piece.dt);
+            }
+        }
+    }
+    let longest = (total.min(MOST_SAMPLES) / SEGMENTS.1).max(SHORTEST);
+    let first = ((PERIODS * period) as usize).min(total / SEGMENTS.0).max(SHORTEST).min(longest);
+    let mut out = vec![first];
+    while let Some(&last) = out.last()
+        && last < longest
+    {
+        // A last step of less than a factor of two is not worth a level.
+        let next = if last * 4 > longest / 2 { longest } else { last * 4 };
+        out.push(next);
+    }
+    out
 }
 
 fn limits(iterations: usize) -> Limits {
@@ -152,7 +188,8 @@ impl<'a> Search<'a> {
     pub fn new(nominal: Setup, library: &'a [Mechanism], observer: &'a dyn Observer) -> Search<'a> {
         let places = places(&nominal.model);
         let all = candidates(&nominal.model, library, &places);
-        Search { library, observer, keep_holds: false, nominal, all }
+        let lengths = lengths(&nominal);
+        Search { library, observer, keep_holds: false, nominal, all, lengths }
     }
 
     /// The candidates it considers.
@@ -219,8 +256,8 @@ impl<'a> Search<'a> {
     }
 
     /// The model fitted at another level, from the stitched trajectory or the measurements.
-    fn relevel(&self, fitted: &Fitted, count: usize, scale: &[f64], iterations: usize) -> Fitted {
-        let level = fitted.setup.level(count);
+    fn relevel(&self, fitted: &Fitted, level: Level, scale: &[f64], iterations: usize) -> Fitted {
+        let level = same_level(&fitted.setup, &level);
         let stitched = fitted.setup.stitch(&fitted.level, &fitted.fit.point, &level, scale);
         let hats = Point {
             parameters: fitted.fit.point.parameters.clone(),
@@ -268,6 +305,11 @@ impl<'a> Search<'a> {
         };
         let level = same_level(&setup, &base.level);
         let kept = transfer(&base.setup, &base.level, &old.starts, &setup, &fresh);
+        if !mechanism.states.is_empty() {
+            // What it brings along may be faster than the machine.
+            let tolerance: Vec<f64> = scale.iter().map(|s| 0.05 * s).collect();
+            setup.choose_method(&tolerance);
+        }
         let mut hats = setup.starts(&level, &shifted);
         // What the mechanism remembers has its own likely start.
         for (h, k) in hats.iter_mut().zip(&kept) {
@@ -419,7 +461,7 @@ impl<'a> Search<'a> {
         let sigma = self.nominal.data.sigma.clone();
         let scale: Vec<f64> = self.nominal.data.spread.iter().map(|s| s.max(1e-300)).collect();
         self.observer.stage(Stage::Calibrating);
-        let level = self.nominal.level(LEVELS[0]);
+        let level = self.nominal.windows(self.lengths[0], MOST_SAMPLES);
         let start = Point {
             parameters: self.nominal.values(),
             starts: self.nominal.starts(&level, &self.nominal.values()),
@@ -440,9 +482,9 @@ impl<'a> Search<'a> {
         // Only a baseline that misses something already on short segments may lack a rare effect: on long
         // ones a fit may also be stuck.
         state.loose = state.misfit() > 1.05;
-        for (step, &count) in LEVELS.iter().enumerate() {
-            if step > 0 && !self.lengthen(&mut calibrated, &mut state, count) {
-                continue;
+        for (step, &length) in self.lengths.iter().enumerate() {
+            if step > 0 {
+                self.lengthen(&mut calibrated, &mut state, length);
             }
             self.level(&mut calibrated, &mut state);
         }
@@ -450,6 +492,21 @@ impl<'a> Search<'a> {
         if self.is_coloured(&state, 0.6) {
             self.observer.stage(Stage::Whitening);
             self.whitened(&mut calibrated, &mut state);
+        }
+        // What was searched through windows is fitted to all data in the end.
+        let length = self.lengths.last().copied().unwrap_or(SHORTEST);
+        let whole = self.nominal.windows(length, usize::MAX);
+        if whole.segments != state.current.level.segments {
+            calibrated = self.relevel(&calibrated, whole.clone(), &state.scale, 15);
+            state.current = if state.current.parts.is_empty() {
+                Fitted { setup: state.current.setup.clone(), ..calibrated.clone() }
+            } else {
+                self.relevel(&state.current, whole, &state.scale, 15)
+            };
+            if state.current.setup.noise.is_none() {
+                state.rescale();
+                state.current = self.refit(&state.current, &state.scale, 5);
+            }
         }
         let current = state.current;
         let better_holds = (0..current.setup.holds.len())
@@ -459,17 +516,15 @@ impl<'a> Search<'a> {
         Found { calibrated, improved: current, accepted: state.accepted, better_holds, scale: state.scale }
     }
 
-    /// Goes on with `count` segments; `false` when they are the same as before.
-    fn lengthen(&self, calibrated: &mut Fitted, state: &mut State, count: usize) -> bool {
-        if calibrated.setup.level(count).segments == calibrated.level.segments {
-            return false;
-        }
-        self.observer.stage(Stage::Lengthening { segments: count });
-        *calibrated = self.relevel(calibrated, count, &state.scale, 20);
+    /// Goes on with longer segments.
+    fn lengthen(&self, calibrated: &mut Fitted, state: &mut State, length: usize) {
+        let level = self.nominal.windows(length, MOST_SAMPLES);
+        self.observer.stage(Stage::Lengthening { segments: level.segments.len() });
+        *calibrated = self.relevel(calibrated, level.clone(), &state.scale, 20);
         state.current = if state.current.parts.is_empty() {
             calibrated.clone()
         } else {
-            self.relevel(&state.current, count, &state.scale, 20)
+            self.relevel(&state.current, level, &state.scale, 20)
         };
         state.rescale();
         state.current = self.refit(&state.current, &state.scale, 10);
@@ -477,7 +532,6 @@ impl<'a> Search<'a> {
         if !state.current.parts.is_empty() {
             self.prune(state);
         }
-        true
     }
 
     fn is_coloured(&self, state: &State, below: f64) -> bool {
@@ -489,15 +543,17 @@ impl<'a> Search<'a> {
     /// sensitivities and candidates are whitened by it, and models are compared by the likelihood of
     /// their innovations.
     fn whitened(&self, calibrated: &mut Fitted, state: &mut State) {
-        for &count in &LEVELS[1..] {
+        // Not the shortest: they hide the low frequencies of the noise.
+        for &length in &self.lengths[self.lengths.len().saturating_sub(2)..] {
             let plain = Setup { noise: None, ..state.current.setup.clone() };
             state.current = Fitted { setup: plain, ..state.current.clone() };
-            if state.current.setup.level(count).segments != state.current.level.segments {
-                state.current = self.relevel(&state.current, count, &state.scale, 20);
+            let level = self.nominal.windows(length, MOST_SAMPLES);
+            if level.segments != state.current.level.segments {
+                state.current = self.relevel(&state.current, level.clone(), &state.scale, 20);
                 *calibrated = if state.current.parts.is_empty() {
                     state.current.clone()
                 } else {
-                    self.relevel(calibrated, count, &state.scale, 20)
+                    self.relevel(calibrated, level, &state.scale, 20)
                 };
             }
             state.whiten();

@@ -15,7 +15,7 @@
 //! survive coarse sampling and noise, states without a sensor exist, and d(t) is the force that the
 //! equations lack (Rauch, Tung & Striebel, AIAA J. 3(8), 1965).
 
-use greybox_calibrate::Setup;
+use greybox_calibrate::{Setup, spread};
 use greybox_simulate::{Seeds, SignalLanes, Simulation};
 use rayon::prelude::*;
 
@@ -143,7 +143,7 @@ impl<'a> Filter<'a> {
             given,
             piece,
             q: given.force.iter().map(|f| 10f64.powf(power) * f * f).collect(),
-            seeds: Seeds { parameters: Vec::new(), initial: (0..nx).collect(), signals },
+            seeds: Seeds { parameters: Vec::new(), initial: (0..nx).collect(), signals: signals.into() },
         }
     }
 
@@ -281,12 +281,6 @@ impl<'a> Filter<'a> {
         }
         out
     }
-}
-
-fn spread(x: &[f64]) -> f64 {
-    let n = x.len().max(1) as f64;
-    let mean = x.iter().sum::<f64>() / n;
-    (x.iter().map(|v| (v - mean).powi(2)).sum::<f64>() / n).sqrt()
 }
 
 /// Φ P Φᵀ, symmetric.

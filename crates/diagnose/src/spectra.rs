@@ -13,7 +13,6 @@ use greybox_model::Expr;
 
 use crate::along::Along;
 use crate::candidate::Candidate;
-use crate::diagnosis::left_over;
 use crate::locate::spectrum;
 use crate::place::Place;
 
@@ -33,14 +32,23 @@ pub struct Spectra<'a> {
     scale: &'a [f64],
     point: &'a Point,
     along: &'a Along<'a>,
+    /// The force that each equation lacks, `[piece][equation][sample]`.
+    forces: &'a [Vec<Vec<f64>>],
     /// Those already made: (equation, variable) and the values.
     known: Mutex<Vec<(usize, Expr, Vec<f64>)>>,
 }
 
 impl<'a> Spectra<'a> {
     /// For the model of `setup` at `point`.
-    pub fn new(setup: &'a Setup, level: &'a Level, scale: &'a [f64], point: &'a Point, along: &'a Along<'a>) -> Self {
-        Spectra { setup, level, scale, point, along, known: Mutex::new(Vec::new()) }
+    pub fn new(
+        setup: &'a Setup,
+        level: &'a Level,
+        scale: &'a [f64],
+        point: &'a Point,
+        along: &'a Along<'a>,
+        forces: &'a [Vec<Vec<f64>>],
+    ) -> Self {
+        Spectra { setup, level, scale, point, along, forces, known: Mutex::new(Vec::new()) }
     }
 
     /// Angular frequencies over `variable` (an expression in the mechanism's placeholders), strongest first.
@@ -68,7 +76,7 @@ impl<'a> Spectra<'a> {
 
     /// The force that an equation leaves over, without its linear part, clipped.
     fn force(&self, equation: usize) -> Option<Vec<Vec<f64>>> {
-        let force = left_over(self.setup, self.along, equation)?;
+        let force: Vec<&Vec<f64>> = self.forces.iter().map(|p| &p[equation]).collect();
         let model = &self.setup.model;
         let mut regressors = vec![Expr::Num(1.0)];
         for state in &model.states {
@@ -76,13 +84,13 @@ impl<'a> Spectra<'a> {
         }
         regressors.extend(model.inputs.iter().map(|i| Expr::var(&i.name)));
         let columns = self.along.eval(&regressors, &[])?;
-        let n: usize = force.iter().map(Vec::len).sum();
+        let n: usize = force.iter().map(|f| f.len()).sum();
         let mut q: Vec<f64> = Vec::with_capacity(n * columns.len());
         for c in &columns {
             q.extend(c.iter().flatten().map(|v| if v.is_finite() { *v } else { 0.0 }));
         }
         qr::orthonormalise(&mut q, n, columns.len());
-        let mut f: Vec<f64> = force.iter().flatten().map(|v| if v.is_finite() { *v } else { 0.0 }).collect();
+        let mut f: Vec<f64> = force.iter().copied().flatten().map(|v| if v.is_finite() { *v } else { 0.0 }).collect();
         qr::project_off(&q, n, &mut f);
         let limit = CLIP * (qr::dot(&f, &f) / n.max(1) as f64).sqrt();
         let mut rest = f.into_iter().map(|v| v.clamp(-limit, limit));

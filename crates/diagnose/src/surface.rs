@@ -4,6 +4,8 @@
 //! and of slow time (6 knots × \[1, d, d'\]) are injected like any candidate. What they explain on folds
 //! they were not fitted to is force that acts on the machine and has a shape; noise gains nothing.
 
+use std::sync::Arc;
+
 use greybox_calibrate::{Level, Point, Setup, qr};
 use greybox_simulate::SignalLanes;
 use rayon::prelude::*;
@@ -139,7 +141,7 @@ pub fn test(setup: &Setup, level: &Level, scale: &[f64], point: &Point) -> Optio
         return None;
     }
     let (lanes, nz) = (columns.len(), setup.system.nz);
-    let signals: Vec<SignalLanes> = pieces
+    let signals: Vec<Arc<SignalLanes>> = pieces
         .iter()
         .enumerate()
         .map(|(p, piece)| {
@@ -153,7 +155,7 @@ pub fn test(setup: &Setup, level: &Level, scale: &[f64], point: &Point) -> Optio
                     force[k * lanes + l] = if v.is_finite() { *v } else { 0.0 };
                 }
             }
-            SignalLanes { lanes, weights, force, ..SignalLanes::default() }
+            Arc::new(SignalLanes { lanes, weights, force, ..SignalLanes::default() })
         })
         .collect();
     let (nx, ny, np) = (setup.system.nx, setup.system.ny, setup.free.len());

@@ -91,7 +91,7 @@ pub struct Seeds {
     /// Indices into the state vector.
     pub initial: Vec<usize>,
     /// Exogenous directions.
-    pub signals: SignalLanes,
+    pub signals: std::sync::Arc<SignalLanes>,
 }
 
 /// Directions that are signals: each adds a force, or a change of an input, to the trajectory.

@@ -252,7 +252,7 @@ fn lanes_of_signals_go_on_and_those_of_carried_starts_are_zero() {
     let environment = environment();
     let p: Vec<f64> = case.model.parameters.iter().map(|p| p.value).collect();
     let force: Vec<f64> = (0..N).map(|k| if (20..90).contains(&k) { 1.0 } else { 0.0 }).collect();
-    let signals = SignalLanes { lanes: 1, weights: vec![0.0, 1.0], force, inputs: vec![] };
+    let signals = SignalLanes { lanes: 1, weights: vec![0.0, 1.0], force, ..SignalLanes::default() }.into();
     let seeds = Seeds { parameters: vec![2], initial: vec![0, 1, 2], signals };
     let simulation = Simulation {
         system: &system,
