@@ -4,6 +4,7 @@
 //! `report.json`. Nothing here knows how greybox works.
 
 mod cases;
+mod concealed;
 mod identify;
 mod table;
 
