@@ -11,16 +11,19 @@ mod plan;
 mod score;
 mod summary;
 mod text;
+#[cfg(test)]
+mod tests;
 
 use std::path::{Path, PathBuf};
 use std::process::Command;
+use std::sync::atomic::{AtomicUsize, Ordering};
+use std::sync::{Mutex, PoisonError};
 use std::time::Duration;
 
 use anyhow::{Context, Result, bail};
 use greybox_report::Report;
-use rayon::prelude::*;
 
-use self::case::{Case, Truth};
+use self::case::{Case, Show, Truth};
 use self::plan::{Left, Slot};
 use self::score::{Oracle, Score};
 use crate::{Ending, process};
@@ -69,16 +72,7 @@ pub(crate) fn run(binary: &Path, options: &Options<'_>) -> Result<Ending> {
         std::fs::create_dir_all(&path).with_context(|| format!("{} cannot be made", path.display()))?;
     }
     let slots = plan::plan(seed, count);
-    let pool = rayon::ThreadPoolBuilder::new().num_threads(options.jobs.max(1)).build()?;
-    let finished: Vec<Finished> = pool.install(|| {
-        slots
-            .par_iter()
-            // One case at a time per worker, in order: the lines come as the suite goes.
-            .with_max_len(1)
-            .map(|slot| one(binary, slot, options))
-            .filter_map(Result::transpose)
-            .collect::<Result<Vec<_>>>()
-    })?;
+    let finished = in_order(&slots, options.jobs, |slot| one(binary, slot, options))?;
     if finished.is_empty() {
         bail!("no case is about `{}`", options.only.unwrap_or_default());
     }
@@ -97,6 +91,35 @@ pub(crate) fn run(binary: &Path, options: &Options<'_>) -> Result<Ending> {
     }
     println!("{}", if missed.is_empty() { "all met." } else { "not all met." });
     Ok(if missed.is_empty() { Ending::Done } else { Ending::Missed })
+}
+
+/// Works through the slots in their order, several at a time; the results in the same order, without the
+/// slots that were left out. After an error nothing new is begun.
+fn in_order<T: Send>(
+    slots: &[Slot],
+    jobs: usize,
+    work: impl Fn(&Slot) -> Result<Option<T>> + Sync,
+) -> Result<Vec<T>> {
+    let next = AtomicUsize::new(0);
+    let results: Mutex<Vec<(usize, Result<Option<T>>)>> = Mutex::default();
+    std::thread::scope(|scope| {
+        for _ in 0..jobs.max(1) {
+            scope.spawn(|| {
+                loop {
+                    let i = next.fetch_add(1, Ordering::Relaxed);
+                    let Some(slot) = slots.get(i) else { break };
+                    let result = work(slot);
+                    if result.is_err() {
+                        next.store(slots.len(), Ordering::Relaxed);
+                    }
+                    results.lock().unwrap_or_else(PoisonError::into_inner).push((i, result));
+                }
+            });
+        }
+    });
+    let mut results = results.into_inner().unwrap_or_else(PoisonError::into_inner);
+    results.sort_by_key(|r| r.0);
+    results.into_iter().filter_map(|(_, r)| r.transpose()).collect()
 }
 
 /// Makes, runs and judges the case of a slot; `None` where `--only` leaves it out.
@@ -141,7 +164,9 @@ fn one(binary: &Path, slot: &Slot, options: &Options<'_>) -> Result<Option<Finis
     let true_file = truth_folder.join(format!("{id}.toml"));
     put(&true_file, &truth_model)?;
     put(&truth_folder.join(format!("{id}.json")), &(serde_json::to_string_pretty(&case.truth)? + "\n"))?;
-    let oracle = oracle(binary, &true_file, &folder.join("holdout.csv"), &out, options.limit)?;
+    let held = truth_folder.join(format!("{id}.holdout.csv"));
+    put(&held, &case.csv(case.held_out(), Show::Measured, false))?;
+    let oracle = oracle(binary, &true_file, &held, &out, options.limit)?;
     let score = match report {
         Ok(report) => score::judge(&case.truth, &report, oracle.as_ref(), run.seconds),
         Err(why) => Score::failed(&case.truth, why, run.seconds),
@@ -164,7 +189,7 @@ fn write(case: &Case, folder: &Path) -> Result<Vec<String>> {
     std::fs::create_dir_all(folder).with_context(|| format!("{} cannot be made", folder.display()))?;
     put(&folder.join("nominal.toml"), &case.nominal_model())?;
     for recording in &case.recordings {
-        put(&folder.join(&recording.name), &case.csv(recording, false))?;
+        put(&folder.join(&recording.name), &case.csv(recording, Show::Measured, case.units))?;
     }
     Ok(case.recordings.iter().map(|r| r.name.clone()).collect())
 }

@@ -30,6 +30,15 @@ pub(crate) struct Recording {
     pub(crate) shown: Vec<Vec<f64>>,
 }
 
+/// Which measurements a file has.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub(crate) enum Show {
+    /// With noise, as greybox is given them.
+    Measured,
+    /// As sensors without noise would show them.
+    Clean,
+}
+
 /// A case, complete.
 #[derive(Debug, Clone)]
 pub(crate) struct Case {
@@ -253,7 +262,6 @@ fn places(kind: Kind, family: Family) -> Vec<usize> {
         (UnmodeledResonance, Table) => &[0, 1],
         (FeedbackDelay, Oscillator | Duffing) => &[0],
         (FeedbackDelay, Table) => &[1],
-        (ConstantOffset, QuarterCar) => &[1],
         (ConstantOffset | PeriodicDisturbance | StepDisturbance, TwoMass | Table) => &[0, 1],
         (ConstantOffset | PeriodicDisturbance | StepDisturbance, QuarterCar) => &[1],
         (ConstantOffset | PeriodicDisturbance | StepDisturbance, _) => &[0],
@@ -552,7 +560,7 @@ impl Sensors<'_> {
 fn refit_basis(bare: &Machine, start: [f64; 4], scene: &Scene, hold: Hold, sensors: &Sensors<'_>) -> Vec<Vec<f64>> {
     let u = &scene.run.u;
     let go = |m: &Machine, start: [f64; 4]| {
-        sensors.stack(&m.run_with(start, scene.samples, scene.dt, hold, Drive::Samples(u), ROUGH).y, 1.0)
+        sensors.stack(&m.run(start, scene.samples, scene.dt, hold, Drive::Samples(u), ROUGH).y, 1.0)
     };
     let base = go(bare, start);
     let mut columns = Vec::new();
@@ -632,7 +640,7 @@ impl Setup {
                     .zip(self.size)
                     .map(|(s, size)| s.iter().map(|x| x * size).collect())
                     .collect();
-                machine.run_with(start, samples, self.dt, self.hold, Drive::Samples(&u), substeps)
+                machine.run(start, samples, self.dt, self.hold, Drive::Samples(&u), substeps)
             }
             Some(law) => {
                 let (mut last, mut rate, mut sum) = (None, 0.0, 0.0);
@@ -646,7 +654,7 @@ impl Setup {
                     let second = signals.get(1).map_or(0.0, |s| self.size[1] * s[k]);
                     [law.kp * error + law.kd * rate + law.ki * sum, second]
                 };
-                machine.run_with(start, samples, self.dt, self.hold, Drive::Controller(&mut step), substeps)
+                machine.run(start, samples, self.dt, self.hold, Drive::Controller(&mut step), substeps)
             }
         }
     }
@@ -837,7 +845,7 @@ fn attempt_case(slot: &Slot, attempt: usize, rng: &mut Pcg64Mcg) -> Option<Case>
             if !run.finite {
                 return f64::NAN;
             }
-            let without = bare.run_with(start, samples, dt, hold, Drive::Samples(&run.u), ROUGH);
+            let without = bare.run(start, samples, dt, hold, Drive::Samples(&run.u), ROUGH);
             let mut off = difference(&sensors.stack(&run.y, 1.0), &sensors.stack(&without.y, 1.0));
             basis.iter().for_each(|b| subtract(&mut off, b));
             off.chunks(samples).map(rms).fold(0.0, f64::max)
@@ -1276,14 +1284,19 @@ impl Case {
         )
     }
 
-    /// A recording as CSV: with what the sensors show, or with what they would show without noise.
-    pub(crate) fn csv(&self, recording: &Recording, clean: bool) -> String {
+    /// The recording that only judges.
+    pub(crate) fn held_out(&self) -> &Recording {
+        &self.recordings[self.recordings.len() - 1]
+    }
+
+    /// A recording as CSV, its header with or without units.
+    pub(crate) fn csv(&self, recording: &Recording, show: Show, units: bool) -> String {
         use std::fmt::Write as _;
         let family = self.machine.family;
         let head = |(name, unit): &(&str, &str)| {
-            if self.units { format!(",{name} [{unit}]") } else { format!(",{name}") }
+            if units { format!(",{name} [{unit}]") } else { format!(",{name}") }
         };
-        let mut text = if self.units { "t [s]".to_owned() } else { "t".to_owned() };
+        let mut text = if units { "t [s]".to_owned() } else { "t".to_owned() };
         family.input_names().iter().for_each(|n| text.push_str(&head(n)));
         let seen: Vec<usize> = (0..self.measured.len()).filter(|&c| self.measured[c]).collect();
         seen.iter().for_each(|&c| text.push_str(&head(&family.states()[c])));
@@ -1294,7 +1307,10 @@ impl Case {
                 let _ = write!(text, ",{}", u[k]);
             });
             for &c in &seen {
-                let y = if clean { recording.run.y[c][k] } else { recording.shown[c][k] };
+                let y = match show {
+                    Show::Measured => recording.shown[c][k],
+                    Show::Clean => recording.run.y[c][k],
+                };
                 let _ = write!(text, ",{y}");
             }
             text.push('\n');

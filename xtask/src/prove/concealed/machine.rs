@@ -235,11 +235,6 @@ impl Family {
 }
 
 impl Machine {
-    /// Without its effects.
-    pub(crate) fn bare(&self) -> Machine {
-        Machine { effects: Vec::new(), ..self.clone() }
-    }
-
     fn place(&self, effect: &Effect) -> Place {
         self.family.places()[effect.at]
     }
@@ -620,13 +615,9 @@ impl Machine {
         y
     }
 
-    /// Solves `samples` samples, `dt` apart, from `start` (coordinates, then rates).
-    pub(crate) fn run(&self, start: [f64; 4], samples: usize, dt: f64, hold: Hold, drive: Drive<'_>) -> Run {
-        self.run_with(start, samples, dt, hold, drive, SUBSTEPS)
-    }
-
-    /// As [`Machine::run`], with a number of steps per sample.
-    pub(crate) fn run_with(
+    /// Solves `samples` samples, `dt` apart, from `start` (coordinates, then rates), in `substeps` steps per
+    /// sample.
+    pub(crate) fn run(
         &self,
         start: [f64; 4],
         samples: usize,
@@ -748,7 +739,7 @@ mod tests {
     fn a_damped_oscillator_follows_its_closed_form() {
         let (m, c, k) = (2.0, 0.8, 50.0);
         let machine = Machine { family: Family::Oscillator, p: vec![m, c, k], effects: vec![] };
-        let run = machine.run([0.3, 0.0, 0.0, 0.0], 1000, 0.01, Hold::Linear, Drive::Samples(&quiet(1000)));
+        let run = machine.run([0.3, 0.0, 0.0, 0.0], 1000, 0.01, Hold::Linear, Drive::Samples(&quiet(1000)), SUBSTEPS);
         let decay = c / (2.0 * m);
         let omega = (k / m - decay * decay).sqrt();
         for i in (0..1000).step_by(37) {
@@ -768,7 +759,7 @@ mod tests {
         };
         let half = std::f64::consts::PI / 10.0;
         let dt = half / 50.0;
-        let run = machine.run([1.0, 0.0, 0.0, 0.0], 2000, dt, Hold::Linear, Drive::Samples(&quiet(2000)));
+        let run = machine.run([1.0, 0.0, 0.0, 0.0], 2000, dt, Hold::Linear, Drive::Samples(&quiet(2000)), SUBSTEPS);
         let mut amplitude = 1.0;
         for turn in 1..=15 {
             amplitude -= 0.06;
@@ -783,7 +774,7 @@ mod tests {
     #[test]
     fn energy_is_kept_where_nothing_takes_it() {
         let machine = Machine { family: Family::Pendulum, p: vec![0.3, 0.0, 5.0], effects: vec![] };
-        let run = machine.run([2.5, 0.0, 0.0, 0.0], 5000, 0.005, Hold::Linear, Drive::Samples(&quiet(5000)));
+        let run = machine.run([2.5, 0.0, 0.0, 0.0], 5000, 0.005, Hold::Linear, Drive::Samples(&quiet(5000)), SUBSTEPS);
         let energy = |i: usize| 0.15 * run.v[0][i].powi(2) - 5.0 * run.q[0][i].cos();
         assert!((energy(4999) - energy(0)).abs() < 1e-8, "{} {}", energy(4999), energy(0));
     }
