@@ -10,9 +10,9 @@ mod machine;
 mod plan;
 mod score;
 mod summary;
-mod text;
 #[cfg(test)]
 mod tests;
+mod text;
 
 use std::path::{Path, PathBuf};
 use std::process::Command;
@@ -67,7 +67,8 @@ pub(crate) fn run(binary: &Path, options: &Options<'_>) -> Result<Ending> {
     for folder in ["cases", "truth", "out"] {
         let path = options.folder.join(folder);
         if path.exists() {
-            std::fs::remove_dir_all(&path).with_context(|| format!("{} cannot be emptied", path.display()))?;
+            std::fs::remove_dir_all(&path)
+                .with_context(|| format!("{} cannot be emptied", path.display()))?;
         }
         std::fs::create_dir_all(&path).with_context(|| format!("{} cannot be made", path.display()))?;
     }
@@ -181,7 +182,14 @@ fn describe(truth: &Truth, kind: &str) -> String {
     let masks: Vec<&str> = truth.masks.iter().map(|m| m.name()).collect();
     let effects: Vec<&str> = truth.effects.iter().map(|e| e.kind).collect();
     let tier = truth.tier.map_or("", |t| t.name());
-    format!("{kind} {} {} {} {tier} {} {}", truth.id, truth.class, truth.system, masks.join(" "), effects.join(" "))
+    format!(
+        "{kind} {} {} {} {tier} {} {}",
+        truth.id,
+        truth.class,
+        truth.system,
+        masks.join(" "),
+        effects.join(" ")
+    )
 }
 
 /// Writes what greybox is given; the names of the recordings, the held-out one last.
@@ -199,7 +207,13 @@ fn put(path: &Path, text: &str) -> Result<()> {
 }
 
 /// The held-out errors of the true model; `None` where it could not be simulated.
-fn oracle(binary: &Path, model: &Path, holdout: &Path, out: &Path, limit: Duration) -> Result<Option<Oracle>> {
+fn oracle(
+    binary: &Path,
+    model: &Path,
+    holdout: &Path,
+    out: &Path,
+    limit: Duration,
+) -> Result<Option<Oracle>> {
     let logs = out.join("oracle");
     std::fs::create_dir_all(&logs).with_context(|| format!("{} cannot be made", logs.display()))?;
     let mut command = Command::new(binary);

@@ -174,14 +174,7 @@ impl Family {
             Family::Table => {
                 let (m1, m2) = (u(1.0, 20.0), u(1.0, 20.0));
                 let k2 = m2 * omega * omega * u(0.5, 1.5);
-                vec![
-                    m1,
-                    m1 * omega * u(0.15, 0.4),
-                    m2,
-                    2.0 * u(0.04, 0.2) * omega * m2,
-                    k2,
-                    u(2.0, 40.0),
-                ]
+                vec![m1, m1 * omega * u(0.15, 0.4), m2, 2.0 * u(0.04, 0.2) * omega * m2, k2, u(2.0, 40.0)]
             }
         }
     }
@@ -217,13 +210,21 @@ fn places(kind: Kind, family: Family) -> Vec<usize> {
         (ViscousFriction, TwoMass | Table) => &[0, 1],
         (ViscousFriction, _) => &[0],
         (
-            CoulombFriction | AsymmetricCoulombFriction | StribeckFriction | PreslidingFriction | QuadraticDrag,
+            CoulombFriction
+            | AsymmetricCoulombFriction
+            | StribeckFriction
+            | PreslidingFriction
+            | QuadraticDrag,
             TwoMass | Table,
         ) => &[0, 1],
         (StribeckFriction | PreslidingFriction, QuarterCar) => &[],
         (CoulombFriction, FlexibleLink) => &[0, 1],
         (
-            CoulombFriction | AsymmetricCoulombFriction | StribeckFriction | PreslidingFriction | QuadraticDrag,
+            CoulombFriction
+            | AsymmetricCoulombFriction
+            | StribeckFriction
+            | PreslidingFriction
+            | QuadraticDrag,
             _,
         ) => &[0],
         (LoadDependentFriction, Servo | DcMotor | FlexibleLink | Table) => &[0],
@@ -501,8 +502,7 @@ fn grow(kind: Kind, place: usize, machine: &Machine, scene: &Scene, rng: &mut Pc
             Box::new(move |s| [s * force, f, phase])
         }
         Kind::StepDisturbance => {
-            let part =
-                if scene.rare { rng.random_range(0.955..0.975) } else { rng.random_range(0.3..0.8) };
+            let part = if scene.rare { rng.random_range(0.955..0.975) } else { rng.random_range(0.3..0.8) };
             let t0 = ((part * scene.samples as f64).floor() + 0.5) * scene.dt;
             let sign = either(rng);
             Box::new(move |s| [1.5 * s * force * sign, t0, 0.0])
@@ -557,7 +557,13 @@ impl Sensors<'_> {
 }
 
 /// The responses of the bare machine to its free parameters and its initial state, orthonormal.
-fn refit_basis(bare: &Machine, start: [f64; 4], scene: &Scene, hold: Hold, sensors: &Sensors<'_>) -> Vec<Vec<f64>> {
+fn refit_basis(
+    bare: &Machine,
+    start: [f64; 4],
+    scene: &Scene,
+    hold: Hold,
+    sensors: &Sensors<'_>,
+) -> Vec<Vec<f64>> {
     let u = &scene.run.u;
     let go = |m: &Machine, start: [f64; 4]| {
         sensors.stack(&m.run(start, scene.samples, scene.dt, hold, Drive::Samples(u), ROUGH).y, 1.0)
@@ -818,11 +824,8 @@ fn attempt_case(slot: &Slot, attempt: usize, rng: &mut Pcg64Mcg) -> Option<Case>
     }
     let spreads: Vec<f64> = run.q.iter().map(|q| spread(q)).collect();
     let colour = if has(Mask::Coloured) { rng.random_range(0.9..0.97) } else { 0.0 };
-    let mut part = if has(Mask::Coloured) {
-        log_uniform(rng, 0.005, 0.04)
-    } else {
-        log_uniform(rng, 0.002, 0.03)
-    };
+    let mut part =
+        if has(Mask::Coloured) { log_uniform(rng, 0.005, 0.04) } else { log_uniform(rng, 0.002, 0.03) };
     if has(Mask::ClosedLoop) {
         part = part.min(0.008);
     }
@@ -854,11 +857,8 @@ fn attempt_case(slot: &Slot, attempt: usize, rng: &mut Pcg64Mcg) -> Option<Case>
         for (number, &(kind, place)) in kinds.iter().enumerate() {
             let target = slot.tier.target(rng);
             let growing = grow(kind, place, &bare, &scene, rng);
-            let effect = if growing.given {
-                growing.with(1.0)
-            } else {
-                strength_for(target, &growing, &measure)?
-            };
+            let effect =
+                if growing.given { growing.with(1.0) } else { strength_for(target, &growing, &measure)? };
             let mut reached = measure(&effect);
             if !reached.is_finite() {
                 return None;
@@ -881,10 +881,8 @@ fn attempt_case(slot: &Slot, attempt: usize, rng: &mut Pcg64Mcg) -> Option<Case>
     // An encoder: its steps make the noise, with a little of an analogue one.
     let quantum: Vec<f64> =
         sigma.iter().map(|s| if has(Mask::Quantised) { s * 12f64.sqrt() * 0.98 } else { 0.0 }).collect();
-    let noise = |c: usize| Noise {
-        sigma: if has(Mask::Quantised) { 0.2 * sigma[c] } else { sigma[c] },
-        colour,
-    };
+    let noise =
+        |c: usize| Noise { sigma: if has(Mask::Quantised) { 0.2 * sigma[c] } else { sigma[c] }, colour };
 
     // The recordings.
     let two = rng.random_bool(0.15);
@@ -991,7 +989,11 @@ fn strength_for(target: f64, growing: &Growing, measure: &dyn Fn(&Effect) -> f64
         for _ in 0..12 {
             let middle = (low * high).sqrt();
             let ratio = reach(middle);
-            if ratio.is_nan() || ratio > target { high = middle } else { low = middle }
+            if ratio.is_nan() || ratio > target {
+                high = middle
+            } else {
+                low = middle
+            }
             if (ratio / target - 1.0).abs() < 0.05 {
                 high = middle;
                 break;
@@ -1018,7 +1020,13 @@ fn first_size(machine: &Machine, size: f64, closed: bool) -> [f64; 2] {
     }
 }
 
-fn draw_signals(setup: &Setup, shape: Shape, family: Family, samples: usize, rng: &mut Pcg64Mcg) -> Vec<Vec<f64>> {
+fn draw_signals(
+    setup: &Setup,
+    shape: Shape,
+    family: Family,
+    samples: usize,
+    rng: &mut Pcg64Mcg,
+) -> Vec<Vec<f64>> {
     (0..family.inputs()).map(|_| shape.draw_signal(samples, setup.dt, setup.shape_rate, rng)).collect()
 }
 
@@ -1324,4 +1332,3 @@ impl Case {
 pub(crate) fn every_kind() -> impl Iterator<Item = Kind> {
     super::kind::LIBRARY.into_iter().chain(super::kind::OUTSIDE)
 }
-

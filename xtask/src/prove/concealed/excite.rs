@@ -34,7 +34,8 @@ impl Shape {
                         [0.1 * 25f64.powf(ratio) * f, rng.random_range(0.0..TAU), rng.random_range(0.6..1.4)]
                     })
                     .collect();
-                time.map(|t| sines.iter().map(|[f, phase, a]| a * (TAU * f * t + phase).sin()).sum()).collect()
+                time.map(|t| sines.iter().map(|[f, phase, a]| a * (TAU * f * t + phase).sin()).sum())
+                    .collect()
             }
             Shape::Sweep => {
                 let length = samples as f64 * dt;

@@ -255,7 +255,8 @@ impl Machine {
 
     /// The input as it reaches the machine.
     fn effective_input(&self, i: usize, clock: Clock, y: &State, past: &Past<'_>) -> f64 {
-        let delay = self.effects.iter().find(|e| e.kind == Kind::InputDelay && e.at == i).map_or(0.0, |e| e.p[0]);
+        let delay =
+            self.effects.iter().find(|e| e.kind == Kind::InputDelay && e.at == i).map_or(0.0, |e| e.p[0]);
         let mut u = past.input(i, clock, delay);
         for (index, e) in self.effects.iter().enumerate().filter(|(_, e)| e.kind.on_input() && e.at == i) {
             let own = EXTRA + self.slot(index);
@@ -417,14 +418,12 @@ impl Machine {
                 let spring = p[1] * (v[0] - v[1]) + p[2] * elastic;
                 (diagonal(p[0], p[3]), [spring, p[4] * (q[1] - u[0]) - spring])
             }
-            Family::Duffing => (
-                diagonal(p[0], 1.0),
-                [p[1] * v[0] + p[2] * elastic + p[3] * q[0].powi(3) - u[0], 0.0],
-            ),
-            Family::Table => (
-                diagonal(p[0], p[2]),
-                [p[1] * v[0] - p[5] * u[0], p[3] * v[1] + p[4] * elastic - u[1]],
-            ),
+            Family::Duffing => {
+                (diagonal(p[0], 1.0), [p[1] * v[0] + p[2] * elastic + p[3] * q[0].powi(3) - u[0], 0.0])
+            }
+            Family::Table => {
+                (diagonal(p[0], p[2]), [p[1] * v[0] - p[5] * u[0], p[3] * v[1] + p[4] * elastic - u[1]])
+            }
         }
     }
 
@@ -466,7 +465,14 @@ impl Machine {
     }
 
     /// Rates of the state with every contact sliding (±1) or sticking (0) as said, and the contacts' forces.
-    fn rates(&self, clock: Clock, y: &State, contacts: &[Place], modes: &[i8; 4], past: &Past<'_>) -> (State, [f64; 4], [[f64; 2]; 4]) {
+    fn rates(
+        &self,
+        clock: Clock,
+        y: &State,
+        contacts: &[Place],
+        modes: &[i8; 4],
+        past: &Past<'_>,
+    ) -> (State, [f64; 4], [[f64; 2]; 4]) {
         let terms = self.terms(clock, y, past);
         let mut h = terms.h;
         let mut forces = [0.0; 4];
@@ -480,9 +486,8 @@ impl Machine {
         }
         let m = terms.m;
         let det = m[0][0] * m[1][1] - m[0][1] * m[1][0];
-        let solve = |b: [f64; 2]| {
-            [(m[1][1] * b[0] - m[0][1] * b[1]) / det, (m[0][0] * b[1] - m[1][0] * b[0]) / det]
-        };
+        let solve =
+            |b: [f64; 2]| [(m[1][1] * b[0] - m[0][1] * b[1]) / det, (m[0][0] * b[1] - m[1][0] * b[0]) / det];
         let free = solve(h);
         let mut acceleration = [-free[0], -free[1]];
         // Forces that keep the sticking contacts still: (c_i·M⁻¹w_j) λ_j = −c_i·M⁻¹h.
@@ -516,7 +521,15 @@ impl Machine {
     }
 
     /// One Runge–Kutta step of length `size·h` from `clock`.
-    fn leap(&self, clock: Clock, size: f64, y: &State, contacts: &[Place], modes: &[i8; 4], past: &Past<'_>) -> State {
+    fn leap(
+        &self,
+        clock: Clock,
+        size: f64,
+        y: &State,
+        contacts: &[Place],
+        modes: &[i8; 4],
+        past: &Past<'_>,
+    ) -> State {
         let at = |part: f64| Clock { inside: clock.inside + part * size, ..clock };
         let f = |clock: Clock, y: &State| self.rates(clock, y, contacts, modes, past).0;
         let h = size * clock.h;
@@ -529,7 +542,14 @@ impl Machine {
     }
 
     /// By how much each contact leaves its mode, positive when it does.
-    fn leaving(&self, clock: Clock, y: &State, contacts: &[Place], modes: &[i8; 4], past: &Past<'_>) -> [f64; 4] {
+    fn leaving(
+        &self,
+        clock: Clock,
+        y: &State,
+        contacts: &[Place],
+        modes: &[i8; 4],
+        past: &Past<'_>,
+    ) -> [f64; 4] {
         let (_, forces, levels) = self.rates(clock, y, contacts, modes, past);
         let mut out = [-1.0; 4];
         for (i, place) in contacts.iter().enumerate() {
@@ -543,7 +563,15 @@ impl Machine {
     }
 
     /// Mode of contact `i` at rest: sticking, or sliding where the force that would hold it is too large.
-    fn mode_at_rest(&self, i: usize, clock: Clock, y: &State, contacts: &[Place], modes: &[i8; 4], past: &Past<'_>) -> i8 {
+    fn mode_at_rest(
+        &self,
+        i: usize,
+        clock: Clock,
+        y: &State,
+        contacts: &[Place],
+        modes: &[i8; 4],
+        past: &Past<'_>,
+    ) -> i8 {
         let mut held = *modes;
         held[i] = 0;
         let (_, forces, levels) = self.rates(clock, y, contacts, &held, past);
@@ -557,7 +585,14 @@ impl Machine {
     }
 
     /// One whole step: smooth where no contact changes, else piece by piece between the changes.
-    fn step(&self, clock: Clock, y: &State, contacts: &[Place], modes: &mut [i8; 4], past: &Past<'_>) -> State {
+    fn step(
+        &self,
+        clock: Clock,
+        y: &State,
+        contacts: &[Place],
+        modes: &mut [i8; 4],
+        past: &Past<'_>,
+    ) -> State {
         if contacts.is_empty() {
             return self.leap(clock, 1.0, y, contacts, modes, past);
         }
@@ -632,8 +667,13 @@ impl Machine {
             Drive::Samples(given) => given.to_vec(),
             Drive::Controller(_) => vec![Vec::with_capacity(samples); inputs],
         };
-        let mut run =
-            Run { y: vec![Vec::new(); n], q: vec![Vec::new(); n], v: vec![Vec::new(); n], u: Vec::new(), finite: true };
+        let mut run = Run {
+            y: vec![Vec::new(); n],
+            q: vec![Vec::new(); n],
+            v: vec![Vec::new(); n],
+            u: Vec::new(),
+            finite: true,
+        };
         let mut y: State = [0.0; WIDTH];
         y[..4].copy_from_slice(&start);
         let mut track: Vec<[f64; 4]> = Vec::with_capacity(samples * substeps + 1);
@@ -739,7 +779,14 @@ mod tests {
     fn a_damped_oscillator_follows_its_closed_form() {
         let (m, c, k) = (2.0, 0.8, 50.0);
         let machine = Machine { family: Family::Oscillator, p: vec![m, c, k], effects: vec![] };
-        let run = machine.run([0.3, 0.0, 0.0, 0.0], 1000, 0.01, Hold::Linear, Drive::Samples(&quiet(1000)), SUBSTEPS);
+        let run = machine.run(
+            [0.3, 0.0, 0.0, 0.0],
+            1000,
+            0.01,
+            Hold::Linear,
+            Drive::Samples(&quiet(1000)),
+            SUBSTEPS,
+        );
         let decay = c / (2.0 * m);
         let omega = (k / m - decay * decay).sqrt();
         for i in (0..1000).step_by(37) {
@@ -759,7 +806,8 @@ mod tests {
         };
         let half = std::f64::consts::PI / 10.0;
         let dt = half / 50.0;
-        let run = machine.run([1.0, 0.0, 0.0, 0.0], 2000, dt, Hold::Linear, Drive::Samples(&quiet(2000)), SUBSTEPS);
+        let run =
+            machine.run([1.0, 0.0, 0.0, 0.0], 2000, dt, Hold::Linear, Drive::Samples(&quiet(2000)), SUBSTEPS);
         let mut amplitude = 1.0;
         for turn in 1..=15 {
             amplitude -= 0.06;
@@ -774,7 +822,14 @@ mod tests {
     #[test]
     fn energy_is_kept_where_nothing_takes_it() {
         let machine = Machine { family: Family::Pendulum, p: vec![0.3, 0.0, 5.0], effects: vec![] };
-        let run = machine.run([2.5, 0.0, 0.0, 0.0], 5000, 0.005, Hold::Linear, Drive::Samples(&quiet(5000)), SUBSTEPS);
+        let run = machine.run(
+            [2.5, 0.0, 0.0, 0.0],
+            5000,
+            0.005,
+            Hold::Linear,
+            Drive::Samples(&quiet(5000)),
+            SUBSTEPS,
+        );
         let energy = |i: usize| 0.15 * run.v[0][i].powi(2) - 5.0 * run.q[0][i].cos();
         assert!((energy(4999) - energy(0)).abs() < 1e-8, "{} {}", energy(4999), energy(0));
     }

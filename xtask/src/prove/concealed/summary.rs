@@ -62,22 +62,120 @@ const MUCH: f64 = f64::INFINITY;
 const HELD_OUT: f64 = 1.15;
 
 const GOALS: [Goal; 16] = [
-    Goal { name: "detected", what: "effects detected", get: |f| f.detected, low: 0.98, high: MUCH, shown: percent },
-    Goal { name: "false_alarms", what: "false alarms on nulls", get: |f| f.false_alarms, low: NONE, high: 0.02, shown: percent },
+    Goal {
+        name: "detected",
+        what: "effects detected",
+        get: |f| f.detected,
+        low: 0.98,
+        high: MUCH,
+        shown: percent,
+    },
+    Goal {
+        name: "false_alarms",
+        what: "false alarms on nulls",
+        get: |f| f.false_alarms,
+        low: NONE,
+        high: 0.02,
+        shown: percent,
+    },
     Goal { name: "exact", what: "kind right", get: |f| f.exact, low: 0.90, high: MUCH, shown: percent },
     Goal { name: "family", what: "family right", get: |f| f.family, low: 0.96, high: MUCH, shown: percent },
-    Goal { name: "equation", what: "equation right", get: |f| f.equation, low: 0.97, high: MUCH, shown: percent },
-    Goal { name: "spurious", what: "spurious mechanisms per case", get: |f| f.spurious, low: NONE, high: 0.1, shown: plain },
-    Goal { name: "held_out", what: "held-out error within 1.15 x oracle", get: |f| f.held_out, low: 0.90, high: MUCH, shown: percent },
-    Goal { name: "worse_than_calibrated", what: "held-out worse than calibrated", get: |f| f.worse_than_calibrated, low: NONE, high: 0.0, shown: percent },
-    Goal { name: "parameter_error", what: "median parameter error", get: |f| f.parameter_error, low: NONE, high: 0.05, shown: percent },
-    Goal { name: "coverage", what: "95 % intervals that hold the truth", get: |f| f.coverage, low: 0.90, high: 0.98, shown: percent },
-    Goal { name: "location", what: "median overlap of windows", get: |f| f.location, low: 0.6, high: MUCH, shown: plain },
-    Goal { name: "outside", what: "outside: unexplained or a relative", get: |f| f.outside, low: 0.90, high: MUCH, shown: percent },
-    Goal { name: "confidently_wrong", what: "outside: confidently wrong", get: |f| f.confidently_wrong, low: NONE, high: 0.0, shown: percent },
-    Goal { name: "seconds_median", what: "time, median", get: |f| f.seconds_median, low: NONE, high: 15.0, shown: seconds },
-    Goal { name: "seconds_worst", what: "time, worst", get: |f| f.seconds_worst, low: NONE, high: 120.0, shown: seconds },
-    Goal { name: "failures", what: "runs that failed", get: |f| f.failures, low: NONE, high: 0.0, shown: percent },
+    Goal {
+        name: "equation",
+        what: "equation right",
+        get: |f| f.equation,
+        low: 0.97,
+        high: MUCH,
+        shown: percent,
+    },
+    Goal {
+        name: "spurious",
+        what: "spurious mechanisms per case",
+        get: |f| f.spurious,
+        low: NONE,
+        high: 0.1,
+        shown: plain,
+    },
+    Goal {
+        name: "held_out",
+        what: "held-out error within 1.15 x oracle",
+        get: |f| f.held_out,
+        low: 0.90,
+        high: MUCH,
+        shown: percent,
+    },
+    Goal {
+        name: "worse_than_calibrated",
+        what: "held-out worse than calibrated",
+        get: |f| f.worse_than_calibrated,
+        low: NONE,
+        high: 0.0,
+        shown: percent,
+    },
+    Goal {
+        name: "parameter_error",
+        what: "median parameter error",
+        get: |f| f.parameter_error,
+        low: NONE,
+        high: 0.05,
+        shown: percent,
+    },
+    Goal {
+        name: "coverage",
+        what: "95 % intervals that hold the truth",
+        get: |f| f.coverage,
+        low: 0.90,
+        high: 0.98,
+        shown: percent,
+    },
+    Goal {
+        name: "location",
+        what: "median overlap of windows",
+        get: |f| f.location,
+        low: 0.6,
+        high: MUCH,
+        shown: plain,
+    },
+    Goal {
+        name: "outside",
+        what: "outside: unexplained or a relative",
+        get: |f| f.outside,
+        low: 0.90,
+        high: MUCH,
+        shown: percent,
+    },
+    Goal {
+        name: "confidently_wrong",
+        what: "outside: confidently wrong",
+        get: |f| f.confidently_wrong,
+        low: NONE,
+        high: 0.0,
+        shown: percent,
+    },
+    Goal {
+        name: "seconds_median",
+        what: "time, median",
+        get: |f| f.seconds_median,
+        low: NONE,
+        high: 15.0,
+        shown: seconds,
+    },
+    Goal {
+        name: "seconds_worst",
+        what: "time, worst",
+        get: |f| f.seconds_worst,
+        low: NONE,
+        high: 120.0,
+        shown: seconds,
+    },
+    Goal {
+        name: "failures",
+        what: "runs that failed",
+        get: |f| f.failures,
+        low: NONE,
+        high: 0.0,
+        shown: percent,
+    },
 ];
 
 impl Goal {
@@ -173,12 +271,15 @@ impl Floors {
     pub(crate) fn read(path: &Path) -> Result<Floors> {
         let text =
             std::fs::read_to_string(path).with_context(|| format!("{} cannot be read", path.display()))?;
-        let floors: Floors =
-            serde_json::from_str(&text).with_context(|| format!("{}", path.display()))?;
+        let floors: Floors = serde_json::from_str(&text).with_context(|| format!("{}", path.display()))?;
         for name in floors.at_least.keys().chain(floors.at_most.keys()) {
             if !GOALS.iter().any(|g| g.name == name) {
                 let known: Vec<&str> = GOALS.iter().map(|g| g.name).collect();
-                anyhow::bail!("{}: no figure is called `{name}`; there are {}", path.display(), known.join(", "));
+                anyhow::bail!(
+                    "{}: no figure is called `{name}`; there are {}",
+                    path.display(),
+                    known.join(", ")
+                );
             }
         }
         Ok(floors)
@@ -308,7 +409,12 @@ fn calibration(finished: &[Finished]) -> String {
             .map(|(_, right)| right)
             .collect();
         let right = share(inside.iter().copied()).map_or("-".to_owned(), percent);
-        let _ = writeln!(text, "{:<35} {:>5} {right:>7}", format!("{low:.2} to {:.2}", f64::min(high, 1.0)), inside.len());
+        let _ = writeln!(
+            text,
+            "{:<35} {:>5} {right:>7}",
+            format!("{low:.2} to {:.2}", f64::min(high, 1.0)),
+            inside.len()
+        );
     }
     text.push('\n');
     text
@@ -316,10 +422,8 @@ fn calibration(finished: &[Finished]) -> String {
 
 /// Everything, per case and in all.
 pub(crate) fn to_json(seed: u64, finished: &[Finished], figures: &Figures) -> serde_json::Value {
-    let cases: Vec<_> = finished
-        .iter()
-        .map(|f| json!({"truth": f.truth, "score": f.score, "oracle": f.oracle}))
-        .collect();
+    let cases: Vec<_> =
+        finished.iter().map(|f| json!({"truth": f.truth, "score": f.score, "oracle": f.oracle})).collect();
     let goals: Vec<_> = GOALS
         .iter()
         .map(|g| {

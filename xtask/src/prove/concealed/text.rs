@@ -84,46 +84,68 @@ impl Family {
             Family::Servo => const { &[free("J", "kg m^2"), free("B", "N m s"), known("kt", "N m/V")] },
             Family::Oscillator => const { &[free("m", "kg"), free("c", "N s/m"), free("k", "N/m")] },
             Family::Pendulum => const { &[free("J", "kg m^2"), free("b", "N m s"), free("mgl", "N m")] },
-            Family::TwoMass => const { &[
-                free("J1", "kg m^2"),
-                free("b1", "N m s"),
-                free("ks", "N m"),
-                free("cs", "N m s"),
-                free("J2", "kg m^2"),
-                free("b2", "N m s"),
-                known("kt", "N m/A"),
-            ] },
-            Family::FlexibleLink => const { &[
-                free("J", "kg m^2"),
-                free("B", "N m s"),
-                free("ks", "N m"),
-                free("Jl", "kg m^2"),
-                free("Bl", "N m s"),
-                known("kt", "N m/V"),
-            ] },
-            Family::DcMotor => const { &[
-                free("J", "kg m^2"),
-                free("b", "N m s"),
-                known("kt", "N m/A"),
-                free("L", "V s/A"),
-                free("R", "V/A"),
-            ] },
-            Family::QuarterCar => const { &[
-                known("ms", "kg"),
-                free("cs", "N s/m"),
-                free("ks", "N/m"),
-                free("mu", "kg"),
-                free("kt", "N/m"),
-            ] },
-            Family::Duffing => const { &[free("m", "kg"), free("c", "N s/m"), free("k", "N/m"), free("k3", "N/m^3")] },
-            Family::Table => const { &[
-                free("m1", "kg"),
-                free("b1", "N s/m"),
-                free("m2", "kg"),
-                free("b2", "N s/m"),
-                free("k2", "N/m"),
-                known("kf", "N/A"),
-            ] },
+            Family::TwoMass => {
+                const {
+                    &[
+                        free("J1", "kg m^2"),
+                        free("b1", "N m s"),
+                        free("ks", "N m"),
+                        free("cs", "N m s"),
+                        free("J2", "kg m^2"),
+                        free("b2", "N m s"),
+                        known("kt", "N m/A"),
+                    ]
+                }
+            }
+            Family::FlexibleLink => {
+                const {
+                    &[
+                        free("J", "kg m^2"),
+                        free("B", "N m s"),
+                        free("ks", "N m"),
+                        free("Jl", "kg m^2"),
+                        free("Bl", "N m s"),
+                        known("kt", "N m/V"),
+                    ]
+                }
+            }
+            Family::DcMotor => {
+                const {
+                    &[
+                        free("J", "kg m^2"),
+                        free("b", "N m s"),
+                        known("kt", "N m/A"),
+                        free("L", "V s/A"),
+                        free("R", "V/A"),
+                    ]
+                }
+            }
+            Family::QuarterCar => {
+                const {
+                    &[
+                        known("ms", "kg"),
+                        free("cs", "N s/m"),
+                        free("ks", "N/m"),
+                        free("mu", "kg"),
+                        free("kt", "N/m"),
+                    ]
+                }
+            }
+            Family::Duffing => {
+                const { &[free("m", "kg"), free("c", "N s/m"), free("k", "N/m"), free("k3", "N/m^3")] }
+            }
+            Family::Table => {
+                const {
+                    &[
+                        free("m1", "kg"),
+                        free("b1", "N s/m"),
+                        free("m2", "kg"),
+                        free("b2", "N s/m"),
+                        free("k2", "N/m"),
+                        known("kf", "N/A"),
+                    ]
+                }
+            }
         }
     }
 
@@ -171,10 +193,9 @@ fn equations(family: Family, u: &[String], elastic: &str) -> Vec<(Vec<Term>, Vec
         Family::Oscillator => {
             vec![(vec![t('+', 0, "x''"), t('+', 1, "x'"), t('+', 2, elastic)], bare(&u[0]))]
         }
-        Family::Duffing => vec![(
-            vec![t('+', 0, "x''"), t('+', 1, "x'"), t('+', 2, elastic), t('+', 3, "x^3")],
-            bare(&u[0]),
-        )],
+        Family::Duffing => {
+            vec![(vec![t('+', 0, "x''"), t('+', 1, "x'"), t('+', 2, elastic), t('+', 3, "x^3")], bare(&u[0]))]
+        }
         Family::Pendulum => {
             vec![(vec![t('+', 0, "phi''"), t('+', 1, "phi'"), t('+', 2, "sin(phi)")], bare(&u[0]))]
         }
@@ -258,7 +279,8 @@ pub(crate) fn model(machine: &Machine, w: &Writing<'_>) -> String {
     let mut parameters = String::new();
     for (i, named) in family.parameters().iter().enumerate().filter(|&(i, _)| machine.p[i] != 0.0) {
         let known = if named.fixed || w.truth { "fixed = true".to_owned() } else { String::new() };
-        let prior = w.std[i].filter(|_| !named.fixed && !w.truth).map_or(String::new(), |s| format!("std = {s:.3e}"));
+        let prior =
+            w.std[i].filter(|_| !named.fixed && !w.truth).map_or(String::new(), |s| format!("std = {s:.3e}"));
         // The nominal values read like those of a data sheet.
         let shown = if w.truth { value(w.values[i]) } else { format!("{}", w.values[i]) };
         let _ = writeln!(
@@ -299,7 +321,12 @@ pub(crate) fn model(machine: &Machine, w: &Writing<'_>) -> String {
             }
             Kind::TiringActuator => {
                 let _ = writeln!(states, "tired{index} = {{ measured = false, initial = 0 }}");
-                let _ = writeln!(own, "tiring{index} = \"{}*tired{index}' = abs({}) - tired{index}\"", n(1), raw(e));
+                let _ = writeln!(
+                    own,
+                    "tiring{index} = \"{}*tired{index}' = abs({}) - tired{index}\"",
+                    n(1),
+                    raw(e)
+                );
                 u[e.at] = format!("({}/(1 + {}*tired{index}))", u[e.at], n(0));
             }
             Kind::SensorOffset | Kind::SensorDelay => {
@@ -311,8 +338,7 @@ pub(crate) fn model(machine: &Machine, w: &Writing<'_>) -> String {
                 let _ = writeln!(measurements, "{state} = \"{shown}\"");
             }
             Kind::ParameterDrift => {
-                drifting[e.which] =
-                    Some(format!("({}*(1 + {}*t))", family.parameters()[e.which].name, n(0)));
+                drifting[e.which] = Some(format!("({}*(1 + {}*t))", family.parameters()[e.which].name, n(0)));
             }
             Kind::DeadZone => elastic = format!("deadzone({}, {})", family.motion(e.at).0, n(0)),
             Kind::FeedbackDelay => elastic = format!("delay({}, {})", family.motion(e.at).0, n(0)),
@@ -371,7 +397,14 @@ pub(crate) fn model(machine: &Machine, w: &Writing<'_>) -> String {
 }
 
 /// A force on the left side, in the model language; states of its own are added.
-fn force(family: Family, e: &Effect, index: usize, states: &mut String, own: &mut String, u: &[String]) -> String {
+fn force(
+    family: Family,
+    e: &Effect,
+    index: usize,
+    states: &mut String,
+    own: &mut String,
+    u: &[String],
+) -> String {
     let n = |k: usize| e.symbol(k, index);
     let (d, r) = family.motion(e.at);
     match e.kind {
@@ -385,7 +418,8 @@ fn force(family: Family, e: &Effect, index: usize, states: &mut String, own: &mu
         }
         Kind::PreslidingFriction => {
             let _ = writeln!(states, "z{index} = {{ measured = false, initial = 0 }}");
-            let _ = writeln!(own, "bristle{index} = \"z{index}' = {r} - {}/{}*abs({r})*z{index}\"", n(0), n(1));
+            let _ =
+                writeln!(own, "bristle{index} = \"z{index}' = {r} - {}/{}*abs({r})*z{index}\"", n(0), n(1));
             format!("{}*z{index}", n(0))
         }
         Kind::QuadraticDrag => format!("{}*{r}*abs({r})", n(0)),
