@@ -5,6 +5,7 @@
 
 mod case;
 mod excite;
+mod gallery;
 mod kind;
 mod machine;
 mod plan;
@@ -23,7 +24,7 @@ use std::time::Duration;
 use anyhow::{Context, Result, bail};
 use greybox_report::Report;
 
-use self::case::{Case, Show, Truth};
+use self::case::{Case, Truth};
 use self::plan::{Left, Slot};
 use self::score::{Oracle, Score};
 use crate::{Ending, process};
@@ -52,6 +53,8 @@ pub(crate) struct Finished {
     pub(crate) oracle: Option<Oracle>,
     /// The nominal and the true model file, for the gallery.
     pub(crate) models: [String; 2],
+    /// The held-out recording, channel by channel, for the gallery.
+    pub(crate) curves: Vec<gallery::Curves>,
 }
 
 /// Runs the suite.
@@ -79,6 +82,8 @@ pub(crate) fn run(binary: &Path, options: &Options<'_>) -> Result<Ending> {
     }
     let verdicts = summary::Figures::of(&finished);
     print!("{}", summary::render(&finished, &verdicts));
+    put(&options.folder.join("gallery.html"), &gallery::render(seed, &finished, &verdicts))?;
+    println!("gallery: {}\n", options.folder.join("gallery.html").display());
     if let Some(path) = options.json {
         let text = serde_json::to_string_pretty(&summary::to_json(seed, &finished, &verdicts))? + "\n";
         std::fs::write(path, text).with_context(|| format!("{} cannot be written", path.display()))?;
@@ -166,13 +171,17 @@ fn one(binary: &Path, slot: &Slot, options: &Options<'_>) -> Result<Option<Finis
     put(&true_file, &truth_model)?;
     put(&truth_folder.join(format!("{id}.json")), &(serde_json::to_string_pretty(&case.truth)? + "\n"))?;
     let held = truth_folder.join(format!("{id}.holdout.csv"));
-    put(&held, &case.csv(case.held_out(), Show::Measured, false))?;
+    put(&held, &case.csv(case.held_out(), false))?;
     let oracle = oracle(binary, &true_file, &held, &out, options.limit)?;
+    let curves = match &report {
+        Ok(report) => curves(binary, &case, report, &folder, &out, options.limit)?,
+        Err(_) => Vec::new(),
+    };
     let score = match report {
         Ok(report) => score::judge(&case.truth, &report, oracle.as_ref(), run.seconds),
         Err(why) => Score::failed(&case.truth, why, run.seconds),
     };
-    let finished = Finished { truth: case.truth, score, oracle, models: [nominal, truth_model] };
+    let finished = Finished { truth: case.truth, score, oracle, models: [nominal, truth_model], curves };
     println!("{}", summary::line(&finished));
     Ok(Some(finished))
 }
@@ -197,13 +206,33 @@ fn write(case: &Case, folder: &Path) -> Result<Vec<String>> {
     std::fs::create_dir_all(folder).with_context(|| format!("{} cannot be made", folder.display()))?;
     put(&folder.join("nominal.toml"), &case.nominal_model())?;
     for recording in &case.recordings {
-        put(&folder.join(&recording.name), &case.csv(recording, Show::Measured, case.units))?;
+        put(&folder.join(&recording.name), &case.csv(recording, case.units))?;
     }
     Ok(case.recordings.iter().map(|r| r.name.clone()).collect())
 }
 
 fn put(path: &Path, text: &str) -> Result<()> {
     std::fs::write(path, text).with_context(|| format!("{} cannot be written", path.display()))
+}
+
+/// `greybox simulate`: what it prints for machines, and the file it writes; `None` where it fails.
+fn simulate(
+    binary: &Path,
+    model: &Path,
+    recording: &Path,
+    logs: &Path,
+    limit: Duration,
+) -> Result<Option<(serde_json::Value, String)>> {
+    std::fs::create_dir_all(logs).with_context(|| format!("{} cannot be made", logs.display()))?;
+    let csv = logs.join("simulated.csv");
+    let mut command = Command::new(binary);
+    command.arg("simulate").arg(model).arg(recording).arg("--out").arg(&csv).arg("--json");
+    let run = process::run(&mut command, logs, limit)?;
+    if !run.status.is_some_and(|s| s.success()) {
+        return Ok(None);
+    }
+    let said = std::fs::read_to_string(logs.join("stdout.txt"))?;
+    Ok(serde_json::from_str(&said).ok().zip(std::fs::read_to_string(&csv).ok()))
 }
 
 /// The held-out errors of the true model; `None` where it could not be simulated.
@@ -214,17 +243,8 @@ fn oracle(
     out: &Path,
     limit: Duration,
 ) -> Result<Option<Oracle>> {
-    let logs = out.join("oracle");
-    std::fs::create_dir_all(&logs).with_context(|| format!("{} cannot be made", logs.display()))?;
-    let mut command = Command::new(binary);
-    command.arg("simulate").arg(model).arg(holdout).arg("--out").arg(logs.join("oracle.csv")).arg("--json");
-    let run = process::run(&mut command, &logs, limit)?;
-    if !run.status.is_some_and(|s| s.success()) {
-        return Ok(None);
-    }
-    let text = std::fs::read_to_string(logs.join("stdout.txt"))?;
-    let Ok(value) = serde_json::from_str::<serde_json::Value>(&text) else { return Ok(None) };
-    let errors = value["fit"].as_object().map(|fit| {
+    let run = simulate(binary, model, holdout, &out.join("oracle"), limit)?;
+    let errors = run.as_ref().and_then(|(said, _)| said["fit"].as_object()).map(|fit| {
         fit.iter()
             .map(|(channel, s)| {
                 (channel.clone(), s["nrmse"].as_f64().unwrap_or(f64::NAN), s["nrmse_windowed"].as_f64())
@@ -232,4 +252,33 @@ fn oracle(
             .collect()
     });
     Ok(errors.map(|errors| Oracle { errors }))
+}
+
+/// The held-out recording with the free runs of the calibrated and the improved model.
+fn curves(
+    binary: &Path,
+    case: &Case,
+    report: &Report,
+    folder: &Path,
+    out: &Path,
+    limit: Duration,
+) -> Result<Vec<gallery::Curves>> {
+    let calibrated = out.join("calibrated.toml");
+    put(&calibrated, &case.model_with(|name| report.parameters.get(name).and_then(|p| p.calibrated)))?;
+    let holdout = folder.join("holdout.csv");
+    let run = |model: &Path, logs: &str| -> Result<String> {
+        Ok(simulate(binary, model, &holdout, &out.join(logs), limit)?.map(|(_, csv)| csv).unwrap_or_default())
+    };
+    let (plain, improved) = (run(&calibrated, "calibrated")?, run(&out.join("improved.toml"), "improved")?);
+    let names = case.machine.family.states();
+    Ok((0..names.len())
+        .filter(|&c| case.measured[c])
+        .map(|c| gallery::Curves {
+            channel: names[c].0.to_owned(),
+            dt: case.dt,
+            measured: case.held_out().shown[c].clone(),
+            calibrated: gallery::column(&plain, names[c].0).unwrap_or_default(),
+            improved: gallery::column(&improved, names[c].0).unwrap_or_default(),
+        })
+        .collect())
 }

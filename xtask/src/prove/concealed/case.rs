@@ -30,15 +30,6 @@ pub(crate) struct Recording {
     pub(crate) shown: Vec<Vec<f64>>,
 }
 
-/// Which measurements a file has.
-#[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub(crate) enum Show {
-    /// With noise, as greybox is given them.
-    Measured,
-    /// As sensors without noise would show them.
-    Clean,
-}
-
 /// A case, complete.
 #[derive(Debug, Clone)]
 pub(crate) struct Case {
@@ -69,8 +60,8 @@ pub(crate) struct Truth {
     pub(crate) effects: Vec<TruthEffect>,
     /// Outside the library: kinds a fair judge accepts.
     pub(crate) relatives: &'static [&'static str],
-    /// Nothing pulls it back: free runs drift.
-    pub(crate) integrates: bool,
+    /// Channels that nothing pulls back: their free runs drift.
+    pub(crate) drifting: Vec<String>,
     /// RMS of the measurement noise, by channel.
     pub(crate) noise: Vec<(String, f64)>,
     /// The model's parameters as they are.
@@ -114,12 +105,13 @@ fn log_uniform(rng: &mut Pcg64Mcg, low: f64, high: f64) -> f64 {
 }
 
 impl Family {
-    /// Whether nothing pulls its first coordinate back.
-    fn integrates(self) -> bool {
-        matches!(
-            self,
-            Family::Servo | Family::TwoMass | Family::FlexibleLink | Family::DcMotor | Family::Table
-        )
+    /// The coordinates that nothing pulls back.
+    fn drifting(self) -> &'static [usize] {
+        match self {
+            Family::TwoMass => &[0, 1],
+            Family::Servo | Family::FlexibleLink | Family::DcMotor | Family::Table => &[0],
+            _ => &[],
+        }
     }
 
     fn rotary(self) -> bool {
@@ -1124,7 +1116,7 @@ fn truth(
         .map(|(e, &severity)| TruthEffect {
             kind: e.kind.name(),
             family: e.kind.family(),
-            equations: equations(e, family),
+            equations: equations(e, family, measured),
             channel: e.kind.on_measurement().then(|| family.states()[e.at].0.to_owned()),
             drifting: (e.kind == Kind::ParameterDrift).then(|| family.parameters()[e.which].name.to_owned()),
             parameters: canonical(e),
@@ -1158,7 +1150,7 @@ fn truth(
             Left::Effect(k) if k.is_outside() => k.relatives(),
             _ => &[],
         },
-        integrates: family.integrates(),
+        drifting: family.drifting().iter().map(|&c| family.states()[c].0.to_owned()).collect(),
         noise: (0..measured.len())
             .filter(|&c| measured[c])
             .map(|c| (family.states()[c].0.to_owned(), sigma[c]))
@@ -1185,9 +1177,12 @@ fn canonical(e: &Effect) -> Vec<(&'static str, f64)> {
 }
 
 /// Equations that are right to name for an effect; empty: any.
-fn equations(e: &Effect, family: Family) -> Vec<String> {
+fn equations(e: &Effect, family: Family, measured: &[bool]) -> Vec<String> {
     let name = |i: usize| family.equation_names()[i].to_owned();
+    // A constant force shifts what no one sees by the difference between the two places.
+    let unseen = family == Family::DcMotor || measured.contains(&false);
     match e.kind {
+        Kind::ConstantOffset | Kind::InputOffset if unseen => vec![name(0), name(1)],
         k if k.on_input() => vec![name(family.entered(e.at))],
         k if k.on_measurement() => Vec::new(),
         Kind::ParameterDrift => family
@@ -1245,9 +1240,16 @@ fn twins(e: &Effect, family: Family, measured: &[bool]) -> Vec<&'static str> {
         Kind::InputOffset => vec!["constant_offset"],
         Kind::ConstantOffset if held => vec!["input_offset", "sensor_offset"],
         Kind::ConstantOffset if family.driven(e.at) => vec!["input_offset"],
+        Kind::ConstantOffset if family == Family::QuarterCar && !measured[1] => {
+            vec!["sensor_offset", "input_offset"]
+        }
+        Kind::ConstantOffset if family == Family::TwoMass && !measured[1] => vec!["input_offset"],
         // A force on the body presses both springs, which only an offset of both sensors could show.
         Kind::ConstantOffset => vec![],
         Kind::SensorOffset if held => vec!["constant_offset", "input_offset"],
+        Kind::SensorOffset if family == Family::QuarterCar && !measured[1] => {
+            vec!["constant_offset", "input_offset"]
+        }
         // Linear springs: a force across the spring moves that coordinate alone.
         Kind::SensorOffset if matches!(family, Family::QuarterCar | Family::FlexibleLink) => {
             vec!["constant_offset"]
@@ -1262,11 +1264,18 @@ fn twins(e: &Effect, family: Family, measured: &[bool]) -> Vec<&'static str> {
 impl Case {
     /// The file that greybox is given.
     pub(crate) fn nominal_model(&self) -> String {
+        self.model_with(|_| None)
+    }
+
+    /// The same equations with other values where `value` has one.
+    pub(crate) fn model_with(&self, value: impl Fn(&str) -> Option<f64>) -> String {
+        let named = self.machine.family.parameters().iter().zip(&self.nominal);
+        let values: Vec<f64> = named.map(|(named, &p)| value(named.name).unwrap_or(p)).collect();
         text::model(
             &self.machine,
             &Writing {
                 name: "Machine",
-                values: &self.nominal,
+                values: &values,
                 std: &self.std,
                 measured: &self.measured,
                 hold: self.hold,
@@ -1298,7 +1307,7 @@ impl Case {
     }
 
     /// A recording as CSV, its header with or without units.
-    pub(crate) fn csv(&self, recording: &Recording, show: Show, units: bool) -> String {
+    pub(crate) fn csv(&self, recording: &Recording, units: bool) -> String {
         use std::fmt::Write as _;
         let family = self.machine.family;
         let head = |(name, unit): &(&str, &str)| {
@@ -1315,11 +1324,7 @@ impl Case {
                 let _ = write!(text, ",{}", u[k]);
             });
             for &c in &seen {
-                let y = match show {
-                    Show::Measured => recording.shown[c][k],
-                    Show::Clean => recording.run.y[c][k],
-                };
-                let _ = write!(text, ",{y}");
+                let _ = write!(text, ",{}", recording.shown[c][k]);
             }
             text.push('\n');
         }

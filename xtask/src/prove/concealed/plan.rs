@@ -175,7 +175,8 @@ fn round(seed: u64, round: usize) -> Vec<Slot> {
         .enumerate()
         .map(|(i, (_, left, turn))| {
             let index = ROUND * round + i;
-            let own = mix(mix(seed).wrapping_add(mix(index as u64 + 1)));
+            // Not symmetric: no seed shares a case with another.
+            let own = mix(mix(mix(seed)) ^ index as u64);
             let mut order = MASKS.to_vec();
             // Each round takes the next masking first.
             order.rotate_left(turn % MASKS.len());
@@ -227,6 +228,10 @@ mod tests {
         ids.dedup();
         assert_eq!(ids.len(), 200);
         assert_ne!(plan(10, 10), short);
+        // Nor does another seed hold any of them.
+        for other in 0..9 {
+            assert!(plan(other, 200).iter().all(|s| ids.binary_search(&s.id()).is_err()));
+        }
     }
 
     #[test]

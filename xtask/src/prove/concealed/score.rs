@@ -75,6 +75,7 @@ impl Score {
         self.failure.is_none()
             && !self.false_alarm
             && self.exact != Some(false)
+            && self.equation != Some(false)
             && self.outside != Some(false)
             && self.spurious.unwrap_or(0) == 0
     }
@@ -281,8 +282,8 @@ fn intersection(a: &[[f64; 2]], b: &[[f64; 2]]) -> f64 {
 
 /// The held-out error over the oracle's and over the calibrated model's, each by its worst channel.
 ///
-/// Of a machine that nothing pulls back, the better of free run and windows counts: its free run drifts
-/// with the least error of a constant force.
+/// Free runs, but for a channel that nothing pulls back: its free run drifts with the least error of a
+/// constant force, so that runs restarted every window count there.
 fn held_out(truth: &Truth, report: &Report, oracle: Option<&Oracle>) -> (Option<f64>, Option<f64>) {
     let held = &report.fit.holdout;
     let improved = if held.improved.is_empty() { &held.calibrated } else { &held.improved };
@@ -290,23 +291,24 @@ fn held_out(truth: &Truth, report: &Report, oracle: Option<&Oracle>) -> (Option<
         // A run that diverged has no number, and is as bad as can be.
         ratios.into_iter().map(|r| if r.is_nan() { f64::INFINITY } else { r }).reduce(f64::max)
     };
-    let pick = |free: f64, windowed: Option<f64>| match windowed {
-        Some(w) if truth.integrates && !(free <= w) => w,
-        _ => free,
+    let ratio = |channel: &String, fit: &Fit, free: f64, windowed: Option<f64>| match fit
+        .nrmse_windowed
+        .zip(windowed)
+    {
+        Some((fit, base)) if truth.drifting.contains(channel) => fit / base,
+        _ => fit.nrmse / free,
     };
-    let mut by_oracle = Vec::new();
-    for (channel, free, windowed) in oracle.iter().flat_map(|o| &o.errors) {
-        let Some(fit) = improved.get(channel) else { continue };
-        let windowed = windowed.zip(fit.nrmse_windowed).map(|(o, f)| f / o);
-        by_oracle.push(pick(fit.nrmse / free, windowed));
-    }
-    let ratio = |fit: &Fit, base: &Fit| {
-        let windowed = fit.nrmse_windowed.zip(base.nrmse_windowed).map(|(f, b)| f / b);
-        pick(fit.nrmse / base.nrmse, windowed)
-    };
-    let by_calibrated: Vec<f64> = improved
+    let errors = oracle.iter().flat_map(|o| &o.errors);
+    let by_oracle = errors
+        .filter_map(|(channel, free, windowed)| {
+            improved.get(channel).map(|fit| ratio(channel, fit, *free, *windowed))
+        })
+        .collect();
+    let by_calibrated = improved
         .iter()
-        .filter_map(|(channel, fit)| held.calibrated.get(channel).map(|base| ratio(fit, base)))
+        .filter_map(|(channel, fit)| {
+            held.calibrated.get(channel).map(|base| ratio(channel, fit, base.nrmse, base.nrmse_windowed))
+        })
         .collect();
     (worst(by_oracle), worst(by_calibrated))
 }

@@ -7,7 +7,7 @@ use greybox_model::system::System;
 use greybox_simulate::{Environment, Method, Seeds, Signal, integrate};
 use rayon::prelude::*;
 
-use super::case::{Case, Show, every_kind, make};
+use super::case::{Case, every_kind, make};
 use super::excite::rms;
 use super::kind::Kind;
 use super::machine::{Drive, Hold, SUBSTEPS};
@@ -121,7 +121,7 @@ fn a_seed_gives_the_same_case_again() {
         let (a, b) = (make(&slot).unwrap(), make(&slot).unwrap());
         assert_eq!(a.nominal_model(), b.nominal_model());
         for (x, y) in a.recordings.iter().zip(&b.recordings) {
-            assert_eq!(a.csv(x, Show::Measured, true), b.csv(y, Show::Measured, true));
+            assert_eq!(a.csv(x, true), b.csv(y, true));
         }
     }
 }

@@ -116,7 +116,7 @@ impl Family {
                         free("b", "N m s"),
                         known("kt", "N m/A"),
                         free("L", "V s/A"),
-                        free("R", "V/A"),
+                        known("R", "V/A"),
                     ]
                 }
             }
