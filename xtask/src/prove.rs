@@ -1,9 +1,10 @@
-//! `cargo xtask prove`: greybox as a user runs it, on real recordings, against goals.
+//! `cargo xtask prove`: greybox as a user runs it, on concealed cases or real recordings, against goals.
 //!
 //! Each case is one `greybox diagnose` as a process of its own; what it finds is read from its
 //! `report.json`. Nothing here knows how greybox works.
 
 mod cases;
+mod concealed;
 mod identify;
 mod table;
 
@@ -21,23 +22,33 @@ use cases::Case;
 /// What `prove` takes.
 #[derive(Debug, clap::Args)]
 pub(crate) struct Arguments {
-    /// Folder of the real recordings (else the environment variable GREYBOX_RECORDINGS)
+    /// Measure greybox on the real recordings of this folder instead of the concealed suite
     #[arg(long, value_name = "DIR")]
     recordings: Option<PathBuf>,
     /// Measure identification over seeds on virtual rigs instead
     #[arg(long)]
     identify: bool,
-    /// First seed of --identify
+    /// Seed of the concealed suite; first seed of --identify
     #[arg(long, value_name = "N", default_value_t = 1)]
     seed: u64,
-    /// Seeds per case of --identify, at most (its full count otherwise)
+    /// Cases of the concealed suite (three rounds of 42 otherwise); seeds per case of --identify, at most
     #[arg(long, value_name = "N")]
     count: Option<usize>,
+    /// Keep the concealed suite's cases, truths and results here (target/prove/concealed otherwise)
+    #[arg(long, value_name = "DIR")]
+    keep: Option<PathBuf>,
+    /// Cases of the concealed suite that run at the same time
+    #[arg(long, value_name = "N", default_value_t = 2)]
+    jobs: usize,
+    /// Run the fixed suite of this file, and fail only when a figure falls below its floor there
+    #[arg(long, value_name = "FILE")]
+    floors: Option<PathBuf>,
     /// Write the figures as JSON
     #[arg(long, value_name = "FILE")]
     json: Option<PathBuf>,
-    /// Only the cases whose name contains this
-    #[arg(long, value_name = "NAME")]
+    /// Only the cases whose name contains this; of the concealed suite, those about all of these words (a
+    /// kind, a masking, a tier, a system, a case's name, null, outside)
+    #[arg(long, value_name = "WORDS")]
     only: Option<String>,
     /// Print the times without judging them (a shared machine proves nothing about speed)
     #[arg(long)]
@@ -95,23 +106,12 @@ pub(crate) fn run(root: &Path, arguments: &Arguments) -> Result<Ending> {
         let outcomes = identify::run(arguments.seed, arguments.count, arguments.only.as_deref())?;
         return conclude(&outcomes, arguments.json.as_deref());
     }
-    let from_environment = std::env::var_os("GREYBOX_RECORDINGS").map(PathBuf::from);
-    let folder = match (&arguments.recordings, from_environment) {
-        (Some(given), _) if given.is_dir() => given.clone(),
-        (Some(given), _) => {
+    let folder = match &arguments.recordings {
+        Some(given) if given.is_dir() => given.clone(),
+        Some(given) => {
             bail!("there is no folder {}; --recordings names the real recordings", given.display())
         }
-        (None, Some(named)) if named.is_dir() => named,
-        (None, Some(named)) => {
-            println!("skipped: no recordings at {}", named.display());
-            return Ok(Ending::Done);
-        }
-        (None, None) => {
-            eprintln!(
-                "error: the concealed suite is not built yet; `--recordings DIR` measures greybox on real recordings"
-            );
-            return Ok(Ending::Refused);
-        }
+        None => return conceal(root, arguments),
     };
     let mut cases = select(cases::all(), arguments.only.as_deref())?;
     if arguments.times_advisory {
@@ -133,6 +133,25 @@ pub(crate) fn run(root: &Path, arguments: &Arguments) -> Result<Ending> {
         outcomes.push(measure(&binary, &folder, case, &out, Duration::from_secs(arguments.timeout))?);
     }
     conclude(&outcomes, arguments.json.as_deref())
+}
+
+/// Runs the concealed suite.
+fn conceal(root: &Path, arguments: &Arguments) -> Result<Ending> {
+    let folder = arguments.keep.clone().unwrap_or_else(|| target(root).join("prove").join("concealed"));
+    std::fs::create_dir_all(&folder).with_context(|| format!("{} cannot be made", folder.display()))?;
+    let options = concealed::Options {
+        seed: arguments.seed,
+        count: arguments.count,
+        only: arguments.only.as_deref(),
+        json: arguments.json.as_deref(),
+        // Processes run elsewhere.
+        folder: std::path::absolute(&folder)?,
+        jobs: arguments.jobs,
+        floors: arguments.floors.as_deref(),
+        times_advisory: arguments.times_advisory,
+        limit: Duration::from_secs(arguments.timeout),
+    };
+    concealed::run(&build(root)?, &options)
 }
 
 /// Prints the table, writes the JSON, and judges.

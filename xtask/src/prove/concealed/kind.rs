@@ -1,0 +1,254 @@
+//! What a case may leave out: names, families and parameters of every effect.
+
+/// An effect left out of the nominal model: those of the library, and some outside it.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord)]
+pub(crate) enum Kind {
+    ViscousFriction,
+    CoulombFriction,
+    AsymmetricCoulombFriction,
+    StribeckFriction,
+    PreslidingFriction,
+    QuadraticDrag,
+    LoadDependentFriction,
+    LinearStiffness,
+    QuadraticStiffness,
+    CubicStiffness,
+    DeadZone,
+    EndStop,
+    BoucWenHysteresis,
+    InputSaturation,
+    InputDeadZone,
+    InputDelay,
+    ActuatorLag,
+    InputOffset,
+    Gravity,
+    Cogging,
+    PositionDependentInertia,
+    Coupling,
+    UnmodeledResonance,
+    FeedbackDelay,
+    ConstantOffset,
+    PeriodicDisturbance,
+    StepDisturbance,
+    ParameterDrift,
+    SensorOffset,
+    SensorDelay,
+    /// `cx*d^2*d'`: damping that grows with the displacement.
+    DisplacementDamping,
+    /// `asx*sin(nsx*d*d')`.
+    SineOfPower,
+    /// `kqt*(1 + cos(2*pi*fq*t))*d^2`: a quadratic spring that breathes.
+    BreathingQuadratic,
+    /// `fqq*d^2*sign(d')`: friction that grows with the square of the position.
+    PositionFriction,
+    /// `kxx*q1*q2` in the equation of `q1`.
+    ProductCoupling,
+    /// `u/(1 + bf*s)` for `u`, `tf*s' = abs(u) - s`: an actuator that tires.
+    TiringActuator,
+    /// `k5*d^5`.
+    QuinticStiffness,
+    /// `ap*cos(2*pi*fp*t)*d`: a spring that is pumped.
+    ParametricExcitation,
+}
+
+use Kind::*;
+
+/// The kinds of the library.
+pub(crate) const LIBRARY: [Kind; 30] = [
+    ViscousFriction,
+    CoulombFriction,
+    AsymmetricCoulombFriction,
+    StribeckFriction,
+    PreslidingFriction,
+    QuadraticDrag,
+    LoadDependentFriction,
+    LinearStiffness,
+    QuadraticStiffness,
+    CubicStiffness,
+    DeadZone,
+    EndStop,
+    BoucWenHysteresis,
+    InputSaturation,
+    InputDeadZone,
+    InputDelay,
+    ActuatorLag,
+    InputOffset,
+    Gravity,
+    Cogging,
+    PositionDependentInertia,
+    Coupling,
+    UnmodeledResonance,
+    FeedbackDelay,
+    ConstantOffset,
+    PeriodicDisturbance,
+    StepDisturbance,
+    ParameterDrift,
+    SensorOffset,
+    SensorDelay,
+];
+
+/// Effects that no kind of the library describes.
+pub(crate) const OUTSIDE: [Kind; 8] = [
+    DisplacementDamping,
+    SineOfPower,
+    BreathingQuadratic,
+    PositionFriction,
+    ProductCoupling,
+    TiringActuator,
+    QuinticStiffness,
+    ParametricExcitation,
+];
+
+impl Kind {
+    /// As in a report.
+    pub(crate) fn name(self) -> &'static str {
+        match self {
+            ViscousFriction => "viscous_friction",
+            CoulombFriction => "coulomb_friction",
+            AsymmetricCoulombFriction => "asymmetric_coulomb_friction",
+            StribeckFriction => "stribeck_friction",
+            PreslidingFriction => "presliding_friction",
+            QuadraticDrag => "quadratic_drag",
+            LoadDependentFriction => "load_dependent_friction",
+            LinearStiffness => "linear_stiffness",
+            QuadraticStiffness => "quadratic_stiffness",
+            CubicStiffness => "cubic_stiffness",
+            DeadZone => "dead_zone",
+            EndStop => "end_stop",
+            BoucWenHysteresis => "bouc_wen_hysteresis",
+            InputSaturation => "input_saturation",
+            InputDeadZone => "input_dead_zone",
+            InputDelay => "input_delay",
+            ActuatorLag => "actuator_lag",
+            InputOffset => "input_offset",
+            Gravity => "gravity",
+            Cogging => "cogging",
+            PositionDependentInertia => "position_dependent_inertia",
+            Coupling => "coupling",
+            UnmodeledResonance => "unmodeled_resonance",
+            FeedbackDelay => "feedback_delay",
+            ConstantOffset => "constant_offset",
+            PeriodicDisturbance => "periodic_disturbance",
+            StepDisturbance => "step_disturbance",
+            ParameterDrift => "parameter_drift",
+            SensorOffset => "sensor_offset",
+            SensorDelay => "sensor_delay",
+            DisplacementDamping => "outside_displacement_damping",
+            SineOfPower => "outside_sine_of_power",
+            BreathingQuadratic => "outside_breathing_quadratic",
+            PositionFriction => "outside_position_friction",
+            ProductCoupling => "outside_product_coupling",
+            TiringActuator => "outside_tiring_actuator",
+            QuinticStiffness => "outside_quintic_stiffness",
+            ParametricExcitation => "outside_parametric_excitation",
+        }
+    }
+
+    /// Family of the kind of that name; `None` for a name that is not in the library.
+    pub(crate) fn family_of(name: &str) -> Option<&'static str> {
+        LIBRARY.iter().find(|k| k.name() == name).map(|k| k.family())
+    }
+
+    /// The family.
+    pub(crate) fn family(self) -> &'static str {
+        match self {
+            ViscousFriction
+            | CoulombFriction
+            | AsymmetricCoulombFriction
+            | StribeckFriction
+            | PreslidingFriction
+            | QuadraticDrag
+            | LoadDependentFriction => "friction",
+            LinearStiffness | QuadraticStiffness | CubicStiffness | DeadZone | EndStop => "stiffness",
+            BoucWenHysteresis => "hysteresis",
+            InputSaturation | InputDeadZone | InputDelay | ActuatorLag | InputOffset => "actuation",
+            Gravity | Cogging | PositionDependentInertia => "position_dependent",
+            Coupling | UnmodeledResonance | FeedbackDelay => "structure",
+            ConstantOffset | PeriodicDisturbance | StepDisturbance => "disturbance",
+            ParameterDrift => "time_variation",
+            SensorOffset | SensorDelay => "sensing",
+            _ => "outside",
+        }
+    }
+
+    /// Names of its parameters, in the order in which an effect holds their values.
+    pub(crate) fn parameters(self) -> &'static [&'static str] {
+        match self {
+            ViscousFriction => &["b"],
+            CoulombFriction => &["fc"],
+            AsymmetricCoulombFriction => &["fcp", "fcn"],
+            StribeckFriction => &["fc", "fs", "vs"],
+            PreslidingFriction => &["s0", "fc"],
+            QuadraticDrag => &["cd"],
+            LoadDependentFriction => &["mul"],
+            LinearStiffness => &["kg"],
+            QuadraticStiffness => &["kq2"],
+            CubicStiffness => &["k3"],
+            DeadZone => &["gap"],
+            EndStop => &["kst", "xst"],
+            BoucWenHysteresis => &["kh", "be", "ga"],
+            InputSaturation => &["usat"],
+            InputDeadZone => &["udz"],
+            InputDelay => &["tau"],
+            ActuatorLag => &["ta"],
+            InputOffset => &["uo"],
+            Gravity => &["mgl"],
+            Cogging => &["acg", "ncg", "pcg"],
+            PositionDependentInertia => &["je", "n"],
+            Coupling => &["kc", "cg", "mc"],
+            UnmodeledResonance => &["ma", "ka", "ca"],
+            FeedbackDelay => &["tau_f"],
+            ConstantOffset => &["f0"],
+            PeriodicDisturbance => &["ad", "fd", "pd"],
+            StepDisturbance => &["fst", "t0"],
+            ParameterDrift => &["rate"],
+            SensorOffset => &["so"],
+            SensorDelay => &["tsd"],
+            DisplacementDamping => &["cx"],
+            SineOfPower => &["asx", "nsx"],
+            BreathingQuadratic => &["kqt", "fq"],
+            PositionFriction => &["fqq"],
+            ProductCoupling => &["kxx"],
+            TiringActuator => &["bf", "tf"],
+            QuinticStiffness => &["k5"],
+            ParametricExcitation => &["ap", "fp"],
+        }
+    }
+
+    /// Whether it acts on what the input does.
+    pub(crate) fn on_input(self) -> bool {
+        matches!(
+            self,
+            InputSaturation | InputDeadZone | InputDelay | ActuatorLag | InputOffset | TiringActuator
+        )
+    }
+
+    /// Whether it acts on a measurement.
+    pub(crate) fn on_measurement(self) -> bool {
+        matches!(self, SensorOffset | SensorDelay)
+    }
+
+    /// Whether it lies outside the library.
+    pub(crate) fn is_outside(self) -> bool {
+        OUTSIDE.contains(&self)
+    }
+
+    /// Whether it acts only beyond a threshold, and so has a true location in time.
+    pub(crate) fn has_threshold(self) -> bool {
+        matches!(
+            self,
+            EndStop | DeadZone | InputSaturation | InputDeadZone | StribeckFriction | StepDisturbance
+        )
+    }
+
+    /// For an effect outside the library: the kinds of it that a fair judge accepts as near.
+    pub(crate) fn relatives(self) -> &'static [&'static str] {
+        match self {
+            PositionFriction => &["load_dependent_friction"],
+            ProductCoupling => &["coupling"],
+            QuinticStiffness => &["cubic_stiffness", "end_stop"],
+            TiringActuator => &["input_saturation"],
+            _ => &[],
+        }
+    }
+}
