@@ -97,7 +97,7 @@ impl Setup {
     }
 
     /// Scores per channel of a free run, over all pieces or those of one recording. Windows of
-    /// `window` seconds restart from the smoothed measurements (unmeasured states from the run).
+    /// `window` seconds restart from a state estimated on their first quarter.
     pub fn scores(
         &self,
         run: &FreeRun,
@@ -137,8 +137,9 @@ impl Setup {
             .collect()
     }
 
-    /// Outputs of simulations restarted every window, `y[c * n + k]`. What was before a window stays
-    /// known to delayed expressions.
+    /// Outputs of simulations restarted every window, `y[c * n + k]`, each from a state estimated on the
+    /// window's first quarter (prior: the smoothed measurements; what no sensor sees, the free run). What
+    /// was before a window stays known to delayed expressions.
     fn windowed(&self, piece: usize, run: &FreeRun, parameters: &[f64], window: f64) -> Vec<f64> {
         let data = &self.data.pieces[piece];
         let (n, ny) = (data.len, self.system.ny);
@@ -151,16 +152,31 @@ impl Setup {
             method: self.method,
             seeds: &Seeds::default(),
         };
+        let fixed = Setup { free: Vec::new(), noise: None, carried: Vec::new(), ..self.clone() };
         let mut before = None;
         let mut a = 0;
         while a < n {
             let b = (a + length).min(n);
             let mut x0: Vec<f64> = (0..self.system.nx).map(|i| run.x[piece][i * n + a]).collect();
-            for (x, hat) in x0.iter_mut().zip(&self.hats.states[piece]) {
-                if let Some(hat) = hat
-                    && hat[a].is_finite()
+            let mut prior = self.start_prior(piece, a);
+            for (i, (x, (mean, std))) in x0.iter_mut().zip(&mut prior).enumerate() {
+                if std.is_finite() {
+                    *x = *mean;
+                } else {
+                    let state = &run.x[piece][i * n..(i + 1) * n];
+                    (*mean, *std) = (*x, (0.3 * crate::data::spread(state)).max(f64::MIN_POSITIVE));
+                }
+            }
+            let horizon = a..a + ((b - a) as f64 * START_SHARE) as usize;
+            if horizon.len() >= 2 {
+                let level = Level { segments: vec![Segment { piece, range: horizon }], priors: vec![prior] };
+                let point = Point { parameters: parameters.to_vec(), starts: vec![x0.clone()] };
+                let limits = Limits { iterations: 6, tolerance: 1e-4 };
+                let fit = fixed.with_problem(&level, &self.data.sigma, |p| p.fit(point, limits));
+                if let Some(found) = fit.point.starts.into_iter().next()
+                    && found.iter().all(|v| v.is_finite())
                 {
-                    *x = hat[a];
+                    x0 = found;
                 }
             }
             let (part, carry) = simulation.run_on(&x0, a..b, before.as_ref(), &[]);

@@ -381,24 +381,13 @@ fn conclude(
 
     // Mechanisms, remainder, verdict.
     let surface = surface(&improved, &scale);
-    let misfit =
-        residual_rms(&improved, &found.scale).iter().zip(&train.sigma).map(|(r, s)| r / s).fold(0.0, f64::max);
-    let fired = |gain: f64, ratio: f64| {
-        surface.as_ref().is_some_and(|s| s.gain > gain && s.t > 2.5) && misfit > ratio
-    };
     let full: f64 = raw_rss(&improved, &found.scale).iter().sum();
     let base = search.rss_at(&calibrated, &improved, &found.scale);
-    let explained = 1.0 - full / base.max(1e-300);
-    let verdict = if improved.parts.is_empty() {
-        if fired(0.2, 1.3) { Verdict::Unexplained } else { Verdict::Consistent }
-    } else if fired(0.2, 1.3) && explained < 0.5 {
-        Verdict::Unexplained
-    } else {
-        Verdict::MissingPhysics
-    };
-    let significant = if improved.parts.is_empty() { fired(0.2, 1.3) } else { fired(0.05, 1.1) };
+    let left = Left::of(&improved, &found.scale, surface.as_ref(), base);
+    let verdict = left.verdict(improved.parts.len());
+    let significant = left.significant(improved.parts.len());
     let mut mechanisms = if verdict == Verdict::MissingPhysics {
-        findings(&improved, &found, library, search, &scale, base, full, &train_role, &uncertainty)
+        findings(&improved, &found, &nominal.model, library, search, &scale, base, full, &train_role, &uncertainty)
     } else {
         Vec::new()
     };
@@ -637,6 +626,60 @@ fn figure(
     Some(Estimate { value: v, ci95: Some((v - w, v + w)) })
 }
 
+/// What the improved model leaves over.
+struct Left {
+    /// Largest residual RMS over the noise.
+    misfit: f64,
+    /// A channel's residual is well above the noise, correlated, and no coloured noise.
+    slow: bool,
+    /// Gain of free shapes on folds they were not fitted to (zero where it is not steady).
+    shape: f64,
+    /// Share of the calibrated model's misfit beyond the noise that the mechanisms explain.
+    explained: f64,
+}
+
+impl Left {
+    fn of(improved: &Fitted, scale: &[f64], surface: Option<&Surface>, base: f64) -> Left {
+        let sigma = &improved.setup.data.sigma;
+        let rms = residual_rms(improved, scale);
+        let coloured = crate::search::coloured_channels(improved, scale);
+        let misfit = rms.iter().zip(sigma).map(|(r, s)| r / s).fold(0.0, f64::max);
+        let slow = rms.iter().zip(sigma).zip(&coloured).any(|((r, s), c)| r / s > MISFIT && !c);
+        let shape = surface.filter(|s| s.t > 2.5).map_or(0.0, |s| s.gain);
+        // The floor is the noise where it is white, the residual itself where it passes for noise.
+        let counts = &improved.fit.count;
+        let floor: f64 = (0..rms.len())
+            .map(|c| {
+                let noise = if coloured[c] { rms[c] } else { sigma[c].min(rms[c]) };
+                counts[c] as f64 * (noise / scale[c]).powi(2)
+            })
+            .sum();
+        let full: f64 = raw_rss(improved, scale).iter().sum();
+        let explained = 1.0 - (full - floor).max(0.0) / (base - floor).max(1e-300);
+        Left { misfit, slow, shape, explained }
+    }
+
+    /// Whether something is missing beyond the mechanisms found.
+    fn significant(&self, mechanisms: usize) -> bool {
+        let (gain, ratio) = if mechanisms == 0 { (0.2, 1.3) } else { (0.05, 1.1) };
+        self.slow || (self.shape > gain && self.misfit > ratio)
+    }
+
+    fn verdict(&self, mechanisms: usize) -> Verdict {
+        let lacks = self.slow || (self.shape > 0.2 && self.misfit > 1.3);
+        match mechanisms {
+            0 if lacks => Verdict::Unexplained,
+            0 => Verdict::Consistent,
+            // A list of many effects that still does not reach the noise describes, it does not explain.
+            _ if lacks && (self.explained < 0.9 || mechanisms >= 3) => Verdict::Unexplained,
+            _ => Verdict::MissingPhysics,
+        }
+    }
+}
+
+/// Residual over noise from which a slow residual is a misfit.
+const MISFIT: f64 = 1.5;
+
 fn surface(fitted: &Fitted, scale: &[f64]) -> Option<Surface> {
     crate::surface::test(&fitted.setup, &fitted.level, scale, &fitted.fit.point)
 }
@@ -644,6 +687,7 @@ fn surface(fitted: &Fitted, scale: &[f64]) -> Option<Surface> {
 fn findings(
     improved: &Fitted,
     found: &Found,
+    nominal: &Model,
     library: &[Mechanism],
     search: &Search<'_>,
     scale: &[f64],
@@ -726,7 +770,7 @@ fn findings(
             Finding {
                 kind: mechanism.kind.clone(),
                 signature: mechanism.about.signature.clone(),
-                equations: part.candidate.place.equations(&setup.model),
+                equations: part.candidate.place.equations(nominal),
                 channel,
                 input,
                 drifting,
@@ -736,7 +780,10 @@ fn findings(
                 share_explained: ((without - full) / base.max(1e-300)).clamp(0.0, 1.0),
                 confidence,
                 alternatives,
-                location: locate(&setup, &along, mechanism, &part.instance),
+                location: crate::locate::Location {
+                    equations: part.candidate.place.equations(nominal),
+                    ..locate(&setup, &along, mechanism, &part.instance)
+                },
                 evidence,
                 curve: curve(&setup, &hats, mechanism, &part.instance, &part.candidate.place),
             }

@@ -59,6 +59,8 @@ pub struct Scored {
     pub shift: Vec<f64>,
     /// Sizes of the inner parameters.
     pub scales: Vec<f64>,
+    /// A tenth of the effect, from where a fit can go on when the first order promised too much.
+    pub faint: Option<Vec<f64>>,
     /// The next best choices of the inner parameters: (gain, values, shift).
     pub others: Vec<(f64, Vec<f64>, Vec<f64>)>,
 }
@@ -804,8 +806,13 @@ pub fn screen(
             mechanism.linear.iter().map(|n| mechanism.positive.contains(n)).collect()
         };
         let Some(regressed) = gram.regress(index, &positive, 0.0) else { continue };
+        let mut faint = None;
         let (gain, values) = match variant.secant {
-            None => (regressed.gain, mechanism.values(&regressed.coefficients, &variant.inner)),
+            None => {
+                let tenth: Vec<f64> = regressed.coefficients.iter().map(|c| 0.1 * c).collect();
+                faint = mechanism.values(&tenth, &variant.inner);
+                (regressed.gain, mechanism.values(&regressed.coefficients, &variant.inner))
+            }
             Some(scalable) => {
                 let c = regressed.coefficients[0];
                 if scalable && c < 3.0 {
@@ -828,6 +835,7 @@ pub fn screen(
             values,
             shift: regressed.shift,
             scales: variant.scales.clone(),
+            faint,
             others: Vec::new(),
         });
     }

@@ -23,6 +23,8 @@ const SEGMENTS: (usize, usize) = (60, 4);
 const PERIODS: f64 = 3.0;
 /// Shortest segment, samples.
 const SHORTEST: usize = 40;
+/// Innovations over high-frequency noise from which a correlated residual passes for coloured noise.
+const CLEAR: f64 = 1.35;
 /// Most samples that a level of the search looks at; longer recordings are seen through windows.
 const MOST_SAMPLES: usize = 9000;
 /// Most mechanisms that are looked for.
@@ -325,7 +327,11 @@ impl<'a> Search<'a> {
             Point { parameters: plain, starts: kept.clone() },
             Point { parameters: shifted, starts: hats },
         ];
-        // Other choices of the inner parameters: the score test is only of first order.
+        // Less of it, and other choices of the inner parameters: the score test is only of first order.
+        if let Some(faint) = &scored.faint {
+            let parameters = old.parameters.iter().chain(faint).copied().collect();
+            points.push(Point { parameters, starts: kept.clone() });
+        }
         for (_, values, shift) in &scored.others {
             let mut parameters: Vec<f64> = old.parameters.iter().chain(values).copied().collect();
             for (f, d) in base.setup.free.iter().zip(shift) {
@@ -489,7 +495,7 @@ impl<'a> Search<'a> {
             self.level(&mut calibrated, &mut state);
         }
         self.reconsider(&calibrated, &mut state);
-        if self.is_coloured(&state, 0.6) {
+        if self.is_coloured(&state, 0.6) && state.noise_is_coloured() {
             self.observer.stage(Stage::Whitening);
             self.whitened(&mut calibrated, &mut state);
         }
@@ -772,21 +778,23 @@ impl<'a> Search<'a> {
             let known = state.accepted.iter_mut().find(|a| a.candidate == part.candidate);
             if winner == part.candidate {
                 if let Some(known) = known {
-                    // Sums that equal it exactly stay declared.
-                    let whole: Vec<Rival> = known
-                        .rivals
-                        .iter()
-                        .filter(|r| r.equivalent && !rivals.iter().any(|n| n.candidate == r.candidate))
-                        .cloned()
-                        .collect();
-                    known.rivals = rivals;
-                    known.rivals.extend(whole);
+                    // What equals it exactly stays declared so.
+                    let before = std::mem::replace(&mut known.rivals, rivals);
+                    for old in before.into_iter().filter(|r| r.equivalent) {
+                        match known.rivals.iter_mut().find(|r| r.candidate == old.candidate) {
+                            Some(new) => new.equivalent = true,
+                            None => known.rivals.push(old),
+                        }
+                    }
                     known.evidence = evidence;
                 }
                 continue;
             }
             let mechanism = &self.library[winner.mechanism];
             self.observer.weighed(&mechanism.kind, &evidence, 1.0);
+            if !self.believable(&evidence, mechanism, 1.0, base.parts.is_empty(), state.loose) {
+                continue;
+            }
             state.accepted.retain(|a| a.candidate != part.candidate);
             self.accept(state, winner, chosen, rivals, evidence);
             if index >= state.current.parts.len() {
@@ -1001,6 +1009,12 @@ impl State {
         self.scale = next_scale(&self.current.fit, &self.scale, &self.sigma);
     }
 
+    /// Whether what is left over can be coloured noise (not white noise with a slow misfit).
+    fn noise_is_coloured(&self) -> bool {
+        let f = &self.current;
+        coloured_channels(f, &self.scale).into_iter().any(|c| c)
+    }
+
     /// The noise model that suits the current residual, and its innovations as the scale.
     fn whiten(&mut self) {
         let f = &self.current;
@@ -1010,6 +1024,19 @@ impl State {
         }
         self.current.setup.noise = Some(Arc::new(noise));
     }
+}
+
+/// Per channel: the residual is correlated, and its innovations stand clear of the noise that fast
+/// differences show. Coloured noise has little power at high frequencies (for an autoregression with a
+/// coefficient near one, innovations are twice what the differences say); a slow misfit over white noise
+/// leaves innovations of just that noise.
+pub fn coloured_channels(f: &Fitted, scale: &[f64]) -> Vec<bool> {
+    let noise = f.setup.innovations(&f.level, scale, &f.fit.point);
+    noise
+        .iter()
+        .zip(&f.setup.data.sigma)
+        .map(|(a, sigma)| a.order() > 0 && a.variance().sqrt() > CLEAR * sigma)
+        .collect()
 }
 
 /// Sum of squared innovations per channel, each model with the noise model of its own residual.
