@@ -1281,12 +1281,13 @@ impl Case {
                 hold: self.hold,
                 units: self.units,
                 truth: false,
+                pinned: false,
             },
         )
     }
 
-    /// The true equations with the true parameters.
-    pub(crate) fn true_model(&self) -> String {
+    /// The true equations with the true parameters; `pinned` as in [`Writing`].
+    pub(crate) fn true_model(&self, pinned: bool) -> String {
         text::model(
             &self.machine,
             &Writing {
@@ -1297,6 +1298,7 @@ impl Case {
                 hold: self.hold,
                 units: false,
                 truth: true,
+                pinned,
             },
         )
     }
