@@ -9,6 +9,7 @@ mod gallery;
 mod kind;
 mod machine;
 mod plan;
+mod rival;
 mod score;
 mod summary;
 #[cfg(test)]
@@ -44,6 +45,8 @@ pub(crate) struct Options<'a> {
     pub(crate) floors: Option<&'a Path>,
     pub(crate) times_advisory: bool,
     pub(crate) limit: Duration,
+    /// Whether the naive rival is judged as well.
+    pub(crate) rival: bool,
 }
 
 /// A case that was run.
@@ -55,6 +58,8 @@ pub(crate) struct Finished {
     pub(crate) models: [String; 2],
     /// The held-out recording, channel by channel, for the gallery.
     pub(crate) curves: Vec<gallery::Curves>,
+    /// What the naive rival says; absent where it was not asked or cannot say anything.
+    pub(crate) rival: Option<rival::Verdict>,
 }
 
 /// Runs the suite.
@@ -82,6 +87,9 @@ pub(crate) fn run(binary: &Path, options: &Options<'_>) -> Result<Ending> {
     }
     let verdicts = summary::Figures::of(&finished);
     print!("{}", summary::render(&finished, &verdicts));
+    if options.rival {
+        print!("{}", summary::render_rival(&finished));
+    }
     put(&options.folder.join("gallery.html"), &gallery::render(seed, &finished, &verdicts))?;
     println!("gallery: {}\n", options.folder.join("gallery.html").display());
     if let Some(path) = options.json {
@@ -175,11 +183,21 @@ fn one(binary: &Path, slot: &Slot, options: &Options<'_>) -> Result<Option<Finis
         Ok(report) => curves(binary, &case, report, &folder, &out, options.limit)?,
         Err(_) => Vec::new(),
     };
+    let rival = match &report {
+        Ok(report) if options.rival => {
+            let named = case.machine.family.parameters().iter().zip(&case.nominal);
+            let value = |name: &str| report.parameters.get(name).and_then(|p| p.calibrated);
+            let calibrated: Vec<f64> = named.map(|(n, &p)| value(n.name).unwrap_or(p)).collect();
+            rival::judge(&case, &calibrated)
+        }
+        _ => None,
+    };
     let score = match report {
         Ok(report) => score::judge(&case.truth, &report, oracle.as_ref(), run.seconds),
         Err(why) => Score::failed(&case.truth, why, run.seconds),
     };
-    let finished = Finished { truth: case.truth, score, oracle, models: [nominal, truth_model], curves };
+    let finished =
+        Finished { truth: case.truth, score, oracle, models: [nominal, truth_model], curves, rival };
     println!("{}", summary::line(&finished));
     Ok(Some(finished))
 }

@@ -9,6 +9,9 @@ use serde::{Deserialize, Serialize};
 use serde_json::json;
 
 use super::Finished;
+use super::case::TruthEffect;
+use super::kind::Kind;
+use super::rival::Verdict;
 use super::score::is_worse;
 
 /// The suite's figures; `None` where no case tells.
@@ -420,10 +423,74 @@ fn calibration(finished: &[Finished]) -> String {
     text
 }
 
+/// Greybox beside the naive rival, on the cases of which the rival can say anything.
+pub(crate) fn render_rival(finished: &[Finished]) -> String {
+    let both: Vec<(&Finished, &Verdict)> =
+        finished.iter().filter_map(|f| f.rival.as_ref().map(|r| (f, r))).collect();
+    let of = |class: &'static str| both.iter().filter(move |(f, _)| f.truth.class == class);
+    let family = |f: &Finished, r: &Verdict| {
+        r.kind.and_then(Kind::family_of).is_some_and(|x| f.truth.effects.iter().any(|e| e.family == x))
+    };
+    let place = |f: &Finished, r: &Verdict| {
+        let named = r.equation.as_ref();
+        named.is_some_and(|e| f.truth.effects.iter().any(|t| t.equations.contains(e)))
+    };
+    // Of several effects the rival need name only one.
+    let kind = |f: &Finished, r: &Verdict| {
+        let fits = |e: &TruthEffect, k: &str| e.kind == k || e.twins.contains(&k);
+        r.kind.is_some_and(|k| f.truth.effects.iter().any(|e| fits(e, k)))
+    };
+    let mut text = format!(
+        "{:<38} {:>9} {:>9}   on the {} cases with every state measured\n",
+        "",
+        "greybox",
+        "rival",
+        both.len()
+    );
+    let mut line = |what: &str, ours: Option<f64>, theirs: Option<f64>| {
+        let shown = |x: Option<f64>| x.map_or("-".to_owned(), percent);
+        let _ = writeln!(text, "{what:<38} {:>9} {:>9}", shown(ours), shown(theirs));
+    };
+    line(
+        "effects detected",
+        share(of("effect").map(|(f, _)| f.score.detected)),
+        share(of("effect").map(|(_, r)| r.detected)),
+    );
+    line(
+        "false alarms on nulls",
+        share(of("null").map(|(f, _)| f.score.false_alarm)),
+        share(of("null").map(|(_, r)| r.detected)),
+    );
+    line(
+        "kind right",
+        share(of("effect").filter_map(|(f, _)| f.score.exact)),
+        share(of("effect").map(|(f, r)| kind(f, r))),
+    );
+    line(
+        "family right",
+        share(of("effect").filter_map(|(f, _)| f.score.family)),
+        share(of("effect").map(|(f, r)| kind(f, r) || family(f, r))),
+    );
+    line(
+        "equation right",
+        share(of("effect").filter_map(|(f, _)| f.score.equation)),
+        share(of("effect").map(|(f, r)| place(f, r))),
+    );
+    line(
+        "outside: noticed, and no kind named",
+        share(of("outside").filter_map(|(f, _)| f.score.outside)),
+        share(of("outside").map(|(_, r)| r.detected && r.kind.is_none())),
+    );
+    text.push_str("held-out error of the rival: none, its terms are not a simulation\n\n");
+    text
+}
+
 /// Everything, per case and in all.
 pub(crate) fn to_json(seed: u64, finished: &[Finished], figures: &Figures) -> serde_json::Value {
-    let cases: Vec<_> =
-        finished.iter().map(|f| json!({"truth": f.truth, "score": f.score, "oracle": f.oracle})).collect();
+    let cases: Vec<_> = finished
+        .iter()
+        .map(|f| json!({"truth": f.truth, "score": f.score, "oracle": f.oracle, "rival": f.rival}))
+        .collect();
     let goals: Vec<_> = GOALS
         .iter()
         .map(|g| {
