@@ -47,11 +47,14 @@ pub(crate) fn judge(case: &Case, calibrated: &[f64]) -> Option<Verdict> {
         (vec![Vec::new(); n], vec![Vec::new(); n], vec![Vec::new(); family.inputs()], vec![Vec::new(); n]);
     for recording in &case.recordings[..case.recordings.len() - 1] {
         let smooth: Vec<[Vec<f64>; 3]> = recording.shown.iter().map(|y| derivatives(y, case.dt)).collect();
-        let length = smooth[0][0].len();
-        let edge = (recording.shown[0].len() - length) / 2;
-        for k in 0..length {
-            let at = |order: usize| [smooth[0][order][k], smooth.get(1).map_or(0.0, |s| s[order][k])];
-            let now: Vec<f64> = recording.run.u.iter().map(|u| u[k + edge]).collect();
+        // Each window leaves out as much at both ends; the widest decides.
+        let all = recording.shown[0].len();
+        let edges: Vec<usize> = smooth.iter().map(|s| (all - s[0].len()) / 2).collect();
+        let edge = edges.iter().copied().max().unwrap_or(0);
+        for k in edge..all - edge {
+            let of = |c: usize, order: usize| smooth.get(c).map_or(0.0, |s| s[order][k - edges[c]]);
+            let at = |order: usize| [of(0, order), of(1, order)];
+            let now: Vec<f64> = recording.run.u.iter().map(|u| u[k]).collect();
             let force = machine.missing_force(at(0), at(1), at(2), &now);
             for c in 0..n {
                 q[c].push(at(0)[c]);

@@ -282,8 +282,8 @@ fn intersection(a: &[[f64; 2]], b: &[[f64; 2]]) -> f64 {
 
 /// The held-out error over the oracle's and over the calibrated model's, each by its worst channel.
 ///
-/// Free runs, but for a channel that nothing pulls back: its free run drifts with the least error of a
-/// constant force, so that runs restarted every window count there.
+/// Free runs. A channel that nothing pulls back drifts in free run with the least error of a constant
+/// force; there, runs restarted every window count instead where they come out better.
 fn held_out(truth: &Truth, report: &Report, oracle: Option<&Oracle>) -> (Option<f64>, Option<f64>) {
     let held = &report.fit.holdout;
     let improved = if held.improved.is_empty() { &held.calibrated } else { &held.improved };
@@ -291,12 +291,10 @@ fn held_out(truth: &Truth, report: &Report, oracle: Option<&Oracle>) -> (Option<
         // A run that diverged has no number, and is as bad as can be.
         ratios.into_iter().map(|r| if r.is_nan() { f64::INFINITY } else { r }).reduce(f64::max)
     };
-    let ratio = |channel: &String, fit: &Fit, free: f64, windowed: Option<f64>| match fit
-        .nrmse_windowed
-        .zip(windowed)
-    {
-        Some((fit, base)) if truth.drifting.contains(channel) => fit / base,
-        _ => fit.nrmse / free,
+    let ratio = |channel: &String, fit: &Fit, free: f64, windowed: Option<f64>| {
+        let restarted = fit.nrmse_windowed.zip(windowed).map(|(fit, base)| fit / base);
+        // `min` passes over a run that diverged.
+        (fit.nrmse / free).min(restarted.filter(|_| truth.drifting.contains(channel)).unwrap_or(f64::NAN))
     };
     let errors = oracle.iter().flat_map(|o| &o.errors);
     let by_oracle = errors
