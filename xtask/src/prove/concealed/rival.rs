@@ -4,7 +4,8 @@
 //! derivatives of the measurements, the force that the equations then miss, and STLSQ (Brunton, Proctor &
 //! Kutz 2016) of it on polynomials up to degree 3 of states and inputs and on the sign of the velocity. The
 //! threshold is the one that predicts the last fifth of the recording best; something is missing where that
-//! prediction takes more than a tenth of the missing force's variance.
+//! prediction takes more than a tenth of the missing force's variance, and where the force is not small beside
+//! that of inertia (derivatives of smoothed measurements err in proportion to it).
 //!
 //! It does not simulate what it finds: held-out errors are not defined for it. A state that no channel
 //! measures is beyond it as well.
@@ -19,6 +20,9 @@ use super::machine::Family;
 
 /// Share of the validation variance below which nothing is said to be missing.
 const PREDICTED: f64 = 0.1;
+
+/// Missing force over the force of inertia (RMS) below which nothing is said to be missing.
+const NOTICED: f64 = 0.05;
 
 /// What the rival says.
 #[derive(Debug, Clone, Default, PartialEq, Serialize)]
@@ -43,8 +47,9 @@ pub(crate) fn judge(case: &Case, calibrated: &[f64]) -> Option<Verdict> {
     machine.effects.clear();
     machine.p.iter_mut().zip(calibrated).for_each(|(p, &c)| *p = if *p == 0.0 { 0.0 } else { c });
     // States, rates and missing forces of all training recordings.
-    let (mut q, mut v, mut u, mut missing) =
-        (vec![Vec::new(); n], vec![Vec::new(); n], vec![Vec::new(); family.inputs()], vec![Vec::new(); n]);
+    let empty = || vec![Vec::new(); n];
+    let (mut q, mut v, mut missing, mut inertia) = (empty(), empty(), empty(), empty());
+    let mut u = vec![Vec::new(); family.inputs()];
     for recording in &case.recordings[..case.recordings.len() - 1] {
         let smooth: Vec<[Vec<f64>; 3]> = recording.shown.iter().map(|y| derivatives(y, case.dt)).collect();
         // Each window leaves out as much at both ends; the widest decides.
@@ -56,10 +61,12 @@ pub(crate) fn judge(case: &Case, calibrated: &[f64]) -> Option<Verdict> {
             let at = |order: usize| [of(0, order), of(1, order)];
             let now: Vec<f64> = recording.run.u.iter().map(|u| u[k]).collect();
             let force = machine.missing_force(at(0), at(1), at(2), &now);
+            let still = machine.missing_force(at(0), at(1), [0.0; 2], &now);
             for c in 0..n {
                 q[c].push(at(0)[c]);
                 v[c].push(at(1)[c]);
                 missing[c].push(force[c]);
+                inertia[c].push(force[c] - still[c]);
             }
             now.iter().zip(&mut u).for_each(|(x, u)| u.push(*x));
         }
@@ -71,7 +78,8 @@ pub(crate) fn judge(case: &Case, calibrated: &[f64]) -> Option<Verdict> {
     for c in 0..n {
         let (columns, terms) = library(&variables, &names, &v);
         if let Some((gain, kept)) = regress(&columns, &missing[c]) {
-            if gain <= strongest {
+            let part = rms(&missing[c]) / rms(&inertia[c]) * gain.max(0.0).sqrt();
+            if gain <= strongest || part < NOTICED {
                 continue;
             }
             strongest = gain;

@@ -254,6 +254,9 @@ impl Figures {
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub(crate) struct Floors {
+    /// What the file is for, to readers.
+    #[serde(default)]
+    pub(crate) about: String,
     /// Seed of the suite.
     pub(crate) seed: u64,
     /// Number of its cases.
@@ -500,4 +503,57 @@ pub(crate) fn to_json(seed: u64, finished: &[Finished], figures: &Figures) -> se
         })
         .collect();
     json!({"seed": seed, "figures": figures, "goals": goals, "cases": cases})
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_floor_is_missed_below_it_and_where_nothing_was_measured() {
+        let floors = Floors {
+            about: String::new(),
+            seed: 1,
+            count: 2,
+            at_least: BTreeMap::from([("detected".to_owned(), 0.9), ("location".to_owned(), 0.5)]),
+            at_most: BTreeMap::from([("false_alarms".to_owned(), 0.0)]),
+        };
+        let figures = Figures { detected: Some(0.95), false_alarms: Some(0.1), ..Figures::default() };
+        assert_eq!(
+            floors.missed(&figures),
+            [
+                "false alarms on nulls: 10.0 % (ceiling 0.0 %)",
+                "median overlap of windows: not measured (floor 0.500)"
+            ]
+        );
+    }
+
+    #[test]
+    fn the_fixed_suite_names_figures_that_exist() {
+        let path = crate::root().join("fixtures").join("concealed").join("floors.json");
+        assert!(Floors::read(&path).unwrap().count > 0);
+    }
+
+    #[test]
+    fn goals_are_missed_outside_their_bounds_only() {
+        let figures = Figures {
+            coverage: Some(0.99),
+            exact: Some(0.9),
+            seconds_worst: Some(500.0),
+            ..Figures::default()
+        };
+        assert_eq!(
+            figures.missed(true),
+            ["95 % intervals that hold the truth: 99.0 % (goal 90.0 % to 98.0 %)"]
+        );
+        assert_eq!(figures.missed(false).len(), 2);
+    }
+
+    #[test]
+    fn medians_and_shares() {
+        assert_eq!(median(vec![3.0, 1.0, 2.0, 10.0]), Some(2.5));
+        assert_eq!(median(vec![]), None);
+        assert_eq!(share([true, false, true, true].into_iter()), Some(0.75));
+        assert_eq!(share(std::iter::empty()), None);
+    }
 }
