@@ -17,7 +17,7 @@ use super::text::{self, Writing};
 /// Draws before a slot is given up.
 const ATTEMPTS: usize = 60;
 /// Runge–Kutta steps per sample where only sizes matter.
-const ROUGH: usize = 6;
+const ROUGH: usize = 3;
 
 /// A recording as a sensor would have made it.
 #[derive(Debug, Clone)]
