@@ -103,7 +103,8 @@ pub(crate) fn run(binary: &Path, options: &Options<'_>) -> Result<Ending> {
     for line in &missed {
         println!("MISSED {line}");
     }
-    println!("{}", if missed.is_empty() { "all met." } else { "not all met." });
+    let asked = if floors.is_some() { "floors" } else { "goals" };
+    println!("{} {asked} met.", if missed.is_empty() { "all" } else { "not all" });
     Ok(if missed.is_empty() { Ending::Done } else { Ending::Missed })
 }
 

@@ -220,7 +220,7 @@ fn derivatives(y: &[f64], dt: f64) -> [Vec<f64>; 3] {
         }
         let tried = smooth(y, half, dt);
         let off: Vec<f64> = tried[0].iter().zip(&y[half..]).map(|(s, y)| y - s).collect();
-        if rms(&off) > 1.15 * sigma {
+        if rms(&off) > 1.15 * sigma * (1.0 - 2.25 / (2 * half + 1) as f64).sqrt() {
             break;
         }
         best = tried;
