@@ -40,6 +40,9 @@ pub(crate) struct Arguments {
     /// Cases of the concealed suite that run at the same time
     #[arg(long, value_name = "N", default_value_t = 2)]
     jobs: usize,
+    /// Beside greybox, judge what sparse regression of the missing acceleration says of the concealed suite
+    #[arg(long)]
+    rival: bool,
     /// Run the fixed suite of this file, and fail only when a figure falls below its floor there
     #[arg(long, value_name = "FILE")]
     floors: Option<PathBuf>,
@@ -150,6 +153,7 @@ fn conceal(root: &Path, arguments: &Arguments) -> Result<Ending> {
         floors: arguments.floors.as_deref(),
         times_advisory: arguments.times_advisory,
         limit: Duration::from_secs(arguments.timeout),
+        rival: arguments.rival,
     };
     concealed::run(&build(root)?, &options)
 }

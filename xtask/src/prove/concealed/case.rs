@@ -17,7 +17,7 @@ use super::text::{self, Writing};
 /// Draws before a slot is given up.
 const ATTEMPTS: usize = 60;
 /// Runge–Kutta steps per sample where only sizes matter.
-const ROUGH: usize = 6;
+const ROUGH: usize = 3;
 
 /// A recording as a sensor would have made it.
 #[derive(Debug, Clone)]
@@ -84,7 +84,8 @@ pub(crate) struct TruthEffect {
     pub(crate) twins: Vec<&'static str>,
     /// Where it acts in time, for the kinds with a threshold, by training recording.
     pub(crate) windows: Vec<(String, Vec<[f64; 2]>)>,
-    /// RMS misfit over noise RMS of a model refitted without it (worst channel, linearised refit).
+    /// RMS misfit over noise RMS of the model refitted without it: worst channel, first training
+    /// recording, parameters and initial state refitted by a few Gauss–Newton steps.
     pub(crate) severity: f64,
 }
 
@@ -542,61 +543,160 @@ struct Sensors<'a> {
 }
 
 impl Sensors<'_> {
-    fn stack(&self, y: &[Vec<f64>], scale: f64) -> Vec<f64> {
+    /// All measured channels behind one another, in units of their noise.
+    fn stack(&self, y: &[Vec<f64>]) -> Vec<f64> {
         let seen = (0..y.len()).filter(|&c| self.measured[c]);
-        seen.flat_map(|c| y[c].iter().map(move |x| x * scale / self.sigma[c])).collect()
+        seen.flat_map(|c| y[c].iter().map(move |x| x / self.sigma[c])).collect()
     }
 }
 
-/// The responses of the bare machine to its free parameters and its initial state, orthonormal.
-fn refit_basis(
-    bare: &Machine,
+/// The machine without its effects, as one would calibrate it: free parameters (as factors of the true
+/// ones) and initial state (in parts of the motion).
+struct Refit<'a> {
+    bare: &'a Machine,
     start: [f64; 4],
-    scene: &Scene,
+    scene: &'a Scene,
     hold: Hold,
-    sensors: &Sensors<'_>,
-) -> Vec<Vec<f64>> {
-    let u = &scene.run.u;
-    let go = |m: &Machine, start: [f64; 4]| {
-        sensors.stack(&m.run(start, scene.samples, scene.dt, hold, Drive::Samples(u), ROUGH).y, 1.0)
-    };
-    let base = go(bare, start);
-    let mut columns = Vec::new();
-    for i in (0..bare.p.len()).filter(|&i| !bare.family.parameters()[i].fixed && bare.p[i] != 0.0) {
-        let mut other = bare.clone();
-        other.p[i] *= 1.001;
-        columns.push(difference(&go(&other, start), &base));
+    sensors: &'a Sensors<'a>,
+    /// What moves: parameters, then entries of the initial state with their sizes.
+    free: Vec<usize>,
+    initial: Vec<(usize, f64)>,
+}
+
+impl<'a> Refit<'a> {
+    fn new(
+        bare: &'a Machine,
+        start: [f64; 4],
+        scene: &'a Scene,
+        hold: Hold,
+        sensors: &'a Sensors<'a>,
+    ) -> Self {
+        let named = bare.family.parameters();
+        let free = (0..bare.p.len()).filter(|&i| !named[i].fixed && bare.p[i] != 0.0).collect();
+        let n = bare.family.coordinates();
+        let size = |i: usize| if i < 2 { spread(&scene.run.q[i]) } else { rms(&scene.run.v[i - 2]) };
+        let initial = (0..n).chain(2..2 + n).map(|i| (i, size(i))).collect();
+        Refit { bare, start, scene, hold, sensors, free, initial }
     }
-    let n = bare.family.coordinates();
-    for i in (0..n).chain(2..2 + n) {
-        let size = if i < 2 { spread(&scene.run.q[i]) } else { rms(&scene.run.v[i - 2]) };
-        let mut other = start;
-        other[i] += 1e-3 * size;
-        columns.push(difference(&go(bare, other), &base));
+
+    /// What the sensors show, in units of their noise, for changes `x` of all that moves.
+    fn simulate(&self, x: &[f64], u: &[Vec<f64>]) -> Vec<f64> {
+        let (mut machine, mut start) = (self.bare.clone(), self.start);
+        for (&i, x) in self.free.iter().zip(x) {
+            machine.p[i] *= 1.0 + x;
+        }
+        for (&(i, size), x) in self.initial.iter().zip(&x[self.free.len()..]) {
+            start[i] += size * x;
+        }
+        let run = machine.run(start, self.scene.samples, self.scene.dt, self.hold, Drive::Samples(u), ROUGH);
+        if run.finite { self.sensors.stack(&run.y) } else { Vec::new() }
     }
-    let mut basis: Vec<Vec<f64>> = Vec::new();
-    for mut column in columns {
+
+    fn count(&self) -> usize {
+        self.free.len() + self.initial.len()
+    }
+
+    /// Orthonormal responses around `x`, and the triangle that leads back to changes of `x`.
+    fn basis(&self, x: &[f64], base: &[f64], u: &[Vec<f64>]) -> Basis {
+        let mut basis = Basis::default();
+        for i in 0..self.count() {
+            let mut other = x.to_vec();
+            other[i] += 1e-3;
+            let shifted = self.simulate(&other, u);
+            if shifted.len() == base.len() {
+                basis.take(i, difference(&shifted, base).iter().map(|d| d / 1e-3).collect());
+            }
+        }
+        basis
+    }
+
+    /// Largest RMS misfit of any channel over its noise, of the best fit to `target` that a few
+    /// Gauss–Newton steps find.
+    fn misfit(&self, target: &[f64], u: &[Vec<f64>]) -> f64 {
+        let mut x = vec![0.0; self.count()];
+        let mut residual = difference(target, &self.simulate(&x, u));
+        for _ in 0..6 {
+            let base = difference(target, &residual);
+            let step = self.basis(&x, &base, u).solve(&residual, x.len());
+            let better = [1.0, 0.5, 0.2, 0.05].iter().find_map(|part| {
+                let mut trial: Vec<f64> = x.iter().zip(&step).map(|(x, s)| x + part * s).collect();
+                // Parameters keep their sign.
+                trial[..self.free.len()].iter_mut().for_each(|x| *x = x.max(-0.95));
+                let simulated = self.simulate(&trial, u);
+                let left = difference(target, &simulated);
+                (simulated.len() == target.len() && rms(&left) < rms(&residual)).then_some((trial, left))
+            });
+            let Some((trial, left)) = better else { break };
+            let gained = 1.0 - rms(&left) / rms(&residual);
+            (x, residual) = (trial, left);
+            if gained < 2e-3 {
+                break;
+            }
+        }
+        residual.chunks(self.scene.samples).map(rms).fold(0.0, f64::max)
+    }
+}
+
+/// Columns made orthonormal one by one, and how.
+#[derive(Default)]
+struct Basis {
+    columns: Vec<(usize, Vec<f64>)>,
+    /// Row by row: what each column had of those before it, and its own length.
+    triangle: Vec<Vec<f64>>,
+}
+
+impl Basis {
+    fn take(&mut self, index: usize, mut column: Vec<f64>) {
         let before = rms(&column);
+        let mut parts = vec![0.0; self.columns.len()];
         // Twice is enough (Kahan and Parlett).
         for _ in 0..2 {
-            basis.iter().for_each(|b| subtract(&mut column, b));
+            for (part, (_, unit)) in parts.iter_mut().zip(&self.columns) {
+                *part += subtract(&mut column, unit);
+            }
         }
         let size = column.iter().map(|x| x * x).sum::<f64>().sqrt();
-        if rms(&column) > 1e-9 * before && size.is_finite() && size > 0.0 {
+        if rms(&column) > 1e-7 * before && size.is_finite() && size > 0.0 {
             column.iter_mut().for_each(|x| *x /= size);
-            basis.push(column);
+            parts.push(size);
+            self.columns.push((index, column));
+            self.triangle.push(parts);
         }
     }
-    basis
+
+    /// What is left of a vector.
+    fn project(&self, mut x: Vec<f64>) -> Vec<f64> {
+        self.columns.iter().for_each(|(_, unit)| {
+            subtract(&mut x, unit);
+        });
+        x
+    }
+
+    /// Least squares; columns that say nothing new get 0.
+    fn solve(&self, target: &[f64], count: usize) -> Vec<f64> {
+        let mut rest = target.to_vec();
+        let along: Vec<f64> = self.columns.iter().map(|(_, unit)| subtract(&mut rest, unit)).collect();
+        let mut out = vec![0.0; count];
+        let n = self.columns.len();
+        let mut solved = vec![0.0; n];
+        for i in (0..n).rev() {
+            let later: f64 = (i + 1..n).map(|j| self.triangle[j][i] * solved[j]).sum();
+            solved[i] = (along[i] - later) / self.triangle[i][i];
+            out[self.columns[i].0] = solved[i];
+        }
+        out
+    }
 }
 
 fn difference(a: &[f64], b: &[f64]) -> Vec<f64> {
     a.iter().zip(b).map(|(a, b)| a - b).collect()
 }
 
-fn subtract(x: &mut [f64], unit: &[f64]) {
+/// Takes the part along a unit vector away, and returns its length.
+fn subtract(x: &mut [f64], unit: &[f64]) -> f64 {
     let along: f64 = x.iter().zip(unit).map(|(a, b)| a * b).sum();
     x.iter_mut().zip(unit).for_each(|(x, u)| *x -= along * u);
+    along
 }
 
 /// Everything of an experiment but the machine.
@@ -832,33 +932,53 @@ fn attempt_case(slot: &Slot, attempt: usize, rng: &mut Pcg64Mcg) -> Option<Case>
     let mut severities = Vec::new();
     if !kinds.is_empty() {
         let sensors = Sensors { measured: &measured, sigma: &sigma };
-        let basis = refit_basis(&machine, start, &scene, hold, &sensors);
         let bare = machine.clone();
-        let measure = |effect: &Effect| -> f64 {
-            let with = Machine { effects: vec![effect.clone()], ..bare.clone() };
-            let run = setup.run(&with, start, &signals, &silent, &[0.0; 2], ROUGH);
-            if !run.finite {
+        let refit = Refit::new(&bare, start, &scene, hold, &sensors);
+        let still = vec![0.0; refit.count()];
+        let basis = refit.basis(&still, &refit.simulate(&still, &scene.run.u), &scene.run.u);
+        let with = |effect: &Effect| {
+            let machine = Machine { effects: vec![effect.clone()], ..bare.clone() };
+            let run = setup.run(&machine, start, &signals, &silent, &[0.0; 2], ROUGH);
+            run.finite.then_some(run)
+        };
+        // The quick measure, by a linear refit around the truth; and the slow one, by a real one.
+        let quick = |effect: &Effect| -> f64 {
+            let Some(run) = with(effect) else { return f64::NAN };
+            let without = refit.simulate(&still, &run.u);
+            if without.is_empty() {
                 return f64::NAN;
             }
-            let without = bare.run(start, samples, dt, hold, Drive::Samples(&run.u), ROUGH);
-            let mut off = difference(&sensors.stack(&run.y, 1.0), &sensors.stack(&without.y, 1.0));
-            basis.iter().for_each(|b| subtract(&mut off, b));
-            off.chunks(samples).map(rms).fold(0.0, f64::max)
+            let left = basis.project(difference(&sensors.stack(&run.y), &without));
+            left.chunks(samples).map(rms).fold(0.0, f64::max)
+        };
+        let slow = |effect: &Effect| -> f64 {
+            with(effect).map_or(f64::NAN, |run| refit.misfit(&sensors.stack(&run.y), &run.u))
         };
         let mut scale = 1.0;
         for (number, &(kind, place)) in kinds.iter().enumerate() {
             let target = slot.tier.target(rng);
             let growing = grow(kind, place, &bare, &scene, rng);
-            let effect =
-                if growing.given { growing.with(1.0) } else { strength_for(target, &growing, &measure)? };
-            let mut reached = measure(&effect);
+            let mut effect = growing.with(1.0);
+            let mut reached = f64::NAN;
+            if growing.given {
+                reached = slow(&effect);
+            } else {
+                let mut aim = target;
+                for _ in 0..3 {
+                    effect = strength_for(aim, &growing, &quick)?;
+                    reached = slow(&effect);
+                    if !(reached.is_finite() && (reached / target - 1.0).abs() > 0.15) {
+                        break;
+                    }
+                    aim *= (target / reached).clamp(0.1, 10.0);
+                }
+            }
             if !reached.is_finite() {
                 return None;
             }
             if growing.given && number == 0 {
                 // The noise is fitted to the effect.
-                let wanted = (reached / target).clamp(0.0005 / part, 0.05 / part);
-                scale = wanted;
+                scale = (reached / target).clamp(0.0005 / part, 0.05 / part);
             }
             reached /= scale;
             Tier::of(reached)?;
@@ -1281,12 +1401,13 @@ impl Case {
                 hold: self.hold,
                 units: self.units,
                 truth: false,
+                pinned: false,
             },
         )
     }
 
-    /// The true equations with the true parameters.
-    pub(crate) fn true_model(&self) -> String {
+    /// The true equations with the true parameters; `pinned` as in [`Writing`].
+    pub(crate) fn true_model(&self, pinned: bool) -> String {
         text::model(
             &self.machine,
             &Writing {
@@ -1297,6 +1418,7 @@ impl Case {
                 hold: self.hold,
                 units: false,
                 truth: true,
+                pinned,
             },
         )
     }

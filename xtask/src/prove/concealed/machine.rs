@@ -427,6 +427,19 @@ impl Machine {
         }
     }
 
+    /// What the family's own equations lack for the accelerations `a`: the force on their left side.
+    pub(crate) fn missing_force(&self, q: [f64; 2], v: [f64; 2], a: [f64; 2], u: &[f64]) -> [f64; 2] {
+        let mut p = [0.0; 8];
+        p[..self.p.len()].copy_from_slice(&self.p);
+        let elastic = self.family.elastic().map_or(0.0, |i| {
+            let c = self.family.places()[i].c;
+            c[0] * q[0] + c[1] * q[1]
+        });
+        let u = [u.first().copied().unwrap_or(0.0), u.get(1).copied().unwrap_or(0.0)];
+        let (m, h) = self.nominal(&p, q, v, u, elastic, &[0.0; WIDTH], &mut [0.0; WIDTH - EXTRA]);
+        std::array::from_fn(|i| -(m[i][0] * a[0] + m[i][1] * a[1] + h[i]))
+    }
+
     /// Dry friction forwards and backwards at the rate `r`; `None` for an effect of another nature.
     fn friction_levels(
         &self,

@@ -9,6 +9,9 @@ use serde::{Deserialize, Serialize};
 use serde_json::json;
 
 use super::Finished;
+use super::case::TruthEffect;
+use super::kind::Kind;
+use super::rival::Verdict;
 use super::score::is_worse;
 
 /// The suite's figures; `None` where no case tells.
@@ -251,6 +254,9 @@ impl Figures {
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub(crate) struct Floors {
+    /// What the file is for, to readers.
+    #[serde(default)]
+    pub(crate) about: String,
     /// Seed of the suite.
     pub(crate) seed: u64,
     /// Number of its cases.
@@ -420,10 +426,74 @@ fn calibration(finished: &[Finished]) -> String {
     text
 }
 
+/// Greybox beside the naive rival, on the cases of which the rival can say anything.
+pub(crate) fn render_rival(finished: &[Finished]) -> String {
+    let both: Vec<(&Finished, &Verdict)> =
+        finished.iter().filter_map(|f| f.rival.as_ref().map(|r| (f, r))).collect();
+    let of = |class: &'static str| both.iter().filter(move |(f, _)| f.truth.class == class);
+    let family = |f: &Finished, r: &Verdict| {
+        r.kind.and_then(Kind::family_of).is_some_and(|x| f.truth.effects.iter().any(|e| e.family == x))
+    };
+    let place = |f: &Finished, r: &Verdict| {
+        let named = r.equation.as_ref();
+        named.is_some_and(|e| f.truth.effects.iter().any(|t| t.equations.contains(e)))
+    };
+    // Of several effects the rival need name only one.
+    let kind = |f: &Finished, r: &Verdict| {
+        let fits = |e: &TruthEffect, k: &str| e.kind == k || e.twins.contains(&k);
+        r.kind.is_some_and(|k| f.truth.effects.iter().any(|e| fits(e, k)))
+    };
+    let mut text = format!(
+        "{:<38} {:>9} {:>9}   on the {} cases with every state measured\n",
+        "",
+        "greybox",
+        "rival",
+        both.len()
+    );
+    let mut line = |what: &str, ours: Option<f64>, theirs: Option<f64>| {
+        let shown = |x: Option<f64>| x.map_or("-".to_owned(), percent);
+        let _ = writeln!(text, "{what:<38} {:>9} {:>9}", shown(ours), shown(theirs));
+    };
+    line(
+        "effects detected",
+        share(of("effect").map(|(f, _)| f.score.detected)),
+        share(of("effect").map(|(_, r)| r.detected)),
+    );
+    line(
+        "false alarms on nulls",
+        share(of("null").map(|(f, _)| f.score.false_alarm)),
+        share(of("null").map(|(_, r)| r.detected)),
+    );
+    line(
+        "kind right",
+        share(of("effect").filter_map(|(f, _)| f.score.exact)),
+        share(of("effect").map(|(f, r)| kind(f, r))),
+    );
+    line(
+        "family right",
+        share(of("effect").filter_map(|(f, _)| f.score.family)),
+        share(of("effect").map(|(f, r)| kind(f, r) || family(f, r))),
+    );
+    line(
+        "equation right",
+        share(of("effect").filter_map(|(f, _)| f.score.equation)),
+        share(of("effect").map(|(f, r)| place(f, r))),
+    );
+    line(
+        "outside: noticed, and no kind named",
+        share(of("outside").filter_map(|(f, _)| f.score.outside)),
+        share(of("outside").map(|(_, r)| r.detected && r.kind.is_none())),
+    );
+    text.push_str("held-out error of the rival: none, its terms are not a simulation\n\n");
+    text
+}
+
 /// Everything, per case and in all.
 pub(crate) fn to_json(seed: u64, finished: &[Finished], figures: &Figures) -> serde_json::Value {
-    let cases: Vec<_> =
-        finished.iter().map(|f| json!({"truth": f.truth, "score": f.score, "oracle": f.oracle})).collect();
+    let cases: Vec<_> = finished
+        .iter()
+        .map(|f| json!({"truth": f.truth, "score": f.score, "oracle": f.oracle, "rival": f.rival}))
+        .collect();
     let goals: Vec<_> = GOALS
         .iter()
         .map(|g| {
@@ -433,4 +503,57 @@ pub(crate) fn to_json(seed: u64, finished: &[Finished], figures: &Figures) -> se
         })
         .collect();
     json!({"seed": seed, "figures": figures, "goals": goals, "cases": cases})
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_floor_is_missed_below_it_and_where_nothing_was_measured() {
+        let floors = Floors {
+            about: String::new(),
+            seed: 1,
+            count: 2,
+            at_least: BTreeMap::from([("detected".to_owned(), 0.9), ("location".to_owned(), 0.5)]),
+            at_most: BTreeMap::from([("false_alarms".to_owned(), 0.0)]),
+        };
+        let figures = Figures { detected: Some(0.95), false_alarms: Some(0.1), ..Figures::default() };
+        assert_eq!(
+            floors.missed(&figures),
+            [
+                "false alarms on nulls: 10.0 % (ceiling 0.0 %)",
+                "median overlap of windows: not measured (floor 0.500)"
+            ]
+        );
+    }
+
+    #[test]
+    fn the_fixed_suite_names_figures_that_exist() {
+        let path = crate::root().join("fixtures").join("concealed").join("floors.json");
+        assert!(Floors::read(&path).unwrap().count > 0);
+    }
+
+    #[test]
+    fn goals_are_missed_outside_their_bounds_only() {
+        let figures = Figures {
+            coverage: Some(0.99),
+            exact: Some(0.9),
+            seconds_worst: Some(500.0),
+            ..Figures::default()
+        };
+        assert_eq!(
+            figures.missed(true),
+            ["95 % intervals that hold the truth: 99.0 % (goal 90.0 % to 98.0 %)"]
+        );
+        assert_eq!(figures.missed(false).len(), 2);
+    }
+
+    #[test]
+    fn medians_and_shares() {
+        assert_eq!(median(vec![3.0, 1.0, 2.0, 10.0]), Some(2.5));
+        assert_eq!(median(vec![]), None);
+        assert_eq!(share([true, false, true, true].into_iter()), Some(0.75));
+        assert_eq!(share(std::iter::empty()), None);
+    }
 }

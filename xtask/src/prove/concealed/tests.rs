@@ -20,7 +20,7 @@ fn slot(kind: Option<Kind>, tier: Tier, masks: &[Mask], seed: u64) -> Slot {
 
 /// Greybox's run of the true model on the inputs of the first recording, from the true initial state.
 fn by_greybox(case: &Case, samples: usize) -> Vec<Vec<f64>> {
-    let toml = case.true_model();
+    let toml = case.true_model(false);
     let model = Model::from_toml(&toml, "truth.toml").unwrap_or_else(|e| panic!("{e}\n{toml}"));
     let system = System::compile(&model).unwrap();
     let run = &case.recordings[0].run;

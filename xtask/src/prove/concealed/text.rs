@@ -246,6 +246,8 @@ pub(crate) struct Writing<'a> {
     pub(crate) units: bool,
     /// The true model: every parameter as it is, and known.
     pub(crate) truth: bool,
+    /// Of the true model, leave the first parameter free in name: a prior holds it to nine digits.
+    pub(crate) pinned: bool,
 }
 
 /// The machine without or with its effects as a model file.
@@ -278,9 +280,14 @@ pub(crate) fn model(machine: &Machine, w: &Writing<'_>) -> String {
     let value = |x: f64| format!("{x:.17e}");
     let mut parameters = String::new();
     for (i, named) in family.parameters().iter().enumerate().filter(|&(i, _)| machine.p[i] != 0.0) {
-        let known = if named.fixed || w.truth { "fixed = true".to_owned() } else { String::new() };
-        let prior =
-            w.std[i].filter(|_| !named.fixed && !w.truth).map_or(String::new(), |s| format!("std = {s:.3e}"));
+        let pinned = w.pinned && i == 0;
+        let known =
+            if (named.fixed || w.truth) && !pinned { "fixed = true".to_owned() } else { String::new() };
+        let prior = match w.std[i].filter(|_| !named.fixed && !w.truth) {
+            _ if pinned => format!("std = {:.3e}", 1e-9 * w.values[i].abs()),
+            Some(std) => format!("std = {std:.3e}"),
+            None => String::new(),
+        };
         // The nominal values read like those of a data sheet.
         let shown = if w.truth { value(w.values[i]) } else { format!("{}", w.values[i]) };
         let _ = writeln!(
