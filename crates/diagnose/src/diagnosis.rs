@@ -391,6 +391,12 @@ fn conclude(
     } else {
         Vec::new()
     };
+    if significant {
+        // What is still missing may be what was taken for this.
+        for m in &mut mechanisms {
+            m.confidence = m.confidence.min(DOUBTED);
+        }
+    }
     mechanisms.sort_by(|a, b| b.share_explained.total_cmp(&a.share_explained));
     let remainder = remainder(&improved, surface, significant, full / base.max(1e-300));
     let noise_floor = train.sigma.iter().zip(&train.spread).map(|(s, d)| s / d.max(1e-300)).collect();
@@ -676,6 +682,9 @@ impl Left {
         }
     }
 }
+
+/// Most confidence in a mechanism beside which something unexplained remains.
+const DOUBTED: f64 = 0.8;
 
 /// Residual over noise from which a slow residual is a misfit.
 const MISFIT: f64 = 1.5;

@@ -782,6 +782,147 @@ impl Gram {
     }
 }
 
+/// Two candidates that explain together what neither does alone.
+#[derive(Debug, Clone)]
+pub struct Pair {
+    /// The two, with the values that they have together.
+    pub members: [Scored; 2],
+    /// Share of the residual sum of squares that they explain, to first order.
+    pub gain: f64,
+}
+
+/// Least share that a pair must explain, and least surplus over its members alone.
+const PAIR_GAIN: f64 = 0.05;
+
+/// The pairs of candidates that gain most beyond what their members gain alone, best first, at most `most`.
+///
+/// With the parameters projected out, every pair is a regression on two to four columns of one common
+/// Gram matrix: all of them cost less than the fit of a single one.
+pub fn screen_pairs(
+    setup: &Setup,
+    library: &[Mechanism],
+    candidates: &[Candidate],
+    level: &Level,
+    scale: &[f64],
+    point: &Point,
+    most: usize,
+) -> Vec<Pair> {
+    let (along, forces) = Along::observed(setup, level, scale, point);
+    let spectra = Spectra::new(setup, level, scale, point, &along, &forces);
+    let lanes = lanes(setup, library, candidates, &along, &spectra);
+    let n = lanes.columns.len();
+    if n == 0 {
+        return Vec::new();
+    }
+    let whole = 0..n;
+    let gram = gram(setup, level, scale, point, &lanes.signals, &lanes.columns, vec![whole]);
+    let np = gram.np;
+    let solved: Vec<Vec<f64>> =
+        (0..n).map(|l| gram.solve(&(0..np).map(|a| gram.jg[a * n + l]).collect::<Vec<_>>())).collect();
+    let base = gram.solve(&gram.jr);
+    let onto = |l: usize, of: &[f64]| -> f64 { (0..np).map(|a| gram.jg[a * n + l] * of[a]).sum() };
+    let projected = |a: usize, b: usize| gram.gg[0][a * n + b] - onto(a, &solved[b]);
+    let against = |a: usize| gram.gr[a] - onto(a, &base);
+    let rr = gram.remaining().max(1e-300);
+    let diagonal: Vec<f64> = (0..n).map(|a| projected(a, a)).collect();
+    let independent: Vec<bool> = (0..n).map(|a| diagonal[a] > INDEPENDENT * gram.gg[0][a * n + a]).collect();
+    let rest: Vec<f64> = (0..n).map(against).collect();
+    let positive = |v: &Variant| -> Vec<bool> {
+        let mechanism = &library[candidates[v.candidate].mechanism];
+        match v.secant {
+            Some(_) => vec![true],
+            None => mechanism.linear.iter().map(|l| mechanism.positive.contains(l)).collect(),
+        }
+    };
+    // Coefficients of a few columns and what they explain; `None` where a sign is impossible.
+    let regress = |columns: &[usize], positive: &[bool]| -> Option<(Vec<f64>, f64)> {
+        if columns.iter().any(|&c| !independent[c]) {
+            return None;
+        }
+        let m = columns.len();
+        let d: Vec<f64> = columns.iter().map(|&c| diagonal[c].sqrt()).collect();
+        let mut a = vec![0.0; m * m];
+        for i in 0..m {
+            for j in 0..m {
+                a[i * m + j] = projected(columns[i], columns[j]) / (d[i] * d[j]);
+            }
+            a[i * m + i] += 1e-6;
+        }
+        let b: Vec<f64> = (0..m).map(|i| rest[columns[i]] / d[i]).collect();
+        let x = qr::solve_spd(&a, m, &b);
+        let gain = qr::dot(&x, &b) / rr;
+        let c: Vec<f64> = x.iter().zip(&d).map(|(x, d)| x / d).collect();
+        let allowed = c.iter().zip(positive).all(|(c, p)| !p || *c > 0.0);
+        (allowed && gain.is_finite()).then_some((c, gain))
+    };
+    let usable: Vec<(usize, Vec<usize>, Vec<bool>, f64)> = lanes
+        .variants
+        .iter()
+        .enumerate()
+        .map(|(i, v)| {
+            let (columns, positive): (Vec<usize>, Vec<bool>) = (v.columns.clone().collect(), positive(v));
+            let alone = regress(&columns, &positive).map_or(0.0, |r| r.1.max(0.0));
+            (i, columns, positive, alone)
+        })
+        .filter(|v| v.1.len() <= 2 && v.1.iter().all(|&c| independent[c]))
+        .collect();
+    let mut found: Vec<(f64, usize, usize, Vec<f64>)> = (0..usable.len())
+        .into_par_iter()
+        .flat_map_iter(|i| {
+            let (usable, regress, lanes) = (&usable, &regress, &lanes);
+            (i + 1..usable.len()).filter_map(move |j| {
+                let ((v, cv, pv, gv), (w, cw, pw, gw)) = (&usable[i], &usable[j]);
+                if lanes.variants[*v].candidate == lanes.variants[*w].candidate {
+                    return None;
+                }
+                let columns: Vec<usize> = cv.iter().chain(cw).copied().collect();
+                let signs: Vec<bool> = pv.iter().chain(pw).copied().collect();
+                let (c, gain) = regress(&columns, &signs)?;
+                (gain > gv + gw + PAIR_GAIN).then_some((gain, i, j, c))
+            })
+        })
+        .collect();
+    found.sort_by(|a, b| b.0.total_cmp(&a.0).then((a.1, a.2).cmp(&(b.1, b.2))));
+    let mut out: Vec<Pair> = Vec::new();
+    for (gain, i, j, c) in found {
+        let (v, w) = (&lanes.variants[usable[i].0], &lanes.variants[usable[j].0]);
+        let known = out.iter().any(|p| {
+            p.members[0].candidate == v.candidate && p.members[1].candidate == w.candidate
+        });
+        if known {
+            continue;
+        }
+        let member = |variant: &Variant, c: &[f64]| -> Option<Scored> {
+            let mechanism = &library[candidates[variant.candidate].mechanism];
+            let values = match variant.secant {
+                None => mechanism.values(c, &variant.inner),
+                Some(true) if c[0] < 3.0 => {
+                    let inner: Vec<f64> = variant.inner.iter().map(|v| v * c[0]).collect();
+                    mechanism.values(&[], &inner)
+                }
+                Some(_) => mechanism.values(&[], &variant.inner),
+            }?;
+            Some(Scored {
+                candidate: variant.candidate,
+                gain,
+                values,
+                shift: vec![0.0; np],
+                scales: variant.scales.clone(),
+                faint: None,
+                others: Vec::new(),
+            })
+        };
+        let split = usable[i].1.len();
+        if let (Some(a), Some(b)) = (member(v, &c[..split]), member(w, &c[split..])) {
+            out.push(Pair { members: [a, b], gain });
+        }
+        if out.len() == most {
+            break;
+        }
+    }
+    out
+}
+
 /// Scores every candidate at the point of a fit, best first.
 pub fn screen(
     setup: &Setup,

@@ -13,7 +13,7 @@ use crate::evidence::{Evidence, Side, folds, kappa, weigh};
 use crate::library::Mechanism;
 use crate::place::{Place, places};
 use crate::along::Along;
-use crate::screen::{Scored, first_states, screen};
+use crate::screen::{Pair, Scored, first_states, screen, screen_pairs};
 use crate::{Observer, Stage};
 
 /// Number of segments of the first and last level, where nothing else decides.
@@ -31,6 +31,9 @@ const MOST_SAMPLES: usize = 9000;
 const MOST_MECHANISMS: usize = 5;
 /// Most candidates that are fitted per round.
 const SHORT_LIST: usize = 9;
+/// Pairs that are fitted when no single candidate pays, and the residual over noise that calls for them.
+const PAIRS: usize = 4;
+const PAIR_MISFIT: f64 = 1.1;
 /// Log-likelihood gain that another hold must bring.
 const HOLD_GAIN: f64 = 10.0;
 /// A simpler model wins when its score is no further behind than this.
@@ -273,6 +276,94 @@ impl<'a> Search<'a> {
         let point = fitted.fit.point.clone();
         let fit = fitted.setup.fit(&fitted.level, scale, &[point], limits(iterations));
         Fitted { fit, ..fitted.clone() }
+    }
+
+    /// Fits `base` plus two candidates.
+    fn extend_by_pair(&self, base: &Fitted, open: &[Candidate], pair: &Pair, scale: &[f64]) -> Option<Fitted> {
+        let n0 = self.nominal.model.parameters.len();
+        let old = &base.fit.point;
+        let mut parts = self.parts(base);
+        let mut fresh: Vec<Vec<f64>> = vec![Vec::new(); base.setup.data.pieces.len()];
+        let along = Along::smoothed(&base.setup, &base.level, scale, old);
+        for member in &pair.members {
+            let candidate = &open[member.candidate];
+            parts.push((candidate.clone(), member.values.clone(), member.scales.clone()));
+            let own = first_states(&base.setup, &self.library[candidate.mechanism], candidate, &along)?;
+            fresh.iter_mut().zip(own).for_each(|(f, o)| f.extend(o));
+        }
+        let (setup, parts) = self.assemble(&base.setup.holds, &old.parameters[..n0], &parts, &base.setup).ok()?;
+        let parameters = old
+            .parameters
+            .iter()
+            .chain(&pair.members[0].values)
+            .chain(&pair.members[1].values)
+            .copied()
+            .collect();
+        let level = same_level(&setup, &base.level);
+        let starts = transfer(&base.setup, &base.level, &old.starts, &setup, &fresh);
+        let fit = setup.fit(&level, scale, &[Point { parameters, starts }], limits(20));
+        let fitted = Fitted { setup, parts, level, fit };
+        (fitted.fit.cost.is_finite() && self.admissible(&fitted)).then_some(fitted)
+    }
+
+    /// Whether every mechanism's requirements on its parameters hold.
+    fn admissible(&self, fitted: &Fitted) -> bool {
+        fitted.parts.iter().all(|part| {
+            let mechanism = &self.library[part.candidate.mechanism];
+            let value = |n: &str| {
+                let i = mechanism.parameters().position(|p| p == n)?;
+                Some(fitted.fit.point.parameters[fitted.setup.model.parameter(&part.instance.names[i])?])
+            };
+            mechanism.require.iter().all(|e| e.eval(&|n, _| value(n)).is_none_or(|v| v >= 0.0))
+        })
+    }
+
+    /// When no single candidate is believable and yet something is missing: the best pairs of those that
+    /// only pay together.
+    fn pair_round(&self, calibrated: &mut Fitted, state: &mut State) -> bool {
+        if state.current.parts.len() + 2 > MOST_MECHANISMS || state.misfit() < PAIR_MISFIT {
+            return false;
+        }
+        let current = state.current.clone();
+        let scale = state.scale.clone();
+        let open: Vec<Candidate> =
+            self.all.iter().filter(|c| !current.parts.iter().any(|p| p.candidate == **c)).cloned().collect();
+        let pairs = screen_pairs(
+            &current.setup,
+            self.library,
+            &open,
+            &current.level,
+            &scale,
+            &current.fit.point,
+            PAIRS,
+        );
+        self.observer.stage(Stage::Fitting { candidates: pairs.len() });
+        let trials: Vec<Fitted> =
+            pairs.par_iter().filter_map(|p| self.extend_by_pair(&current, &open, p, &scale)).collect();
+        let total = |f: &Fitted| f.fit.rss.iter().sum::<f64>();
+        let Some(best) = trials.into_iter().min_by(|a, b| total(a).total_cmp(&total(b))) else { return false };
+        let control = self.control(&current, &best, &scale);
+        let evidence = self.weigh(&control, &best, &scale);
+        let share = (total(&control) - total(&best)) / calibrated_rss(calibrated, &scale).max(1e-300);
+        let (n, first) = (self.all.len() as f64, current.parts.is_empty());
+        let members = &best.parts[best.parts.len() - 2..];
+        for part in members {
+            self.observer.weighed(&self.library[part.candidate.mechanism].kind, &evidence, share);
+        }
+        // There are n²/2 pairs to choose from.
+        let believable = evidence.score > 4.0 * n.max(2.0).ln() + 6.0
+            && members.iter().all(|part| {
+                self.believable(&evidence, &self.library[part.candidate.mechanism], share, first, false)
+            });
+        if !believable {
+            return false;
+        }
+        for part in members {
+            state.accepted.push(Accepted { candidate: part.candidate.clone(), evidence, rivals: Vec::new() });
+        }
+        state.current = best;
+        self.settle(state);
+        state.current.parts.len() >= current.parts.len() + 2
     }
 
     /// Fits `base` plus one candidate.
@@ -578,7 +669,7 @@ impl<'a> Search<'a> {
             if state.misfit() < 1.03 && !self.is_coloured(state, 0.8) && state.current.setup.noise.is_none() {
                 break;
             }
-            if !self.round(calibrated, state) {
+            if !self.round(calibrated, state) && !self.pair_round(calibrated, state) {
                 break;
             }
         }
@@ -710,6 +801,11 @@ impl<'a> Search<'a> {
                 state.accepted.push(Accepted { candidate: winner, evidence, rivals });
             }
         }
+        self.settle(state);
+    }
+
+    /// After an acceptance: the noise or the scale anew, the hold, the mechanisms that no longer pay.
+    fn settle(&self, state: &mut State) {
         if state.current.setup.noise.is_some() {
             state.whiten();
             self.method(&mut state.current, &state.scale);
@@ -812,14 +908,7 @@ impl<'a> Search<'a> {
         scale: &[f64],
     ) -> Option<Fitted> {
         let fitted = self.fitted_trial(current, candidate, scored, scale)?;
-        let mechanism = &self.library[candidate.mechanism];
-        let part = fitted.parts.last()?;
-        let value = |n: &str| {
-            let i = mechanism.parameters().position(|p| p == n)?;
-            Some(fitted.fit.point.parameters[fitted.setup.model.parameter(&part.instance.names[i])?])
-        };
-        let admissible = mechanism.require.iter().all(|e| e.eval(&|n, _| value(n)).is_none_or(|v| v >= 0.0));
-        admissible.then_some(fitted)
+        self.admissible(&fitted).then_some(fitted)
     }
 
     fn fitted_trial(
