@@ -56,11 +56,11 @@ pub fn candidates(model: &Model, library: &[Mechanism], places: &[Place]) -> Vec
                 }
                 _ => false,
             };
-            if fits {
-                out.push(Candidate { mechanism: i, place: place.clone(), mirrored: false });
-                if mechanism.mirror {
-                    out.push(Candidate { mechanism: i, place: place.clone(), mirrored: true });
-                }
+            let candidate = Candidate { mechanism: i, place: place.clone(), mirrored: false };
+            if fits && candidate.has_units(model, mechanism) && !candidate.duplicates(model, mechanism) {
+                let mirror = mechanism.mirror.then(|| Candidate { mirrored: true, ..candidate.clone() });
+                out.push(candidate);
+                out.extend(mirror);
             }
         }
     }
@@ -105,6 +105,50 @@ fn weighted(w: f64, law: Expr) -> Expr {
 }
 
 impl Candidate {
+    /// Whether the model's units admit it (the sine of a length has none).
+    fn has_units(&self, model: &Model, mechanism: &Mechanism) -> bool {
+        let mut with = model.clone();
+        self.insert(&mut with, mechanism, &vec![1.0; mechanism.parameters().count()]);
+        with.resolve_units().is_ok() || model.clone().resolve_units().is_err()
+    }
+
+    /// Whether it is a free parameter of the model under another name: its force is in every equation the
+    /// same multiple of what that parameter multiplies. (Judged at a few arbitrary points.)
+    fn duplicates(&self, model: &Model, mechanism: &Mechanism) -> bool {
+        let [name] = &mechanism.linear[..] else { return false };
+        if !mechanism.states.is_empty() || !mechanism.inner.is_empty() || !mechanism.first.is_empty() {
+            return false;
+        }
+        let mut with = model.clone();
+        let instance = self.insert(&mut with, mechanism, &[0.0]);
+        debug_assert_eq!(mechanism.parameters().next(), Some(name.as_str()));
+        let own = &instance.names[0];
+        let slopes = |of: &str| -> Vec<Expr> {
+            with.equations.iter().map(|e| e.residual().derivative(of, 0).simplify()).collect()
+        };
+        let values = |slopes: &[Expr], point: usize| -> Option<Vec<f64>> {
+            // Arbitrary numbers, the same for a name every time.
+            let value = |n: &str, primes: u8| {
+                let code = n.bytes().fold(7u64 + u64::from(primes), |h, b| (h * 131 + u64::from(b)) % 10_007);
+                Some(0.3 + ((code * (3 + 2 * point as u64)) % 997) as f64 / 997.0)
+            };
+            slopes.iter().map(|e| e.eval(&value)).collect()
+        };
+        let mine = slopes(own);
+        model.parameters.iter().filter(|p| !p.fixed).any(|p| {
+            let theirs = slopes(&p.name);
+            let mut ratio: Option<f64> = None;
+            (0..4).all(|point| {
+                let (Some(a), Some(b)) = (values(&mine, point), values(&theirs, point)) else { return false };
+                let here = a.iter().zip(&b).find(|(a, _)| **a != 0.0).map(|(a, b)| b / a);
+                let Some(r) = here.filter(|r| *r != 0.0) else { return false };
+                let same = *ratio.get_or_insert(r);
+                (r / same - 1.0).abs() < 1e-9
+                    && a.iter().zip(&b).all(|(a, b)| (b - r * a).abs() <= 1e-9 * b.abs().max(1e-12))
+            })
+        })
+    }
+
     /// The motion it acts on, where it acts on one.
     pub fn motion(&self) -> Option<&Motion> {
         match &self.place {

@@ -384,8 +384,8 @@ fn conclude(
     let full: f64 = raw_rss(&improved, &found.scale).iter().sum();
     let base = search.rss_at(&calibrated, &improved, &found.scale);
     let left = Left::of(&improved, &found.scale, surface.as_ref(), base);
-    let verdict = left.verdict(improved.parts.len());
-    let significant = left.significant(improved.parts.len());
+    let verdict = if is_patchwork(&improved) { Verdict::Unexplained } else { left.verdict(improved.parts.len()) };
+    let significant = left.significant(improved.parts.len()) || verdict == Verdict::Unexplained;
     let mut mechanisms = if verdict == Verdict::MissingPhysics {
         findings(&improved, &found, &nominal.model, library, search, &scale, base, full, &train_role, &uncertainty)
     } else {
@@ -632,6 +632,15 @@ fn figure(
     Some(Estimate { value: v, ci95: Some((v - w, v + w)) })
 }
 
+/// Three or more forces on one and the same motion: a list that describes some other law piece by piece.
+fn is_patchwork(improved: &Fitted) -> bool {
+    let motions: Vec<_> = improved.parts.iter().filter_map(|p| p.candidate.motion()).collect();
+    motions.iter().any(|m| motions.iter().filter(|o| o.coefficients == m.coefficients).count() >= PATCHES)
+}
+
+/// Forces on one motion that make a patchwork.
+const PATCHES: usize = 3;
+
 /// What the improved model leaves over.
 struct Left {
     /// Largest residual RMS over the noise.
@@ -776,10 +785,21 @@ fn findings(
                 .iter()
                 .filter_map(|(name, e)| Some((name.clone(), figure(improved, uncertainty, mechanism, part, e)?)))
                 .collect();
+            // Where the data cannot tell at which of several places it acts, all are named.
+            let mut places = part.candidate.place.equations(nominal);
+            for rival in rivals.iter().filter(|r| r.equivalent) {
+                if library[rival.candidate.mechanism].kind == mechanism.kind {
+                    for name in rival.candidate.place.equations(nominal) {
+                        if !places.contains(&name) {
+                            places.push(name);
+                        }
+                    }
+                }
+            }
             Finding {
                 kind: mechanism.kind.clone(),
                 signature: mechanism.about.signature.clone(),
-                equations: part.candidate.place.equations(nominal),
+                equations: places,
                 channel,
                 input,
                 drifting,
@@ -929,6 +949,13 @@ fn remainder(improved: &Fitted, surface: Option<Surface>, significant: bool, lef
                 m,
                 match (&m.position, &m.rate) {
                     (Some(d), Some(v)) => Some(format!("a force that depends on {d} and {v} together")),
+                    _ => None,
+                },
+            ),
+            Variable::Product(m, o) => (
+                m,
+                match (&m.position, &o.position) {
+                    (Some(d), Some(o)) => Some(format!("a force that depends on {d} and {o} together")),
                     _ => None,
                 },
             ),

@@ -956,6 +956,10 @@ pub fn screen(
             }
             Some(scalable) => {
                 let c = regressed.coefficients[0];
+                if scalable {
+                    let fifth: Vec<f64> = variant.inner.iter().map(|v| 0.2 * v * c.min(1.0)).collect();
+                    faint = mechanism.values(&[], &fifth);
+                }
                 if scalable && c < 3.0 {
                     let inner: Vec<f64> = variant.inner.iter().map(|v| v * c).collect();
                     (regressed.gain, mechanism.values(&[], &inner))

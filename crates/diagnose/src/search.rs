@@ -28,12 +28,14 @@ const CLEAR: f64 = 1.35;
 /// Most samples that a level of the search looks at; longer recordings are seen through windows.
 const MOST_SAMPLES: usize = 9000;
 /// Most mechanisms that are looked for.
-const MOST_MECHANISMS: usize = 5;
+const MOST_MECHANISMS: usize = 4;
 /// Most candidates that are fitted per round.
 const SHORT_LIST: usize = 9;
 /// Pairs that are fitted when no single candidate pays, and the residual over noise that calls for them.
 const PAIRS: usize = 4;
 const PAIR_MISFIT: f64 = 1.1;
+/// Two explanations whose scores differ by less stay undecided.
+const UNDECIDED: f64 = 3.0;
 /// Log-likelihood gain that another hold must bring.
 const HOLD_GAIN: f64 = 10.0;
 /// A simpler model wins when its score is no further behind than this.
@@ -665,12 +667,18 @@ impl<'a> Search<'a> {
 
     /// One level: rounds until nothing more is believable.
     fn level(&self, calibrated: &mut Fitted, state: &mut State) {
+        let mut seen: Vec<Vec<Candidate>> = Vec::new();
         while state.current.parts.len() < MOST_MECHANISMS {
             if state.misfit() < 1.03 && !self.is_coloured(state, 0.8) && state.current.setup.noise.is_none() {
                 break;
             }
+            let before = state.candidates();
             if !self.round(calibrated, state) && !self.pair_round(calibrated, state) {
                 break;
+            }
+            seen.push(before);
+            if seen.contains(&state.candidates()) {
+                break; // what was accepted has been dropped again
             }
         }
     }
@@ -833,9 +841,13 @@ impl<'a> Search<'a> {
     /// stand in its stead? The better (or the simpler of equals) takes its place; the others are the
     /// alternatives of the report.
     fn reconsider(&self, calibrated: &Fitted, state: &mut State) {
-        for index in 0..state.current.parts.len() {
-            let Some(base) = self.without(&state.current, index, &state.scale, 12) else { continue };
-            let part = state.current.parts[index].clone();
+        let mut index = 0;
+        let mut relieved = 0;
+        while index < state.current.parts.len() {
+            let at = index;
+            index += 1;
+            let Some(base) = self.without(&state.current, at, &state.scale, 12) else { continue };
+            let part = state.current.parts[at].clone();
             let taken = |c: &Candidate| base.parts.iter().any(|p| p.candidate == *c);
             let open: Vec<Candidate> = self.all.iter().filter(|c| !taken(c)).cloned().collect();
             self.observer.stage(Stage::Screening { candidates: open.len(), found: base.parts.len() });
@@ -862,9 +874,16 @@ impl<'a> Search<'a> {
             if let Some(own) = open.iter().position(|c| *c == part.candidate) {
                 // The fit that stands, its part at the end like that of the others.
                 let mut standing = state.current.clone();
-                standing.parts.remove(index);
+                standing.parts.remove(at);
                 standing.parts.push(part.clone());
                 trials.push((own, standing));
+            }
+            // Of those that fit as well: one that makes another mechanism superfluous.
+            if relieved < MOST_MECHANISMS && self.relieve(&base, state, &open, &trials, &part) {
+                // From the first again: fewer mechanisms, other alternatives.
+                relieved += 1;
+                index = 0;
+                continue;
             }
             let Some((winner, chosen, rivals, evidence)) =
                 self.decide(calibrated, &base, &open, trials, &state.scale)
@@ -893,10 +912,42 @@ impl<'a> Search<'a> {
             }
             state.accepted.retain(|a| a.candidate != part.candidate);
             self.accept(state, winner, chosen, rivals, evidence);
-            if index >= state.current.parts.len() {
-                break;
+        }
+    }
+
+    /// Takes over a trial that fits nearly as well as the standing one and lets another mechanism go.
+    fn relieve(
+        &self,
+        base: &Fitted,
+        state: &mut State,
+        open: &[Candidate],
+        trials: &[(usize, Fitted)],
+        standing: &Part,
+    ) -> bool {
+        if state.current.parts.len() < 2 {
+            return false;
+        }
+        let best: f64 = state.current.fit.rss.iter().sum();
+        for (c, trial) in trials {
+            let near = trial.fit.rss.iter().sum::<f64>() < 1.02 * best;
+            if !near || open[*c] == standing.candidate || trial.parts.len() != state.current.parts.len() {
+                continue;
+            }
+            for index in 0..trial.parts.len() - 1 {
+                let Some(smaller) = self.without(trial, index, &state.scale, 12) else { continue };
+                let e = self.weigh(&smaller, &state.current, &state.scale);
+                if e.score > PARSIMONY || e.drop > 0.02 {
+                    continue;
+                }
+                let evidence = self.weigh(base, trial, &state.scale);
+                state.accepted.retain(|a| smaller.parts.iter().any(|p| p.candidate == a.candidate));
+                state.accepted.push(Accepted { candidate: open[*c].clone(), evidence, rivals: Vec::new() });
+                state.current = smaller;
+                self.settle(state);
+                return true;
             }
         }
+        false
     }
 
     /// Fits a candidate: added, or in place of the relative that it refines.
@@ -1044,8 +1095,11 @@ impl<'a> Search<'a> {
         let rivals = weighed
             .into_iter()
             .filter_map(|(c, f, e)| {
-                let equivalent = complexity(&f) <= complexity(&fitted)
+                // The data cannot separate what fits as well with no more parameters, nor what the evidence
+                // leaves at odds that no one would bet on.
+                let as_good = complexity(&f) <= complexity(&fitted)
                     && f.fit.rss.iter().zip(&fitted.fit.rss).all(|(x, y)| *x < 1.005 * y);
+                let equivalent = as_good || (e.score - evidence.score).abs() < UNDECIDED;
                 let instance = f.parts.last()?.instance.clone();
                 Some(Rival { candidate: open[c].clone(), instance, evidence: e, equivalent })
             })
@@ -1062,7 +1116,12 @@ impl<'a> Search<'a> {
                 continue;
             };
             let e = self.weigh(&smaller, &state.current, &state.scale);
-            let least = if e.whitened { 0.003 } else { 0.01 };
+            // A little less than what it takes to be accepted, or rounds would go in circles.
+            let least = match (e.whitened, e.kappa > 0.8) {
+                (true, _) => 0.0025,
+                (false, true) => 0.004,
+                (false, false) => 0.01,
+            };
             if e.score < 10.0 || e.drop < least {
                 let gone = state.current.parts[index].candidate.clone();
                 self.observer.dropped(&self.library[gone.mechanism].kind);
@@ -1089,6 +1148,10 @@ struct State {
 }
 
 impl State {
+    fn candidates(&self) -> Vec<Candidate> {
+        self.current.parts.iter().map(|p| p.candidate.clone()).collect()
+    }
+
     /// Largest residual RMS over the noise.
     fn misfit(&self) -> f64 {
         rms(&self.current.fit, &self.scale).iter().zip(&self.sigma).map(|(r, s)| r / s).fold(0.0, f64::max)

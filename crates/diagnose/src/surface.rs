@@ -1,7 +1,8 @@
 //! The non-parametric rival: forces of free shape, to see whether anything systematic is left.
 //!
-//! Piecewise linear functions of the motion d (7 knots), of d' (7), of both (5 × 5), of each input (7),
-//! and of slow time (6 knots × \[1, d, d'\]) are injected like any candidate. What they explain on folds
+//! Piecewise linear functions of the motion d (7 knots), of d' (7), of both (5 × 5), of their product (15),
+//! of its product with another motion (9), of each input (7) and its products with d and d' (7), and of slow
+//! time (6 knots × \[1, d, d'\]) are injected like any candidate. What they explain on folds
 //! they were not fitted to is force that acts on the machine and has a shape; noise gains nothing.
 
 use std::sync::Arc;
@@ -38,7 +39,9 @@ pub enum Variable {
     Rate(Motion),
     /// Both.
     Both(Motion),
-    /// An input, acting where the motion acts.
+    /// The product of two motions, acting on the first.
+    Product(Motion, Motion),
+    /// An input (or its product with the motion), acting where the motion acts.
     Input(usize, Motion),
     /// Slow time.
     Time(Motion),
@@ -82,6 +85,9 @@ pub fn test(setup: &Setup, level: &Level, scale: &[f64], point: &Point) -> Optio
         };
         let (d, v) = (eval(&motion.position), eval(&motion.rate));
         let mut push = |variable: Variable, made: Vec<Vec<Vec<f64>>>| {
+            if made.is_empty() {
+                return;
+            }
             let first = columns.len();
             columns.extend(made.into_iter().map(|series| (motion.weights.clone(), series)));
             groups.push((variable, first..columns.len()));
@@ -116,9 +122,25 @@ pub fn test(setup: &Setup, level: &Level, scale: &[f64], point: &Point) -> Optio
             }
             push(Variable::Both(motion.clone()), both);
         }
+        let times_series = |a: &[Vec<f64>], b: &[Vec<f64>]| -> Vec<Vec<f64>> {
+            a.iter().zip(b).map(|(a, b)| a.iter().zip(b).map(|(a, b)| a * b).collect()).collect()
+        };
+        if let (Some(d), Some(v)) = (&d, &v) {
+            push(Variable::Both(motion.clone()), shapes(&times_series(d, v), 15));
+        }
+        for other in &motions {
+            if other != motion
+                && let (Some(d), Some(o)) = (&d, eval(&other.position))
+            {
+                push(Variable::Product(motion.clone(), other.clone()), shapes(&times_series(d, &o), 9));
+            }
+        }
         for u in 0..setup.system.nu {
             let series: Vec<Vec<f64>> = pieces.iter().map(|p| p.inputs[u].clone()).collect();
             push(Variable::Input(u, motion.clone()), shapes(&series, 7));
+            for of in [&d, &v].into_iter().flatten() {
+                push(Variable::Input(u, motion.clone()), shapes(&times_series(&series, of), 7));
+            }
         }
         let times: Vec<Vec<f64>> =
             pieces.iter().map(|p| (0..p.len).map(|k| p.start + k as f64 * p.dt).collect()).collect();
