@@ -89,6 +89,21 @@ impl On {
         }
     }
 
+    /// As a file writes it.
+    pub fn name(self) -> &'static str {
+        match self {
+            On::Motion => "motion",
+            On::Equation => "equation",
+            On::Input => "input",
+            On::Measurement => "measurement",
+            On::Parameter => "parameter",
+            On::Spring => "spring",
+            On::Feedback => "feedback",
+            On::Pair => "pair",
+            On::Load => "load",
+        }
+    }
+
     /// Whether its law stands in for something (else it is a force that is added).
     pub fn replaces(self) -> bool {
         matches!(self, On::Input | On::Measurement | On::Parameter | On::Spring | On::Feedback)
@@ -972,6 +987,11 @@ fn first_value(text: &str, name: &str) -> Result<First, Fault> {
 }
 
 static BUILT_IN: &[(&str, &str)] = include!(concat!(env!("OUT_DIR"), "/mechanisms.rs"));
+
+/// The file names of the built-in library, in the order of [`built_in`].
+pub fn built_in_files() -> impl Iterator<Item = &'static str> {
+    BUILT_IN.iter().map(|(file, _)| *file)
+}
 
 /// The built-in library, in the order of the file names.
 ///
