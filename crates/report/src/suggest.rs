@@ -39,7 +39,7 @@ pub struct InputRange {
 }
 
 /// What is known of the mechanism.
-#[derive(Debug, Clone, Copy)]
+#[derive(Clone, Copy)]
 pub struct Subject<'a> {
     /// Kind.
     pub kind: &'a str,
