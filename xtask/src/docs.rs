@@ -162,7 +162,8 @@ fn index(kinds: &[Kind]) -> Result<String> {
                 0 => format!("[{}](mechanisms/{}.md)", format::kind(&kind.name), kind.name),
                 _ => String::new(),
             };
-            writeln!(page, "| {name} | {} | `{}` |", m.on.name(), m.law)?;
+            let states: Vec<String> = m.states.iter().map(|s| format!(", `{} = {}`", s.lhs, s.rhs)).collect();
+            writeln!(page, "| {name} | {} | `{}`{} |", m.on.name(), m.law, states.concat())?;
         }
     }
     write!(
@@ -197,7 +198,7 @@ mod tests {
     fn every_kind_has_a_page_that_shows_it_in_the_example() {
         for kind in kinds().unwrap() {
             let page = kind::page(&kind, &[]).unwrap();
-            assert_eq!(page.matches("```toml").count(), kind.forms.len(), "{page}");
+            assert_eq!(page.matches("```toml,part").count(), kind.forms.len(), "{page}");
             for (file, m) in &kind.forms {
                 for parameter in m.parameters() {
                     assert!(page.contains(&format!("| `{parameter}` | ")), "{file}: {parameter}");

@@ -25,7 +25,8 @@ pub(super) fn page(kind: &Kind, all: &[Kind]) -> Result<String> {
     }
     for (file, m) in &kind.forms {
         if kind.forms.len() > 1 {
-            write!(page, "\n## `{}`\n", m.law)?;
+            let reaction = m.reaction.as_ref().map_or_else(String::new, |e| format!(" and `{e}`"));
+            write!(page, "\n## `{}`{reaction}\n", m.law)?;
         }
         form(&mut page, file, m, all)?;
     }
@@ -64,7 +65,7 @@ fn form(page: &mut String, file: &str, m: &Mechanism, all: &[Kind]) -> Result<()
     let lines = changed_lines(m).with_context(|| file.to_owned())?;
     write!(
         page,
-        "\n**In `improved.toml`,** found in the [example](../mechanisms.md#the-example) (values left out):\n\n```toml\n{lines}```\n\nSource: `crates/diagnose/mechanisms/{file}`.\n"
+        "\n**In `improved.toml`,** found in the [example](../mechanisms.md#the-example) (new lines, without the parameters):\n\n```toml,part\n{lines}```\n\nSource: `crates/diagnose/mechanisms/{file}`.\n"
     )?;
     Ok(())
 }
@@ -113,7 +114,7 @@ fn inserted(m: &Mechanism) -> Result<(Model, Vec<String>)> {
     Ok((model, instance.names))
 }
 
-/// The lines of the improved model that the example does not have, parameters apart.
+/// The lines of the improved model that the example does not have, under their sections; parameters apart.
 fn changed_lines(m: &Mechanism) -> Result<String> {
     let (model, names) = inserted(m)?;
     let text = model.to_toml(&WriteOptions { original: Some(EXAMPLE), comments: &[] });
@@ -121,8 +122,21 @@ fn changed_lines(m: &Mechanism) -> Result<String> {
     let old: Vec<&str> = EXAMPLE.lines().collect();
     let parameter =
         |line: &str| line.split('=').next().is_some_and(|key| names.iter().any(|n| n == key.trim()));
-    let new = text.lines().filter(|line| !line.trim().is_empty() && !old.contains(line) && !parameter(line));
-    Ok(new.map(|line| format!("{line}\n")).collect())
+    let (mut lines, mut section) = (String::new(), None);
+    for line in text.lines().filter(|line| !line.trim().is_empty()) {
+        if line.starts_with('[') {
+            section = Some(line);
+        } else if !old.contains(&line) && !(section == Some("[parameters]") && parameter(line)) {
+            if let Some(header) = section.take() {
+                lines.push_str(if lines.is_empty() { "" } else { "\n" });
+                lines.push_str(header);
+                lines.push('\n');
+            }
+            lines.push_str(line);
+            lines.push('\n');
+        }
+    }
+    Ok(lines)
 }
 
 fn parameters(page: &mut String, m: &Mechanism) -> Result<()> {
@@ -215,10 +229,8 @@ fn found(m: &Mechanism) -> String {
         also.push(format!("`{e}` cannot be negative."));
     }
     if m.surcharge > 0.0 {
-        also.push(format!(
-            "It pays a surcharge of {} parameters for its freedom to mimic others.",
-            m.surcharge
-        ));
+        let s = if m.surcharge == 1.0 { "" } else { "s" };
+        also.push(format!("Its freedom to mimic others counts as {} parameter{s} more.", m.surcharge));
     }
     if !m.equals.is_empty() {
         let parts: Vec<String> = m
@@ -237,7 +249,7 @@ fn found(m: &Mechanism) -> String {
 
 fn located(m: &Mechanism) -> String {
     let Some(region) = &m.region else {
-        return "where its force departs from what the model's linear terms could take up: instants, range of its variable and frequency band.".to_owned();
+        return "where its effect departs from what the model's linear terms could take up: instants, range of its variable and frequency band.".to_owned();
     };
     let range = match (&region.low, &region.high) {
         (Some(low), Some(high)) => format!("`{low}` ≤ `{}` ≤ `{high}`", region.variable),
