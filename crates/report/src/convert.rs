@@ -596,3 +596,57 @@ fn plots(d: &Diagnosis) -> Vec<MechanismPlot> {
         })
         .collect()
 }
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn figures_have_their_units() {
+        let units = ["f0", "f0_hub", "zeta", "breakaway", "f01"].map(figure_unit);
+        assert_eq!(units, ["Hz", "Hz", "1", "", ""]);
+    }
+
+    #[test]
+    fn a_mechanism_is_told_with_its_figures_and_what_drifts() {
+        let one = |value| Estimated { value, ci95: Some((0.9 * value, 1.1 * value)) };
+        let found = Found {
+            kind: "unmodeled_resonance".into(),
+            signature: String::new(),
+            equations: vec!["fall".into()],
+            channel: None,
+            input: None,
+            drifting: Some("g".into()),
+            expression: "ka*(z - a)".into(),
+            parameters: vec![("g".into(), 0, one(9.81))],
+            figures: vec![("f0".into(), one(4.0)), ("zeta".into(), one(0.02))],
+            share_explained: 0.5,
+            confidence: 0.9,
+            alternatives: vec![greybox_diagnose::diagnosis::Alternative {
+                kind: "actuator_lag".into(),
+                confidence: 0.1,
+                equivalent: false,
+                expression: String::new(),
+                separate: "a sine sweep".into(),
+            }],
+            location: Located::default(),
+            evidence: greybox_diagnose::evidence::Evidence::NONE,
+            curve: None,
+        };
+        let text = "[inputs]\nu = { unit = \"m/s^2\" }\n[states]\nz = { unit = \"m\" }\n[parameters]\n\
+                    g = { value = 9.81, unit = \"m/s^2\" }\n[equations]\nfall = \"z'' = u - g\"\n";
+        let model = Model::from_toml(text, "fall.toml").unwrap();
+        let inputs = vec![InputRange { name: "u".into(), unit: "m/s^2".into(), rms: 0.5, largest: 1.0 }];
+        let basis = Basis { inputs, dt: 0.01, duration: 10.0, ..Basis::default() };
+        let told = mechanism(&found, &model, &basis);
+        assert_eq!(told.drifting.as_deref(), Some("g"));
+        let units: Vec<(&str, &str)> =
+            told.parameters.iter().map(|(n, e)| (n.as_str(), e.unit.as_str())).collect();
+        assert_eq!(units, [("g", "m/s^2"), ("f0", "Hz"), ("zeta", "1")]);
+        assert_eq!(told.parameters["f0"].ci95, Some(Interval::new(3.6, 4.4)));
+        let experiment = told.experiment.unwrap();
+        assert_eq!(experiment.input.as_deref(), Some("u"), "the input of the equation");
+        let band = experiment.band_hz.unwrap();
+        assert!(band.low < 4.0 && 4.0 < band.high, "around f0: {band:?}");
+    }
+}

@@ -304,9 +304,10 @@ fn mechanism(windows: Vec<Interval>) -> Mechanism {
             },
         ],
         experiment: Some(Experiment {
-            text: "drive v slowly, up to 3.5 V as now, 0.025 to 0.2 Hz, through |θ′| < 0.6: a slow sweep of v \
+            text:
+                "drive v slowly, up to 3.5 V as now, 0.025 to 0.2 Hz, through |θ′| < 0.6: a slow sweep of v \
                    through zero velocity"
-                .to_owned(),
+                    .to_owned(),
             input: Some("v".to_owned()),
             amplitude: Some(Interval::new(0.0, 3.5)),
             band_hz: Some(Interval::new(0.025, 0.2)),
