@@ -113,13 +113,7 @@ fn basis(d: &Diagnosis) -> Basis {
         }
         first += state.order;
     }
-    let seconds = data.pieces.iter().map(|p| p.len.saturating_sub(1) as f64 * p.dt);
-    Basis {
-        inputs: inputs.collect(),
-        coordinates,
-        duration: seconds.fold(0.0, f64::max),
-        dt: data.pieces.iter().map(|p| p.dt).fold(0.0, f64::max),
-    }
+    Basis { inputs: inputs.collect(), coordinates, dt: data.pieces.iter().map(|p| p.dt).fold(0.0, f64::max) }
 }
 
 /// The input that stands in the first of these equations that has one.
@@ -138,8 +132,8 @@ fn remainder_plan(d: &Diagnosis, basis: &Basis) -> Option<Experiment> {
 
 /// The experiment that separates a mechanism from its alternatives, if it has any.
 fn plan(found: &Found, improved: &Model, basis: &Basis) -> Option<Experiment> {
-    let separate = found.alternatives.iter().map(|a| a.separate.as_str()).find(|s| !s.is_empty());
-    let separate = separate.or_else(|| found.alternatives.first().map(|_| ""))?;
+    let told = found.alternatives.iter().find(|a| !a.separate.is_empty());
+    let rival = told.or(found.alternatives.first())?;
     let value = |name: &str| {
         // In the model a name may carry the equation's behind it.
         let is =
@@ -156,7 +150,14 @@ fn plan(found: &Found, improved: &Model, basis: &Basis) -> Option<Experiment> {
         |name: &str| value(name).map(|v| if matches!(name, "udz" | "usat") { v / factor } else { v });
     let location = location(&found.location);
     Some(suggest::experiment(
-        &Subject { kind: &found.kind, input, location: &location, value: &scaled, separate },
+        &Subject {
+            kind: &found.kind,
+            rival: &rival.kind,
+            input,
+            location: &location,
+            value: &scaled,
+            separate: &rival.separate,
+        },
         basis,
     ))
 }
@@ -637,7 +638,7 @@ mod tests {
                     g = { value = 9.81, unit = \"m/s^2\" }\n[equations]\nfall = \"z'' = u - g\"\n";
         let model = Model::from_toml(text, "fall.toml").unwrap();
         let inputs = vec![InputRange { name: "u".into(), unit: "m/s^2".into(), rms: 0.5, largest: 1.0 }];
-        let basis = Basis { inputs, dt: 0.01, duration: 10.0, ..Basis::default() };
+        let basis = Basis { inputs, dt: 0.01, ..Basis::default() };
         let told = mechanism(&found, &model, &basis);
         assert_eq!(told.drifting.as_deref(), Some("g"));
         let units: Vec<(&str, &str)> =

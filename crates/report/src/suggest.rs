@@ -19,10 +19,16 @@ pub struct Basis {
     pub inputs: Vec<InputRange>,
     /// Range of each simulated coordinate, in the units of [`Location::region`].
     pub coordinates: Ordered<[f64; 2]>,
-    /// Length of the longest recording, s.
-    pub duration: f64,
     /// Sample interval, s.
     pub dt: f64,
+}
+
+impl Basis {
+    /// The input of this name, else the only one.
+    fn input(&self, name: Option<&str>) -> Option<&InputRange> {
+        let only = || self.inputs.first().filter(|_| self.inputs.len() == 1);
+        self.inputs.iter().find(|i| Some(i.name.as_str()) == name).or_else(only)
+    }
 }
 
 /// What the recordings hold of one input.
@@ -43,6 +49,8 @@ pub struct InputRange {
 pub struct Subject<'a> {
     /// Kind.
     pub kind: &'a str,
+    /// The rival that the experiment is about; empty where there is none.
+    pub rival: &'a str,
     /// The input that reaches it, where one is known.
     pub input: Option<&'a str>,
     /// Where it acts.
@@ -58,6 +66,8 @@ pub struct Subject<'a> {
 enum Way {
     /// Slowly, up to the present amplitude.
     Slow,
+    /// Slowly, and further than now.
+    Wide,
     /// As now, and louder.
     Loud,
     /// Around a frequency, Hz.
@@ -74,28 +84,33 @@ enum Way {
     AsNow,
 }
 
+/// What the rival asks for, as far as its figures are known; else what the mechanism itself does.
 fn way(subject: &Subject<'_>) -> Way {
+    match way_of(subject.rival, subject) {
+        Way::AsNow => way_of(subject.kind, subject),
+        found => found,
+    }
+}
+
+fn way_of(kind: &str, subject: &Subject<'_>) -> Way {
     let corner = |name: &str| {
         let time = (subject.value)(name).filter(|v| *v > 0.0);
         time.map_or(Way::AsNow, |time| Way::Around(1.0 / (2.0 * PI * time)))
     };
     let threshold = |name: &str, of: fn(f64) -> Way| (subject.value)(name).map_or(Way::AsNow, of);
-    match subject.kind {
+    match kind {
         "coulomb_friction"
         | "asymmetric_coulomb_friction"
         | "stribeck_friction"
         | "presliding_friction"
         | "viscous_friction"
         | "load_dependent_friction"
-        | "linear_stiffness"
         | "dead_zone"
         | "end_stop"
         | "bouc_wen_hysteresis"
-        | "gravity"
         | "cogging" => Way::Slow,
-        "quadratic_drag" | "quadratic_stiffness" | "cubic_stiffness" | "position_dependent_inertia" => {
-            Way::Loud
-        }
+        "linear_stiffness" | "quadratic_stiffness" | "cubic_stiffness" | "gravity" => Way::Wide,
+        "quadratic_drag" | "position_dependent_inertia" => Way::Loud,
         "actuator_lag" => corner("ta"),
         "input_delay" => corner("tau"),
         "sensor_delay" => corner("tsd"),
@@ -111,28 +126,25 @@ fn way(subject: &Subject<'_>) -> Way {
 
 /// The experiment for a mechanism.
 pub fn experiment(subject: &Subject<'_>, basis: &Basis) -> Experiment {
-    let input = basis
-        .inputs
-        .iter()
-        .find(|i| Some(i.name.as_str()) == subject.input)
-        .or_else(|| basis.inputs.first().filter(|_| basis.inputs.len() == 1));
+    let input = basis.input(subject.input);
     let way = way(subject);
     let largest = input.map_or(0.0, |i| i.largest);
     let amplitude = match way {
         Way::Slow => Some([0.0, largest]),
-        Way::Loud => Some([largest, LOUDER * largest]),
+        Way::Wide | Way::Loud => Some([largest, LOUDER * largest]),
         Way::Around(_) | Way::AsNow => input.map(|i| [i.rms, i.largest]),
         Way::Silent => Some([0.0, 0.0]),
         Way::Again => Some([largest, largest]),
         Way::Ramp(end) => Some([0.0, end]),
         Way::Beyond(start) => Some([start, LOUDER * start.max(largest)]),
     };
-    let region = subject.location.region.iter().next();
+    // Time is not for the experimenter to pass through; with the input at zero nothing else is either.
+    let region = subject.location.region.iter().next().filter(|(name, _)| *name != "t" && way != Way::Silent);
     let band = match way {
         Way::Slow => slow_band(region, basis),
         Way::Around(f) => decade(f, basis),
         Way::Loud | Way::AsNow => subject.location.band_hz.map(|b| [b.low, b.high]),
-        Way::Silent | Way::Again | Way::Ramp(_) | Way::Beyond(_) => None,
+        Way::Wide | Way::Silent | Way::Again | Way::Ramp(_) | Way::Beyond(_) => None,
     };
     let mut found = Experiment {
         text: String::new(),
@@ -151,12 +163,8 @@ pub fn for_remainder(location: &Location, input: Option<&str>, basis: &Basis, sh
     let separate = format!(
         "the residual looks like {shape}: slow sweeps over the whole range of that variable, at two amplitudes"
     );
-    let subject = Subject { kind: "", input, location, value: &|_| None, separate: &separate };
-    let input = basis
-        .inputs
-        .iter()
-        .find(|i| Some(i.name.as_str()) == subject.input)
-        .or_else(|| basis.inputs.first().filter(|_| basis.inputs.len() == 1));
+    let subject = Subject { kind: "", rival: "", input, location, value: &|_| None, separate: &separate };
+    let input = basis.input(subject.input);
     let mut found = experiment(&subject, basis);
     found.amplitude = input.and_then(|i| interval([i.largest, LOUDER * i.largest]));
     found.text = words(Way::Loud, &found, input, &separate);
@@ -167,9 +175,8 @@ fn interval([low, high]: [f64; 2]) -> Option<Interval> {
     (low.is_finite() && high.is_finite() && low <= high).then(|| Interval::new(low, high))
 }
 
-/// From one period in the longest recording to where a sine over the present range would leave the region of
-/// rates: a sine of amplitude A and frequency f has the largest rate 2π f A. Without such a region, one
-/// period in the longest recording is all that is known to be slow.
+/// Up to where a sine over the present range would leave the region of rates: a sine of amplitude A and
+/// frequency f has the largest rate 2π f A. Nothing without such a region.
 fn slow_band(region: Option<(&String, &[Option<f64>; 2])>, basis: &Basis) -> Option<[f64; 2]> {
     let (name, [low, high]) = region?;
     let range = basis.coordinates.get(name.strip_suffix('\'')?)?;
@@ -178,8 +185,7 @@ fn slow_band(region: Option<(&String, &[Option<f64>; 2])>, basis: &Basis) -> Opt
         _ => return None,
     };
     let top = rate / (PI * (range[1] - range[0]));
-    let bottom = (1.0 / basis.duration).min(top);
-    (top > 0.0 && bottom > 0.0).then_some([bottom, top])
+    (top > 0.0).then_some([0.0, top])
 }
 
 /// The decade around a frequency, as far as the sample interval shows it.
@@ -203,6 +209,7 @@ fn words(way: Way, e: &Experiment, input: Option<&InputRange>, separate: &str) -
         let (low, high) = (size(amplitude.low), size(amplitude.high));
         text = match way {
             Way::Slow => format!("drive {name} slowly, up to {high} as now"),
+            Way::Wide => format!("drive {name} slowly, from {low} as now up to {high}"),
             Way::Loud => format!("drive {name} as now, {low}, and at up to {high}"),
             Way::Around(_) => format!("sweep {name} as a sine of {low} to {high}"),
             Way::AsNow => format!("drive {name} with {low} to {high}"),
@@ -212,14 +219,19 @@ fn words(way: Way, e: &Experiment, input: Option<&InputRange>, separate: &str) -
             Way::Beyond(_) => format!("step {name} from {low} up to {high}"),
         };
         if let Some(band) = e.band_hz {
-            text.push_str(&format!(", {} to {} Hz", format::plain(band.low), format::plain(band.high)));
+            let (low, high) = (format::plain(band.low), format::plain(band.high));
+            text.push_str(&match band.low > 0.0 {
+                true => format!(", {low} to {high} Hz"),
+                false => format!(", below {high} Hz"),
+            });
         }
         if let (Some(variable), Some(range)) = (&e.variable, e.range)
             && !matches!(way, Way::Silent | Way::Ramp(_) | Way::Beyond(_))
         {
             let one = Ordered::from_iter([(variable.clone(), range)]);
             for condition in crate::sentence::region(&one) {
-                text.push_str(&format!(", through {condition}"));
+                let through = if way == Way::Wide { "beyond" } else { "through" };
+                text.push_str(&format!(", {through} {condition}"));
             }
         }
     }
@@ -238,7 +250,6 @@ mod tests {
         Basis {
             inputs: vec![InputRange { name: "v".into(), unit: "V".into(), rms: 1.0, largest: 2.0 }],
             coordinates: Ordered::from_iter([("theta".to_owned(), [-0.5, 0.5])]),
-            duration: 20.0,
             dt: 0.01,
         }
     }
@@ -248,7 +259,14 @@ mod tests {
         let location = Location { region, band_hz: Some(Interval::new(0.5, 3.0)), ..Location::default() };
         let value = |name: &str| values.iter().find(|v| v.0 == name).map(|v| v.1);
         experiment(
-            &Subject { kind, input: Some("v"), location: &location, value: &value, separate: "look." },
+            &Subject {
+                kind,
+                rival: "",
+                input: Some("v"),
+                location: &location,
+                value: &value,
+                separate: "look.",
+            },
             &basis(),
         )
     }
@@ -262,10 +280,10 @@ mod tests {
     fn friction_asks_for_slow_motion_that_stays_in_its_region() {
         let e = ask("stribeck_friction", &[("theta'", [Some(-0.4), Some(0.4)])], &[]);
         near(e.amplitude, [0.0, 2.0]);
-        // A sine of amplitude 0.5 with rate 0.4 has 0.4/(2 pi 0.5) Hz; one period in 20 s is 0.05 Hz.
-        near(e.band_hz, [0.05, 0.4 / PI]);
+        // A sine of amplitude 0.5 and rate 0.4 has 0.4/(2 pi 0.5) Hz.
+        near(e.band_hz, [0.0, 0.4 / PI]);
         assert_eq!((e.variable.as_deref(), e.range), (Some("theta'"), Some([Some(-0.4), Some(0.4)])));
-        assert_eq!(e.text, "drive v slowly, up to 2 V as now, 0.05 to 0.127 Hz, through |θ′| < 0.4: look");
+        assert_eq!(e.text, "drive v slowly, up to 2 V as now, below 0.127 Hz, through |θ′| < 0.4: look");
         assert_eq!(
             ask("gravity", &[("theta", [Some(-1.0), Some(1.0)])], &[]).band_hz,
             None,
@@ -294,10 +312,24 @@ mod tests {
     }
 
     #[test]
+    fn the_rival_says_what_to_do() {
+        let (location, b) = (Location::default(), basis());
+        let subject = |kind, rival| {
+            experiment(
+                &Subject { kind, rival, input: None, location: &location, value: &|_| None, separate: "" },
+                &b,
+            )
+        };
+        assert_eq!(subject("step_disturbance", "periodic_disturbance").text, "record with v at zero");
+        assert_eq!(subject("step_disturbance", "my_own").text, "record the same again, v up to 2 V");
+    }
+
+    #[test]
     fn without_an_input_the_words_remain() {
         let location = Location::default();
         let subject = Subject {
             kind: "gravity",
+            rival: "",
             input: None,
             location: &location,
             value: &|_| None,
