@@ -21,7 +21,7 @@ pub(super) fn page(kind: &Kind, all: &[Kind]) -> Result<String> {
         kind.family().replace('_', " ")
     );
     if kind.forms.len() > 1 {
-        write!(page, "It has {} forms; the diagnosis tries each.\n", kind.forms.len())?;
+        writeln!(page, "It has {} forms; the diagnosis tries each.", kind.forms.len())?;
     }
     for (file, m) in &kind.forms {
         if kind.forms.len() > 1 {
@@ -126,7 +126,7 @@ fn changed_lines(m: &Mechanism) -> Result<String> {
     for line in text.lines().filter(|line| !line.trim().is_empty()) {
         if line.starts_with('[') {
             section = Some(line);
-        } else if !old.contains(&line) && !(section == Some("[parameters]") && parameter(line)) {
+        } else if !old.contains(&line) && (section != Some("[parameters]") || !parameter(line)) {
             if let Some(header) = section.take() {
                 lines.push_str(if lines.is_empty() { "" } else { "\n" });
                 lines.push_str(header);
