@@ -7,7 +7,7 @@ use clap::error::ErrorKind;
 use clap::{Args, Parser, Subcommand};
 
 use crate::answer::Answer;
-use crate::commands::{calibrate, check, demo, diagnose, identify, simulate};
+use crate::commands::{calibrate, check, demo, diagnose, identify, mechanisms, simulate};
 use crate::failure::Failure;
 use crate::loading::{self, LoadedModel};
 use crate::output::OutputFolder;
@@ -127,6 +127,7 @@ pub(crate) enum Command {
     Calibrate(calibrate::Arguments),
     Simulate(simulate::Arguments),
     Check(check::Arguments),
+    Mechanisms(mechanisms::Arguments),
     Demo(demo::Arguments),
 }
 
@@ -138,6 +139,7 @@ impl Command {
             Command::Calibrate(arguments) => calibrate::run(arguments),
             Command::Simulate(arguments) => simulate::run(arguments),
             Command::Check(arguments) => check::run(arguments),
+            Command::Mechanisms(arguments) => mechanisms::run(arguments),
             Command::Demo(arguments) => demo::run(arguments),
         }
     }
@@ -153,7 +155,7 @@ impl Cli {
             }
             Err(e) if e.kind() == ErrorKind::DisplayHelpOnMissingArgumentOrSubcommand => {
                 Err(Failure::input("no command is given").mend(
-                    "name one: `greybox diagnose`, `identify`, `calibrate`, `simulate`, `check` or `demo`; \
+                    "name one: `greybox diagnose`, `identify`, `calibrate`, `simulate`, `check`, `mechanisms` or `demo`; \
                      `greybox --help` explains them",
                 ))
             }

@@ -5,4 +5,5 @@ pub(crate) mod check;
 pub(crate) mod demo;
 pub(crate) mod diagnose;
 pub(crate) mod identify;
+pub(crate) mod mechanisms;
 pub(crate) mod simulate;

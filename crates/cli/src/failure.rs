@@ -7,7 +7,7 @@ use std::path::Path;
 use std::process::ExitCode;
 
 use greybox_calibrate::DataError;
-use greybox_diagnose::DiagnoseError;
+use greybox_diagnose::{DiagnoseError, MechanismError};
 use greybox_identify::IdentifyError;
 use greybox_model::ModelError;
 use greybox_recording::RecordingError;
@@ -108,6 +108,34 @@ impl Failure {
             .at("line", line)
             .at("column", column);
         failure.0.excerpt = Some(Excerpt::new(text, &span, format!("{file}:{line}:{column}"), line, column));
+        failure
+    }
+
+    /// A fault of a mechanism among `files` (name, text) of `folder`, shown with its source line. The message
+    /// holds its own mend.
+    pub(crate) fn mechanism(error: &MechanismError, files: &[(String, String)], folder: &Path) -> Failure {
+        let Some((name, text)) = files.iter().find(|(name, _)| *name == error.file) else {
+            // A built-in file speaks of a kind that a file of the folder has replaced.
+            return Failure::file(
+                folder,
+                format!(
+                    "the built-in {} no longer fits what these files replace: {}",
+                    error.file, error.message
+                ),
+            )
+            .mend("keep the parameters' names of a built-in mechanism, or give the file another name");
+        };
+        let path = folder.join(name);
+        let mut failure = Failure::file(&path, &error.message);
+        if let Some(line) = error.line {
+            let source = text.lines().nth(line - 1).unwrap_or_default();
+            let column = 1 + source.chars().take_while(|c| c.is_whitespace()).count();
+            let start: usize = text.split_inclusive('\n').take(line - 1).map(str::len).sum();
+            let place = format!("{}:{line}", path.display());
+            failure = failure.at("line", line);
+            failure.0.excerpt =
+                Some(Excerpt::new(text, &(start + column - 1..start + source.len()), place, line, column));
+        }
         failure
     }
 

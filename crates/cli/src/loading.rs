@@ -4,6 +4,7 @@ use std::fs;
 use std::io::ErrorKind;
 use std::path::{Path, PathBuf};
 
+use greybox_diagnose::library::{self, Library};
 use greybox_model::{Model, Problem};
 use greybox_recording::{Recording, read_csv};
 
@@ -52,6 +53,46 @@ fn read_text(path: &Path) -> Result<String, Failure> {
         let line = 1 + e.as_bytes()[..e.utf8_error().valid_up_to()].iter().filter(|&&b| b == b'\n').count();
         Failure::file(path, format!("line {line}: the file is not UTF-8 text")).mend("save it again as UTF-8")
     })
+}
+
+/// The built-in mechanisms and those of a folder.
+#[derive(Debug)]
+pub(crate) struct Mechanisms {
+    pub(crate) library: Library,
+    /// The files of the folder.
+    pub(crate) files: Vec<PathBuf>,
+}
+
+/// Adds every `*.toml` of the folder, in the order of their names, to the built-in library.
+///
+/// # Errors
+/// Bad input: no such folder, no mechanism in it, or a fault in one.
+pub(crate) fn mechanisms(folder: &Path) -> Result<Mechanisms, Failure> {
+    if folder.is_file() {
+        return Err(Failure::file(folder, "this is a file, but `--mechanisms` takes a folder")
+            .mend("name the folder that holds the mechanism files"));
+    }
+    let entries = fs::read_dir(folder).map_err(|e| match e.kind() {
+        ErrorKind::NotFound => {
+            Failure::file(folder, "no such folder").mend("check the path and the spelling")
+        }
+        _ => Failure::file(folder, format!("the folder cannot be read: {e}")).mend("check its permissions"),
+    })?;
+    let mut files: Vec<PathBuf> = entries
+        .filter_map(|entry| entry.ok().map(|e| e.path()))
+        .filter(|path| has_extension(path, "toml") && path.is_file())
+        .collect();
+    files.sort();
+    if files.is_empty() {
+        return Err(Failure::file(folder, "this folder holds no mechanism (`*.toml`)")
+            .mend("`greybox mechanisms --example` prints one to start from"));
+    }
+    let mut texts = Vec::with_capacity(files.len());
+    for path in &files {
+        texts.push((file_name(path), read_text(path)?));
+    }
+    let library = library::combine(&texts).map_err(|e| Failure::mechanism(&e, &texts, folder))?;
+    Ok(Mechanisms { library, files })
 }
 
 fn looks_like_recording(path: &Path, text: &str) -> bool {

@@ -91,6 +91,9 @@ fn mechanism_in_words(number: usize, mechanism: &Mechanism) -> String {
         }
         text.push('\n');
     }
+    if let Some(experiment) = mechanism.experiment.as_ref().filter(|e| e.input.is_some()) {
+        let _ = writeln!(text, "   to separate them: {}", experiment.text);
+    }
     text
 }
 
@@ -177,6 +180,7 @@ mod tests {
             "share_explained": 0.81, "confidence": 0.93,
             "alternatives": [{"kind": "stribeck_friction", "confidence": 0.06, "separate": "slow sweeps."},
                              {"kind": "input_dead_zone", "confidence": 0.9, "equivalent": true}],
+            "experiment": {"text": "drive v slowly", "input": "v"},
             "location": {"region": {"theta'": [-0.2, 0.2]}}}],
           "remainder": {"significant": false, "location": {}, "share_of_residual": 0.03},
           "parameters": {},
@@ -193,7 +197,7 @@ mod tests {
             "Coulomb friction is missing in the hub equation; fc = 0.115 ± 0.004 N m; it acts when |θ′| < 0.2",
             "1. Coulomb friction: fc·sign(θ′)\n   explains 81 % of the residual, confidence 93 %\n",
             "   or Stribeck friction (confidence 6 %); to tell: slow sweeps\n",
-            "   or input dead zone (these data cannot tell it apart)\n",
+            "   or input dead zone (these data cannot tell it apart)\n   to separate them: drive v slowly\n",
             "               nominal  calibrated  improved  noise\n",
             "  held out, θ  –        24.0 %      2.10 %    1.50 %\n",
             "Held out: run3.csv.\n",

@@ -80,7 +80,7 @@ fn every_help_has_an_example() {
     for command in [&["--help"] as &[&str], &["diagnose", "--help"], &["calibrate", "--help"]]
         .into_iter()
         .chain([&["simulate", "--help"] as &[&str], &["check", "--help"], &["demo", "--help"]])
-        .chain([&["identify", "--help"] as &[&str]])
+        .chain([&["identify", "--help"] as &[&str], &["mechanisms", "--help"]])
     {
         let outcome = bench.greybox(command);
         assert_eq!(outcome.code, 0);

@@ -24,6 +24,8 @@
 //! signature = "…"
 //! confused_with = ["…"]
 //! separate = "…"
+//! physics = "…"                  # optional, for the book: where it comes from
+//! parameters = { s0 = "…" }      # optional: what each parameter is
 //! ```
 //!
 //! What a law acts on decides which placeholders it may use:
@@ -42,6 +44,8 @@
 //! is a *shape*: it serves the score test, and `[first]` turns it into the law's own parameters (`angle(y,
 //! x)` is the angle of the vector (x, y)). The law must be linear in the `linear` names, through `[first]`
 //! if need be.
+
+use std::collections::BTreeMap;
 
 use greybox_model::{Expr, parse};
 use serde::Deserialize;
@@ -82,6 +86,21 @@ impl On {
             On::Spring | On::Feedback => &["k", "d", "t", "pi"],
             On::Pair => &["d", "o", "t", "pi"],
             On::Load => &["d", "load", "t", "pi"],
+        }
+    }
+
+    /// As a file writes it.
+    pub fn name(self) -> &'static str {
+        match self {
+            On::Motion => "motion",
+            On::Equation => "equation",
+            On::Input => "input",
+            On::Measurement => "measurement",
+            On::Parameter => "parameter",
+            On::Spring => "spring",
+            On::Feedback => "feedback",
+            On::Pair => "pair",
+            On::Load => "load",
         }
     }
 
@@ -179,8 +198,9 @@ pub struct Region {
     pub high: Option<Expr>,
 }
 
-/// Prose for the report.
+/// Prose for the report and the book.
 #[derive(Debug, Clone, PartialEq, Default, Deserialize)]
+#[serde(deny_unknown_fields)]
 pub struct About {
     /// What it looks like in data.
     pub signature: String,
@@ -189,6 +209,12 @@ pub struct About {
     pub confused_with: Vec<String>,
     /// The recording that would separate them.
     pub separate: String,
+    /// Where it comes from, and its source in the field.
+    #[serde(default)]
+    pub physics: String,
+    /// What each parameter of the law is, by name.
+    #[serde(default)]
+    pub parameters: BTreeMap<String, String>,
 }
 
 /// One mechanism.
@@ -242,12 +268,52 @@ pub struct Mechanism {
 
 /// A mechanism file that cannot be used.
 #[derive(Debug, Clone, PartialEq, thiserror::Error)]
-#[error("{file}: {message}")]
+#[error("{file}{}: {message}", .line.map(|l| format!(", line {l}")).unwrap_or_default())]
 pub struct MechanismError {
     /// Name of the file.
     pub file: String,
+    /// Line of the file, where the fault is in one; the first is 1.
+    pub line: Option<usize>,
     /// What is wrong and the mend.
     pub message: String,
+}
+
+/// A fault: the key it is at (the section, the key in it), and what is wrong with the mend.
+struct Fault {
+    section: String,
+    key: String,
+    message: String,
+}
+
+impl Fault {
+    fn new(section: &str, key: &str, message: impl Into<String>) -> Fault {
+        Fault { section: section.to_string(), key: key.to_string(), message: message.into() }
+    }
+}
+
+/// The line of `key` in `[section]` of a TOML text (the empty section stands before the first header), else
+/// that of the section's header, counted from 1. A key without a section of its own is looked for as
+/// `section = { … }` too.
+fn line_of(text: &str, section: &str, key: &str) -> Option<usize> {
+    let (mut current, mut header) = (String::new(), None);
+    for (number, line) in (1..).zip(text.lines()) {
+        let line = line.trim();
+        if let Some(name) = line.strip_prefix('[').and_then(|l| l.split(']').next()) {
+            current = name.trim().to_string();
+            if current == section {
+                header = Some(number);
+            }
+        } else if let Some((name, _)) = line.split_once('=') {
+            let name = name.trim().trim_matches('"');
+            if current == section && name == key {
+                return Some(number);
+            }
+            if format!("{current}.{name}").trim_start_matches('.') == section {
+                header = Some(number);
+            }
+        }
+    }
+    header
 }
 
 #[derive(Deserialize)]
@@ -323,146 +389,101 @@ impl Mechanism {
     /// Reads a mechanism file.
     ///
     /// # Errors
-    /// [`MechanismError`] names the file and what is wrong with it.
+    /// [`MechanismError`] names the file, the line, and what is wrong with the mend. What depends on other
+    /// files (`refines`, `[equals]`) is checked by [`combine`].
     pub fn from_toml(text: &str, file: &str) -> Result<Mechanism, MechanismError> {
-        let fail = |message: String| MechanismError { file: file.to_string(), message };
-        let raw: File = toml::from_str(text).map_err(|e| fail(e.to_string()))?;
-        let expression = |text: &str, key: &str| {
-            parse(text).map(|p| p.expr).map_err(|e| fail(format!("`{key} = \"{text}\"`: {e}")))
-        };
+        let raw: File = toml::from_str(text).map_err(|e| MechanismError {
+            file: file.to_string(),
+            line: e.span().map(|span| 1 + text[..span.start].matches('\n').count()),
+            message: e.message().to_string(),
+        })?;
+        Mechanism::from_file(raw).map_err(|fault| MechanismError {
+            file: file.to_string(),
+            line: line_of(text, &fault.section, &fault.key),
+            message: fault.message,
+        })
+    }
+
+    fn from_file(raw: File) -> Result<Mechanism, Fault> {
         let law = match (&raw.force, &raw.replace) {
-            (Some(force), None) if !raw.on.replaces() => expression(force, "force")?,
-            (None, Some(replace)) if raw.on.replaces() => expression(replace, "replace")?,
-            _ => {
-                return Err(fail(
-                    "a mechanism on a motion, a load, a pair or an equation has `force`, one on an input, a measurement, a parameter or a spring has `replace`, and none has both".into(),
+            (Some(force), None) if !raw.on.replaces() => expression(force, "", "force")?,
+            (None, Some(replace)) if raw.on.replaces() => expression(replace, "", "replace")?,
+            (force, _) => {
+                let key = if force.is_some() { "force" } else { "replace" };
+                return Err(Fault::new(
+                    "",
+                    key,
+                    "a mechanism on a motion, a load, a pair or an equation has `force`, one on an input, a measurement, a parameter, a spring or a feedback has `replace`, and none has both",
                 ));
             }
         };
         if raw.reaction.is_some() && raw.on != On::Pair {
-            return Err(fail("only a mechanism on a pair has a `reaction`".into()));
+            return Err(Fault::new("", "reaction", "only a mechanism on a pair has a `reaction`; remove it"));
         }
-        let reaction = raw.reaction.as_deref().map(|t| expression(t, "reaction")).transpose()?;
-        let mut states = Vec::new();
-        for (name, value) in raw.states {
-            let entry: StateFile = value
-                .try_into()
-                .map_err(|e: toml::de::Error| fail(format!("[states.{name}]: {}", e.message())))?;
-            let equation = greybox_model::parse_equation(&entry.equation)
-                .map_err(|e| fail(format!("[states.{name}] `equation = \"{}\"`: {e}", entry.equation)))?;
-            if !(equation.lhs.expr.mentions(&name) || equation.rhs.expr.mentions(&name)) {
-                return Err(fail(format!("[states.{name}]: its equation does not mention `{name}`")));
-            }
-            states.push(Memory {
-                unit: expression(&entry.unit, "unit")?,
-                start: entry.start.iter().map(|t| expression(t, "start")).collect::<Result<_, _>>()?,
-                name,
-                lhs: equation.lhs.expr,
-                rhs: equation.rhs.expr,
-            });
+        if !(raw.surcharge.is_finite() && raw.surcharge >= 0.0) {
+            return Err(Fault::new("", "surcharge", "`surcharge` must be zero or positive"));
         }
-        let mut inner = Vec::new();
-        for (name, value) in raw.inner {
-            let entry: InnerFile = value
-                .try_into()
-                .map_err(|e: toml::de::Error| fail(format!("[inner] {name}: {}", e.message())))?;
-            let spectral = entry.spectral.as_deref().map(|t| expression(t, "spectral")).transpose()?;
-            if (entry.grid.is_empty() && spectral.is_none()) || !entry.grid.iter().all(|v| v.is_finite()) {
-                return Err(fail(format!("[inner] {name}: `grid` must list finite first values")));
-            }
-            let scale = match entry.scale.as_deref() {
-                None | Some("1") => Scale::One,
-                Some("dt") => Scale::Step,
-                Some("duration") => Scale::Duration,
-                Some("1/duration") => Scale::PerDuration,
-                Some(text) => {
-                    let (f, rest) = text.split_once('(').ok_or_else(|| {
-                        fail(format!(
-                            "[inner] {name}: scale `{text}` is none of `1`, `dt`, `duration`, `1/duration`, `rms(…)`, `max(…)`, `top(…)`, `range(…)`, `1/range(…)`, `freq(…)`"
-                        ))
-                    })?;
-                    let of = expression(rest.trim_end().strip_suffix(')').unwrap_or(rest), "scale")?;
-                    match f.trim() {
-                        "rms" => Scale::Rms(of),
-                        "max" => Scale::Max(of),
-                        "top" => Scale::Top(of),
-                        "range" => Scale::Range(of),
-                        "1/range" => Scale::PerRange(of),
-                        "freq" => Scale::Frequency(of),
-                        other => {
-                            return Err(fail(format!(
-                                "[inner] {name}: unknown scale function `{other}`; use rms, max, top, range, 1/range or freq"
-                            )));
-                        }
-                    }
-                }
-            };
-            let (low, high) = (entry.low.unwrap_or(1e-3), entry.high.unwrap_or(1e3));
-            if low >= high
-                || low.is_nan()
-                || high.is_nan()
-                || entry.grid.iter().any(|g| *g < low || *g > high)
-            {
-                return Err(fail(format!("[inner] {name}: `low` and `high` must enclose the grid")));
-            }
-            inner.push(Inner { name, grid: entry.grid, scale, low, high, spectral });
-        }
-        let region = match raw.location {
-            None => None,
-            Some(l) => Some(Region {
-                variable: expression(&l.variable, "variable")?,
-                low: l.low.as_deref().map(|t| expression(t, "low")).transpose()?,
-                high: l.high.as_deref().map(|t| expression(t, "high")).transpose()?,
-            }),
-        };
         let mut equals = Vec::new();
         for (kind, value) in raw.equals {
-            let table: std::collections::BTreeMap<String, String> = value
-                .try_into()
-                .map_err(|e: toml::de::Error| fail(format!("[equals] {kind}: {}", e.message())))?;
+            let table: BTreeMap<String, String> = value.try_into().map_err(|e: toml::de::Error| {
+                Fault::new("equals", &kind, format!("[equals] {kind}: {}", e.message()))
+            })?;
             for (parameter, text) in table {
-                equals.push((kind.clone(), parameter, expression(&text, "equals")?));
+                equals.push((kind.clone(), parameter, expression(&text, "equals", &kind)?));
             }
         }
+        let formula = |section: &str, name: &str, value: &toml::Value| match value.as_str() {
+            Some(text) => Ok(text.to_string()),
+            None => {
+                Err(Fault::new(section, name, format!("[{section}] {name}: write the formula as a string")))
+            }
+        };
         let mut first = Vec::new();
         for (name, value) in raw.first {
-            let Some(text) = value.as_str() else {
-                return Err(fail(format!("[first] {name}: write the formula as a string")));
-            };
-            first.push((name, first_value(text, &expression)?));
+            let value = first_value(&formula("first", &name, &value)?, &name)?;
+            first.push((name, value));
         }
         let mut report = Vec::new();
         for (name, value) in raw.report {
-            let Some(text) = value.as_str() else {
-                return Err(fail(format!("[report] {name}: write the formula as a string")));
-            };
-            report.push((name, expression(text, "report")?));
+            let value = expression(&formula("report", &name, &value)?, "report", &name)?;
+            report.push((name, value));
         }
         let mut mechanism = Mechanism {
             kind: raw.kind,
             family: raw.family,
             on: raw.on,
             law,
-            reaction,
-            states,
+            reaction: raw.reaction.as_deref().map(|t| expression(t, "", "reaction")).transpose()?,
+            states: raw
+                .states
+                .into_iter()
+                .map(|(name, value)| memory(name, value))
+                .collect::<Result<_, _>>()?,
             linear: raw.linear,
             positive: raw.positive,
-            inner,
+            inner: raw.inner.into_iter().map(|(name, value)| inner(name, value)).collect::<Result<_, _>>()?,
             first,
             report,
             own: Vec::new(),
-            rank: raw.rank.unwrap_or(if raw.on == On::Measurement { 2 } else { u8::from(raw.on == On::Input) }),
+            rank: raw.rank.unwrap_or(if raw.on == On::Measurement {
+                2
+            } else {
+                u8::from(raw.on == On::Input)
+            }),
             rare: raw.rare,
             mirror: raw.mirror,
             refines: raw.refines,
-            require: raw.require.iter().map(|t| expression(t, "require")).collect::<Result<_, _>>()?,
+            require: raw.require.iter().map(|t| expression(t, "", "require")).collect::<Result<_, _>>()?,
             surcharge: raw.surcharge,
-            region,
+            region: raw.location.map(region).transpose()?,
             equals,
             about: raw.about,
         };
         mechanism.own = mechanism.named().filter(|n| mechanism.uses(n)).map(str::to_string).collect();
-        mechanism.check().map_err(fail)?;
+        mechanism.check_names()?;
+        mechanism.check_parameters()?;
+        mechanism.check_data()?;
+        mechanism.check_linear()?;
         Ok(mechanism)
     }
 
@@ -491,65 +512,320 @@ impl Mechanism {
         self.expressions().any(|e| e.contains(placeholder, primes))
     }
 
-    /// What a file may not say.
-    fn check(&self) -> Result<(), String> {
+    /// Names are names, each given once, and the law uses no other.
+    fn check_names(&self) -> Result<(), Fault> {
         let placeholders = self.on.placeholders();
-        let state = |n: &str| self.states.iter().any(|s| s.name == n);
+        if self.kind.is_empty() || !self.kind.chars().all(|c| c.is_alphanumeric() || c == '_') {
+            return Err(Fault::new("", "kind", "`kind` must be a name of letters, digits and `_`"));
+        }
         let mut seen: Vec<&str> = Vec::new();
-        for name in self.named().chain(self.states.iter().map(|s| s.name.as_str())) {
+        let parameters = self.linear.iter().map(|n| ("", "linear", n.as_str()));
+        let parameters = parameters
+            .chain(self.inner.iter().map(|i| ("inner", i.name.as_str(), i.name.as_str())))
+            .chain(self.first.iter().map(|f| ("first", f.0.as_str(), f.0.as_str())));
+        let states = self.states.iter().map(|s| ("states", s.name.as_str(), s.name.as_str()));
+        for (section, key, name) in parameters.chain(states) {
+            let section = if section == "states" { format!("states.{name}") } else { section.to_string() };
+            let fault = |message: String| Err(Fault::new(&section, key, message));
+            if !parse(name).is_ok_and(|p| p.expr == Expr::var(name)) {
+                return fault(format!(
+                    "`{name}` is no name that an equation can use; take letters, digits and `_`"
+                ));
+            }
             if placeholders.contains(&name) {
-                return Err(format!("`{name}` already means something in a law; give the parameter another name"));
+                return fault(format!("`{name}` already means something in a law; give it another name"));
             }
             if seen.contains(&name) {
-                return Err(format!("`{name}` is listed twice among `linear`, `[inner]`, `[first]` and `[states]`"));
+                return fault(format!(
+                    "`{name}` is listed twice among `linear`, `[inner]`, `[first]` and `[states]`"
+                ));
             }
             seen.push(name);
         }
-        for e in self.expressions() {
-            let unknown = e.variables().into_iter().find(|(n, _)| !placeholders.contains(&&**n) && !seen.contains(&&**n));
-            if let Some((name, _)) = unknown {
-                return Err(format!(
-                    "the law uses `{name}`, which is neither a parameter (list it under `linear`, `[inner]` or `[first]`) nor one of {}",
-                    placeholders.join(", ")
-                ));
+        let known = |n: &str| placeholders.contains(&n) || seen.contains(&n);
+        let law = if self.on.replaces() { "replace" } else { "force" };
+        let laws =
+            std::iter::once(("", law, &self.law)).chain(self.reaction.iter().map(|e| ("", "reaction", e)));
+        for (section, key, e) in laws {
+            if let Some(name) = stranger(e, known) {
+                return Err(Fault::new(section, key, self.unknown("the law", &name)));
             }
         }
-        for (key, names) in [("positive", &self.positive), ("linear", &self.linear)] {
-            for name in names {
-                let known = self.named().any(|n| n == name);
-                if !known || state(name) {
-                    return Err(format!("`{key}` names `{name}`, which is no parameter of this mechanism"));
+        for state in &self.states {
+            for e in [&state.lhs, &state.rhs] {
+                if let Some(name) = stranger(e, known) {
+                    let section = format!("states.{}", state.name);
+                    return Err(Fault::new(&section, "equation", self.unknown("the equation", &name)));
                 }
+            }
+        }
+        Ok(())
+    }
+
+    fn unknown(&self, what: &str, name: &str) -> String {
+        format!(
+            "{what} uses `{name}`, which is neither a parameter (list it under `linear`, `[inner]` or `[first]`), nor a state, nor one of {}",
+            self.on.placeholders().join(", ")
+        )
+    }
+
+    /// What is said about parameters is about this mechanism's.
+    fn check_parameters(&self) -> Result<(), Fault> {
+        for name in &self.positive {
+            if !self.named().any(|n| n == name) {
+                return Err(Fault::new(
+                    "",
+                    "positive",
+                    format!("`positive` names `{name}`, which is no parameter of this mechanism"),
+                ));
             }
         }
         for (name, first) in &self.first {
             let sources = match first {
-                First::Value(e) => e.variables(),
-                First::Angle(y, x) => [y.variables(), x.variables()].concat(),
+                First::Value(e) => vec![e],
+                First::Angle(y, x) => vec![y, x],
             };
-            let source = |n: &str| self.linear.iter().any(|l| l == n) || self.inner.iter().any(|i| i.name == n) || n == "pi";
-            if let Some((n, _)) = sources.iter().find(|(n, _)| !source(n)) {
-                return Err(format!("[first] {name}: `{n}` is neither under `linear` nor under `[inner]`"));
+            let source = |n: &str| {
+                self.linear.iter().any(|l| l == n) || self.inner.iter().any(|i| i.name == n) || n == "pi"
+            };
+            for e in sources {
+                if let Some(n) = stranger(e, source) {
+                    return Err(Fault::new(
+                        "first",
+                        name,
+                        format!("[first] {name}: `{n}` is neither under `linear` nor under `[inner]`"),
+                    ));
+                }
             }
             if !self.uses(name) {
-                return Err(format!("[first] {name}: the law does not use `{name}`"));
+                return Err(Fault::new(
+                    "first",
+                    name,
+                    format!("[first] {name}: the law does not use `{name}`; remove it"),
+                ));
             }
         }
-        for (name, e) in &self.report {
-            if let Some((n, _)) = e.variables().iter().find(|(n, _)| &**n != "pi" && !self.own.iter().any(|p| **p == **n)) {
-                return Err(format!("[report] {name}: `{n}` is no parameter of the law"));
+        if self.first.is_empty()
+            && let Some(name) = self.named().find(|n| !self.uses(n))
+        {
+            let (section, key) = if self.inner(name).is_some() { ("inner", name) } else { ("", "linear") };
+            return Err(Fault::new(
+                section,
+                key,
+                format!(
+                    "the law does not use `{name}`; remove it, or reach the law's parameters through it in `[first]`"
+                ),
+            ));
+        }
+        let own = |n: &str| n == "pi" || self.own.iter().any(|p| p == n);
+        let figures = self.report.iter().map(|(name, e)| ("report", name.as_str(), e));
+        let require = self.require.iter().map(|e| ("", "require", e));
+        let equals = self.equals.iter().map(|(kind, _, e)| ("equals", kind.as_str(), e));
+        for (section, key, e) in figures.chain(require).chain(equals) {
+            if let Some(n) = stranger(e, own) {
+                let place =
+                    if section.is_empty() { format!("`{key}`") } else { format!("[{section}] {key}") };
+                return Err(Fault::new(section, key, format!("{place}: `{n}` is no parameter of the law")));
             }
         }
+        match self.about.parameters.keys().find(|n| !self.own.contains(n)) {
+            Some(n) => Err(Fault::new(
+                "about",
+                "parameters",
+                format!("[about] parameters: `{n}` is no parameter of the law"),
+            )),
+            None => Ok(()),
+        }
+    }
+
+    /// What is read off the data speaks of the placeholders only; where the law acts, of parameters too.
+    fn check_data(&self) -> Result<(), Fault> {
+        let placeholders = self.on.placeholders();
+        let placeholder = |n: &str| placeholders.contains(&n);
+        for state in &self.states {
+            let section = format!("states.{}", state.name);
+            let unit = std::iter::once(("unit", &state.unit));
+            for (key, e) in unit.chain(state.start.iter().map(|e| ("start", e))) {
+                if let Some(n) = stranger(e, placeholder) {
+                    return Err(Fault::new(
+                        &section,
+                        key,
+                        format!(
+                            "[{section}] `{key}`: `{n}` is none of {}; write an expression of them that has the state's {}",
+                            placeholders.join(", "),
+                            if key == "unit" { "unit, such as `d'*t`" } else { "value" }
+                        ),
+                    ));
+                }
+            }
+            let order = state_order(state);
+            let equation = state.lhs.clone() - state.rhs.clone();
+            if order == 0 {
+                return Err(Fault::new(
+                    &section,
+                    "equation",
+                    format!(
+                        "[{section}]: its equation holds no derivative of `{}`, such as `{}'`",
+                        state.name, state.name
+                    ),
+                ));
+            }
+            if equation.affine_in(&[(&state.name, order)]).is_none() {
+                return Err(Fault::new(
+                    &section,
+                    "equation",
+                    format!(
+                        "[{section}]: its equation must be linear in its highest derivative, `{}{}`",
+                        state.name,
+                        "'".repeat(order.into())
+                    ),
+                ));
+            }
+        }
+        for inner in &self.inner {
+            let scale = match &inner.scale {
+                Scale::Rms(e)
+                | Scale::Max(e)
+                | Scale::Top(e)
+                | Scale::Range(e)
+                | Scale::PerRange(e)
+                | Scale::Frequency(e) => Some(e),
+                Scale::One | Scale::Step | Scale::Duration | Scale::PerDuration => None,
+            };
+            for e in scale.into_iter().chain(&inner.spectral) {
+                if let Some(n) = stranger(e, placeholder) {
+                    return Err(Fault::new(
+                        "inner",
+                        &inner.name,
+                        format!(
+                            "[inner] {}: `{n}` is no channel of this law; a scale is read off {}",
+                            inner.name,
+                            placeholders.join(", ")
+                        ),
+                    ));
+                }
+            }
+        }
+        let Some(region) = &self.region else { return Ok(()) };
+        let state = |n: &str| self.states.iter().any(|s| s.name == n);
+        let own = |n: &str| n == "pi" || n == "rms_rate" || self.own.iter().any(|p| p == n);
+        if let Some(n) = stranger(&region.variable, |n| placeholder(n) || state(n)) {
+            return Err(Fault::new(
+                "location",
+                "variable",
+                format!("[location] variable: `{n}` is none of {}", placeholders.join(", ")),
+            ));
+        }
+        for (key, e) in [("low", &region.low), ("high", &region.high)] {
+            if let Some(n) = e.as_ref().and_then(|e| stranger(e, own)) {
+                return Err(Fault::new(
+                    "location",
+                    key,
+                    format!(
+                        "[location] {key}: `{n}` is no parameter of the law (they are {}), and not `rms_rate`",
+                        self.own.join(", ")
+                    ),
+                ));
+            }
+        }
+        Ok(())
+    }
+
+    /// The law is linear in the `linear` parameters, through `[first]` if need be, and the states do not
+    /// depend on them.
+    fn check_linear(&self) -> Result<(), Fault> {
+        let fault = |message: String| Err(Fault::new("", "linear", message));
         if self.first.is_empty() {
             for name in &self.linear {
                 if self.law.derivative(name, 0).mentions(name) {
-                    return Err(format!("`{name}` is listed as linear, but the law is not linear in it"));
+                    return fault(format!(
+                        "`{name}` is listed as linear, but the law is not linear in it; list it under [inner]"
+                    ));
                 }
                 if self.states.iter().any(|s| s.lhs.mentions(name) || s.rhs.mentions(name)) {
-                    return Err(format!(
+                    return fault(format!(
                         "`{name}` is listed as linear, but a state's equation depends on it; reach it through `[first]`"
                     ));
                 }
+            }
+            return Ok(());
+        }
+        // Through `[first]` there is no telling symbolically (the angle of two parameters): by numbers.
+        let inner: Vec<f64> = (0..self.inner.len()).map(|i| 0.7 + 0.31 * i as f64).collect();
+        let at = |w: f64| -> Vec<f64> {
+            // From one end of a line to the other, which misses the origin.
+            (0..self.linear.len())
+                .map(|i| (1.0 - w) * (1.3 + 0.4 * i as f64) + w * (2.9 - 0.7 * i as f64))
+                .collect()
+        };
+        let value = |e: &Expr, w: f64| {
+            let own = self.values(&at(w), &inner)?;
+            e.eval(&|n, primes| match self.own.iter().position(|p| p == n) {
+                Some(i) => own.get(i).copied(),
+                // Any number will do for a signal, a different one for each.
+                None => {
+                    Some(0.3 + 0.1 * f64::from(primes) + 0.07 * f64::from(n.bytes().next().unwrap_or(0) % 16))
+                }
+            })
+        };
+        let close = |a: f64, b: f64| (a - b).abs() <= 1e-9 * (a.abs() + b.abs());
+        for e in std::iter::once(&self.law).chain(&self.reaction) {
+            if let (Some(a), Some(b), Some(c)) = (value(e, 0.0), value(e, 0.5), value(e, 1.0))
+                && !close(0.5 * (a + c), b)
+            {
+                return fault(format!(
+                    "through `[first]` the law is not linear in {}",
+                    self.linear.join(", ")
+                ));
+            }
+        }
+        for state in &self.states {
+            let equation = state.lhs.clone() - state.rhs.clone();
+            let Some((row, rest)) = equation.affine_in(&[(&state.name, state_order(state))]) else {
+                continue;
+            };
+            let highest = |w: f64| Some(value(&rest, w)? / value(row.first()?, w)?);
+            if let (Some(a), Some(b)) = (highest(0.0), highest(1.0))
+                && !close(a, b)
+            {
+                return fault(format!(
+                    "the equation of the state `{}` depends on {}, through `[first]` too; write it so that first values under [inner] determine it",
+                    state.name,
+                    self.linear.join(", ")
+                ));
+            }
+        }
+        Ok(())
+    }
+
+    /// What this mechanism says of others is about kinds that there are.
+    fn check_relations<'a, I>(&self, all: impl Fn() -> I) -> Result<(), Fault>
+    where
+        I: Iterator<Item = &'a Mechanism>,
+    {
+        for kind in &self.refines {
+            if !all().any(|m| m.kind == *kind) {
+                return Err(Fault::new(
+                    "",
+                    "refines",
+                    format!("`refines` names `{kind}`, a kind that the library does not have"),
+                ));
+            }
+        }
+        for (kind, parameter, _) in &self.equals {
+            if !all().any(|m| m.kind == *kind) {
+                return Err(Fault::new(
+                    "equals",
+                    kind,
+                    format!("[equals] names `{kind}`, a kind that the library does not have"),
+                ));
+            }
+            if !all().any(|m| m.kind == *kind && m.own.contains(parameter)) {
+                return Err(Fault::new(
+                    "equals",
+                    kind,
+                    format!("[equals] {kind}: it has no parameter `{parameter}`"),
+                ));
             }
         }
         Ok(())
@@ -591,12 +867,105 @@ impl Mechanism {
     }
 }
 
-fn first_value(
-    text: &str,
-    expression: &dyn Fn(&str, &str) -> Result<Expr, MechanismError>,
-) -> Result<First, MechanismError> {
+fn expression(text: &str, section: &str, key: &str) -> Result<Expr, Fault> {
+    parse(text).map(|p| p.expr).map_err(|e| Fault::new(section, key, format!("`{key} = \"{text}\"`: {e}")))
+}
+
+/// The first name of an expression that `known` does not know.
+fn stranger(e: &Expr, known: impl Fn(&str) -> bool) -> Option<String> {
+    e.variables().into_iter().find(|(n, _)| !known(n)).map(|(n, _)| n.to_string())
+}
+
+/// Highest derivative of a state in its own equation.
+fn state_order(state: &Memory) -> u8 {
+    let primes = [&state.lhs, &state.rhs].into_iter().flat_map(|e| e.variables());
+    primes.filter(|(n, _)| **n == *state.name).map(|(_, p)| p).max().unwrap_or(0)
+}
+
+fn memory(name: String, value: toml::Value) -> Result<Memory, Fault> {
+    let section = format!("states.{name}");
+    let entry: StateFile = value
+        .try_into()
+        .map_err(|e: toml::de::Error| Fault::new(&section, "", format!("[{section}]: {}", e.message())))?;
+    let equation = greybox_model::parse_equation(&entry.equation).map_err(|e| {
+        Fault::new(&section, "equation", format!("[{section}] `equation = \"{}\"`: {e}", entry.equation))
+    })?;
+    if !(equation.lhs.expr.mentions(&name) || equation.rhs.expr.mentions(&name)) {
+        return Err(Fault::new(
+            &section,
+            "equation",
+            format!("[{section}]: its equation does not mention `{name}`"),
+        ));
+    }
+    Ok(Memory {
+        unit: expression(&entry.unit, &section, "unit")?,
+        start: entry.start.iter().map(|t| expression(t, &section, "start")).collect::<Result<_, _>>()?,
+        name,
+        lhs: equation.lhs.expr,
+        rhs: equation.rhs.expr,
+    })
+}
+
+fn inner(name: String, value: toml::Value) -> Result<Inner, Fault> {
+    let fault = |message: String| Fault::new("inner", &name, format!("[inner] {name}: {message}"));
+    let entry: InnerFile = value.try_into().map_err(|e: toml::de::Error| fault(e.message().to_string()))?;
+    let spectral = entry.spectral.as_deref().map(|t| expression(t, "inner", &name)).transpose()?;
+    if (entry.grid.is_empty() && spectral.is_none()) || !entry.grid.iter().all(|v| v.is_finite()) {
+        return Err(fault("`grid` must list finite first values, such as [0.1, 0.3]".into()));
+    }
+    let scale = match entry.scale.as_deref() {
+        None => Scale::One,
+        Some(text) => scale(text, &name)?,
+    };
+    let (low, high) = (entry.low.unwrap_or(1e-3), entry.high.unwrap_or(1e3));
+    let enclosed = low < high && entry.grid.iter().all(|g| (low..=high).contains(g));
+    if !enclosed {
+        return Err(fault(format!("`low` ({low}) and `high` ({high}) must enclose the grid")));
+    }
+    Ok(Inner { name, grid: entry.grid, scale, low, high, spectral })
+}
+
+fn scale(text: &str, name: &str) -> Result<Scale, Fault> {
+    let fault = |message: String| Err(Fault::new("inner", name, format!("[inner] {name}: {message}")));
+    let (function, rest) = match (text, text.split_once('(')) {
+        ("1", _) => return Ok(Scale::One),
+        ("dt", _) => return Ok(Scale::Step),
+        ("duration", _) => return Ok(Scale::Duration),
+        ("1/duration", _) => return Ok(Scale::PerDuration),
+        (_, Some(parts)) => parts,
+        (_, None) => {
+            return fault(format!(
+                "scale `{text}` is none of `1`, `dt`, `duration`, `1/duration`, `rms(…)`, `max(…)`, `top(…)`, `range(…)`, `1/range(…)`, `freq(…)`"
+            ));
+        }
+    };
+    let of = expression(rest.trim_end().strip_suffix(')').unwrap_or(rest), "inner", name)?;
+    match function.trim() {
+        "rms" => Ok(Scale::Rms(of)),
+        "max" => Ok(Scale::Max(of)),
+        "top" => Ok(Scale::Top(of)),
+        "range" => Ok(Scale::Range(of)),
+        "1/range" => Ok(Scale::PerRange(of)),
+        "freq" => Ok(Scale::Frequency(of)),
+        other => {
+            fault(format!("unknown scale function `{other}`; use rms, max, top, range, 1/range or freq"))
+        }
+    }
+}
+
+fn region(entry: LocationFile) -> Result<Region, Fault> {
+    let end = |text: Option<String>, key: &str| text.map(|t| expression(&t, "location", key)).transpose();
+    Ok(Region {
+        variable: expression(&entry.variable, "location", "variable")?,
+        low: end(entry.low, "low")?,
+        high: end(entry.high, "high")?,
+    })
+}
+
+fn first_value(text: &str, name: &str) -> Result<First, Fault> {
+    let whole = || expression(text, "first", name).map(First::Value);
     let Some(inside) = text.trim().strip_prefix("angle(").and_then(|t| t.strip_suffix(')')) else {
-        return Ok(First::Value(expression(text, "first")?));
+        return whole();
     };
     // The comma between the two arguments: the first outside parentheses.
     let mut depth = 0;
@@ -610,21 +979,90 @@ fn first_value(
     });
     match comma {
         Some((at, _)) => Ok(First::Angle(
-            expression(&inside[..at], "first")?,
-            expression(&inside[at + 1..], "first")?,
+            expression(&inside[..at], "first", name)?,
+            expression(&inside[at + 1..], "first", name)?,
         )),
-        None => expression(text, "first").map(First::Value),
+        None => whole(),
     }
 }
 
 static BUILT_IN: &[(&str, &str)] = include!(concat!(env!("OUT_DIR"), "/mechanisms.rs"));
+
+/// The file names of the built-in library, in the order of [`built_in`].
+pub fn built_in_files() -> impl Iterator<Item = &'static str> {
+    BUILT_IN.iter().map(|(file, _)| *file)
+}
 
 /// The built-in library, in the order of the file names.
 ///
 /// # Errors
 /// Only when a built-in file is wrong, which a test excludes.
 pub fn built_in() -> Result<Vec<Mechanism>, MechanismError> {
-    BUILT_IN.iter().map(|(file, text)| Mechanism::from_toml(text, file)).collect()
+    combine(&[]).map(|library| library.mechanisms)
+}
+
+/// The built-in library with files of one's own.
+#[derive(Debug, Clone, PartialEq)]
+pub struct Library {
+    /// All mechanisms: the built-in ones in the order of their file names, then the others as given.
+    pub mechanisms: Vec<Mechanism>,
+    /// Files that were added.
+    pub added: Vec<String>,
+    /// Files that stand in for the built-in one of their name and kind.
+    pub replaced: Vec<String>,
+}
+
+/// Adds files (name, text) to the built-in library. A file with the name and the kind of a built-in one
+/// replaces it.
+///
+/// ```
+/// let springs = r#"
+/// kind   = "quintic_stiffness"
+/// family = "stiffness"
+/// on     = "motion"
+/// force  = "k5*d^5"
+/// linear = ["k5"]
+///
+/// [about]
+/// signature = "a spring that hardens late and steeply"
+/// separate  = "the resonance measured at several amplitudes"
+/// "#;
+/// let library = greybox_diagnose::library::combine(&[("quintic.toml".into(), springs.into())])?;
+/// assert_eq!(library.added, ["quintic.toml"]);
+/// # Ok::<(), greybox_diagnose::MechanismError>(())
+/// ```
+///
+/// # Errors
+/// As [`Mechanism::from_toml`]; and where `refines` or `[equals]` names a kind, or `[equals]` a parameter,
+/// that no mechanism of the whole library has.
+pub fn combine(own: &[(String, String)]) -> Result<Library, MechanismError> {
+    let mut files: Vec<(&str, &str, Mechanism)> = Vec::new();
+    for &(file, text) in BUILT_IN {
+        files.push((file, text, Mechanism::from_toml(text, file)?));
+    }
+    let (mut added, mut replaced) = (Vec::new(), Vec::new());
+    for (file, text) in own {
+        let mechanism = Mechanism::from_toml(text, file)?;
+        match files.iter_mut().find(|(name, _, m)| name == file && m.kind == mechanism.kind) {
+            Some(entry) => {
+                *entry = (file, text, mechanism);
+                replaced.push(file.clone());
+            }
+            None => {
+                files.push((file, text, mechanism));
+                added.push(file.clone());
+            }
+        }
+    }
+    for (file, text, mechanism) in &files {
+        let others = || files.iter().map(|f| &f.2);
+        mechanism.check_relations(others).map_err(|fault| MechanismError {
+            file: (*file).to_string(),
+            line: line_of(text, &fault.section, &fault.key),
+            message: fault.message,
+        })?;
+    }
+    Ok(Library { mechanisms: files.into_iter().map(|f| f.2).collect(), added, replaced })
 }
 
 #[cfg(test)]
@@ -638,23 +1076,201 @@ mod tests {
         for (mechanism, (file, _)) in library.iter().zip(BUILT_IN) {
             assert!(file.starts_with(&mechanism.kind), "{file}: {}", mechanism.kind);
             assert!(!mechanism.about.signature.is_empty());
+            assert!(!mechanism.about.physics.is_empty(), "{file}: [about] physics");
+            let described: Vec<&String> = mechanism.about.parameters.keys().collect();
+            let mut own = mechanism.own.clone();
+            own.sort();
+            assert_eq!(described, own.iter().collect::<Vec<_>>(), "{file}: [about] parameters");
+            for kind in &mechanism.about.confused_with {
+                assert!(library.iter().any(|m| m.kind == *kind), "{file}: confused with `{kind}`");
+            }
+        }
+    }
+
+    const HEAD: &str = "kind = \"k\"\nfamily = \"f\"\non = \"motion\"\n";
+    const TAIL: &str = "\n[about]\nsignature = \"s\"\nseparate = \"e\"\n";
+
+    /// Line and message of a file on a motion.
+    fn error(rest: &str) -> (Option<usize>, String) {
+        let e = Mechanism::from_toml(&format!("{HEAD}{rest}"), "x.toml").unwrap_err();
+        assert!(e.to_string().starts_with("x.toml"), "{e}");
+        (e.line, e.message)
+    }
+
+    #[test]
+    fn a_good_file_is_read() {
+        let text = format!("{HEAD}force = \"fc*sign(d')\"\nlinear = [\"fc\"]{TAIL}");
+        assert_eq!(Mechanism::from_toml(&text, "x.toml").unwrap().parameters().collect::<Vec<_>>(), ["fc"]);
+    }
+
+    /// Every way to be wrong, the line it is found on (three stand before the text), and what must be said.
+    #[test]
+    fn wrong_files_are_refused_with_line_and_mend() {
+        let state = "force = \"k*z\"\nlinear = [\"k\"]\n[states.z]\n";
+        let first = "force = \"fc*sign(d')\"\nlinear = [\"a\"]\n";
+        let rows: &[(&str, usize, &str)] = &[
+            // not TOML, unknown keys and sections, wrong types
+            ("force = \"d", 4, "invalid basic string"),
+            ("force = \"d\"\ncolour = 1", 5, "unknown field `colour`, expected one of"),
+            ("force = \"d\"\nlinear = \"fc\"", 5, "expected a sequence"),
+            ("force = \"d\"\n[about]\nseperate = \"\"", 6, "unknown field `seperate`"),
+            ("force = \"d\"\n[location]\nwhere = \"d\"", 6, "unknown field `where`"),
+            // the law
+            ("linear = [\"fc\"]", 0, "has `force`"),
+            ("replace = \"d\"", 4, "has `force`"),
+            ("force = \"d\"\nreplace = \"d\"", 4, "none has both"),
+            ("force = \"d\"\nreaction = \"d\"", 5, "only a mechanism on a pair"),
+            ("force = \"fc*sign(d'\"\nlinear = [\"fc\"]", 4, "`force = \"fc*sign(d'\"`"),
+            ("force = \"fc*sgn(d')\"\nlinear = [\"fc\"]", 4, "sgn"),
+            ("force = \"fc*sign(d')\"", 4, "the law uses `fc`, which is neither a parameter"),
+            ("force = \"fc*u\"\nlinear = [\"fc\"]", 4, "the law uses `u`"),
+            // parameters
+            ("force = \"fc^2*d\"\nlinear = [\"fc\"]", 5, "not linear in it; list it under [inner]"),
+            ("force = \"d\"\nlinear = [\"q\"]", 5, "does not use `q`"),
+            ("force = \"d\"\npositive = [\"q\"]", 5, "`positive` names `q`"),
+            ("force = \"fc*d\"\nlinear = [\"fc\", \"fc\"]", 5, "`fc` is listed twice"),
+            ("force = \"d*t\"\nlinear = [\"t\"]", 5, "`t` already means something"),
+            ("force = \"fc*d\"\nlinear = [\"f c\"]", 5, "`f c` is no name"),
+            (
+                "force = \"fc*d\"\nlinear = [\"fc\"]\nrequire = [\"fc - q\"]",
+                6,
+                "`require`: `q` is no parameter",
+            ),
+            ("force = \"fc*d\"\nlinear = [\"fc\"]\nsurcharge = -1", 6, "`surcharge` must be"),
+            // [inner]
+            (
+                "force = \"k*d/x\"\nlinear = [\"k\"]\n[inner]\nx = { grid = [1.0], scale = \"mean(d)\" }",
+                7,
+                "unknown scale function `mean`",
+            ),
+            (
+                "force = \"k*d/x\"\nlinear = [\"k\"]\n[inner]\nx = { grid = [1.0], scale = \"big\" }",
+                7,
+                "scale `big` is none of",
+            ),
+            (
+                "force = \"k*d/x\"\nlinear = [\"k\"]\n[inner]\nx = { grid = [1.0], scale = \"rms(v)\" }",
+                7,
+                "`v` is no channel of this law",
+            ),
+            (
+                "force = \"k*d/x\"\nlinear = [\"k\"]\n[inner]\nx = { grid = [] }",
+                7,
+                "`grid` must list finite first values",
+            ),
+            (
+                "force = \"k*d/x\"\nlinear = [\"k\"]\n[inner]\nx = { grid = [nan] }",
+                7,
+                "`grid` must list finite first values",
+            ),
+            (
+                "force = \"k*d/x\"\nlinear = [\"k\"]\n[inner]\nx = { grid = [5], high = 1 }",
+                7,
+                "must enclose the grid",
+            ),
+            (
+                "force = \"k*d/x\"\nlinear = [\"k\"]\n[inner]\nx = { grid = [5], scal = \"1\" }",
+                7,
+                "unknown field `scal`",
+            ),
+            // [states]
+            (&format!("{state}equation = \"z' = d' -\"\nunit = \"d\""), 7, "equation"),
+            (&format!("{state}equation = \"z' + d'\"\nunit = \"d\""), 7, "="),
+            (&format!("{state}equation = \"d' = d\"\nunit = \"d\""), 7, "does not mention `z`"),
+            (&format!("{state}equation = \"z = d\"\nunit = \"d\""), 7, "holds no derivative of `z`"),
+            (
+                &format!("{state}equation = \"z'^2 = d'\"\nunit = \"d\""),
+                7,
+                "linear in its highest derivative, `z'`",
+            ),
+            (&format!("{state}equation = \"z' = q*d'\"\nunit = \"d\""), 7, "the equation uses `q`"),
+            (&format!("{state}equation = \"z' = k*d'\"\nunit = \"d\""), 5, "reach it through `[first]`"),
+            (&format!("{state}equation = \"z' = d'\"\nunit = \"m\""), 8, "`unit`: `m` is none of d, t, pi"),
+            (
+                &format!("{state}equation = \"z' = d'\"\nunit = \"d\"\nstart = [\"q\"]"),
+                9,
+                "`start`: `q` is none of",
+            ),
+            (&format!("{state}equation = \"z' = d'\""), 6, "missing field `unit`"),
+            // [first]
+            (&format!("{first}[first]\nfc = \"q\""), 7, "`q` is neither under `linear` nor under `[inner]`"),
+            (&format!("{first}[first]\nfc = \"a\"\nq = \"a\""), 8, "the law does not use `q`"),
+            (&format!("{first}[first]\nfc = 3"), 7, "write the formula as a string"),
+            (&format!("{first}[first]\nfc = \"a^2\""), 5, "through `[first]` the law is not linear in a"),
+            (
+                "force = \"fc*z\"\nlinear = [\"a\"]\n[states.z]\nequation = \"z' = d' - fc*z\"\nunit = \"d\"\n[first]\nfc = \"a\"",
+                5,
+                "the equation of the state `z` depends on a",
+            ),
+            // [location], [report], [equals]
+            (
+                "force = \"fc*d\"\nlinear = [\"fc\"]\n[location]\nvariable = \"v\"",
+                7,
+                "[location] variable: `v`",
+            ),
+            (
+                "force = \"fc*d\"\nlinear = [\"fc\"]\n[location]\nvariable = \"d'\"\nlow = \"-2*vs\"",
+                8,
+                "[location] low: `vs` is no parameter",
+            ),
+            (
+                "force = \"fc*d\"\nlinear = [\"fc\"]\n[report]\nf0 = \"sqrt(q)\"",
+                7,
+                "[report] f0: `q` is no parameter",
+            ),
+            (
+                "force = \"fc*d\"\nlinear = [\"fc\"]\n[equals]\nlinear_stiffness = { kg = \"q\" }",
+                7,
+                "[equals] linear_stiffness: `q` is no parameter",
+            ),
+        ];
+        for (rest, line, part) in rows {
+            let about =
+                if rest.contains("[about]") || *line == 4 && part.starts_with("inv") { "" } else { TAIL };
+            let (found, message) = error(&format!("{rest}{about}"));
+            assert!(message.contains(part), "`{part}` is not in `{message}` for:\n{rest}");
+            assert_eq!(found, (*line > 0).then_some(*line), "`{message}` for:\n{rest}");
         }
     }
 
     #[test]
-    fn wrong_files_are_refused_with_the_mend() {
-        let base = "kind = \"k\"\nfamily = \"f\"\non = \"motion\"\n";
-        let error =
-            |rest: &str| Mechanism::from_toml(&format!("{base}{rest}"), "x.toml").unwrap_err().to_string();
-        assert!(error("force = \"fc*sign(d')\"").contains("uses `fc`"));
-        assert!(error("replace = \"d\"").contains("has `force`"));
-        assert!(error("force = \"fc*sign(d'\"\nlinear = [\"fc\"]").contains("force"));
-        assert!(error("force = \"fc^2*d\"\nlinear = [\"fc\"]").contains("not linear"));
-        assert!(error("force = \"d\"\npositive = [\"q\"]").contains("no parameter"));
-        assert!(error("force = \"d\"\ncolour = 1").contains("colour"));
-        assert!(
-            error("force = \"k*d/x\"\nlinear = [\"k\"]\n[inner]\nx = { grid = [1.0], scale = \"mean(d)\" }")
-                .contains("unknown scale function `mean`")
+    fn a_library_is_put_together() {
+        let file = |rest: &str| format!("{HEAD}force = \"fc*sign(d')\"\nlinear = [\"fc\"]\n{rest}{TAIL}");
+        let own = |name: &str, text: String| combine(&[(name.to_string(), text)]);
+        let library = own("k.toml", file("")).unwrap();
+        let count = BUILT_IN.len();
+        assert_eq!(
+            (library.mechanisms.len(), library.added.len(), library.replaced.len()),
+            (count + 1, 1, 0)
         );
+        // The name and the kind of a built-in file: it is replaced, in its place.
+        let text = file("").replace("\"k\"", "\"coulomb_friction\"");
+        let library = own("coulomb_friction.toml", text.clone()).unwrap();
+        assert_eq!(
+            (library.mechanisms.len(), library.replaced.as_slice()),
+            (count, &["coulomb_friction.toml".to_string()][..])
+        );
+        let place = BUILT_IN.iter().position(|f| f.0 == "coulomb_friction.toml").unwrap();
+        assert_eq!(library.mechanisms[place].family, "f");
+        assert_eq!(own("mine.toml", text).unwrap().replaced.len(), 0, "another form of the kind");
+        for (rest, line, part) in [
+            (
+                "refines = [\"coulomb\"]",
+                6,
+                "`refines` names `coulomb`, a kind that the library does not have",
+            ),
+            ("[equals]\ncoulomb = { fc = \"fc\" }", 7, "[equals] names `coulomb`"),
+            ("[equals]\ncoulomb_friction = { fs = \"fc\" }", 7, "it has no parameter `fs`"),
+        ] {
+            let e = own("x.toml", file(rest)).unwrap_err();
+            assert!(e.message.contains(part), "{e}");
+            assert_eq!((e.line, e.file.as_str()), (Some(line), "x.toml"), "{e}");
+        }
+        // A kind of one's own may be refined by another.
+        let files = [
+            ("a.toml".to_string(), file("refines = [\"j\"]")),
+            ("b.toml".to_string(), file("").replace("\"k\"", "\"j\"")),
+        ];
+        assert_eq!(combine(&files).unwrap().added, ["a.toml", "b.toml"]);
     }
 }

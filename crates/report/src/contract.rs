@@ -109,7 +109,8 @@ pub struct Mechanism {
     /// The model parameter that drifts, for `parameter_drift`.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub drifting: Option<String>,
-    /// Identified parameters of the expression.
+    /// Identified parameters of the expression, and the figures that follow from them (a resonance: `f0` in
+    /// Hz, `zeta`).
     pub parameters: Ordered<Estimate>,
     /// Share of the calibrated model's residual variance (above noise) that it explains, 0 to 1.
     #[serde(with = "number")]
@@ -122,8 +123,34 @@ pub struct Mechanism {
     /// Other explanations considered, most confident first.
     #[serde(default)]
     pub alternatives: Vec<Alternative>,
+    /// The experiment that separates it from its alternatives; absent where there is none.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub experiment: Option<Experiment>,
     /// Where it acts.
     pub location: Location,
+}
+
+/// A recording to make. Every number comes from the present recordings or from the law; one that neither
+/// gives is absent.
+#[derive(Debug, Clone, PartialEq, Default, Serialize, Deserialize, JsonSchema)]
+pub struct Experiment {
+    /// In plain language.
+    pub text: String,
+    /// Input of the model to drive.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub input: Option<String>,
+    /// Its smallest and largest magnitude, in its unit.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub amplitude: Option<Interval>,
+    /// Frequencies in Hz.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub band_hz: Option<Interval>,
+    /// Expression of the model that should pass through `range`.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub variable: Option<String>,
+    /// The range; an open end is `null`.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub range: Option<[Option<f64>; 2]>,
 }
 
 /// A name, or a list of names where more than one equation is meant.
@@ -273,6 +300,9 @@ pub struct Remainder {
     /// The recording that would tell what it is, in plain language.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub experiment: Option<String>,
+    /// The same with its numbers.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub experiment_plan: Option<Experiment>,
 }
 
 /// How well the models reproduce the measurements.

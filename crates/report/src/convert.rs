@@ -12,6 +12,7 @@ use greybox_recording::{Recording, Severity as Level, health};
 
 use crate::contract::*;
 use crate::page::{self, MechanismPlot, ModelTexts, Page, Residual, Spectrum, StateMap};
+use crate::suggest::{self, Basis, InputRange, Subject};
 
 /// What the conversion needs beside the diagnosis.
 pub struct Sources<'a> {
@@ -28,6 +29,8 @@ pub struct Sources<'a> {
 /// The contract's report.
 pub fn report(diagnosis: &Diagnosis, sources: &Sources<'_>) -> Report {
     let d = diagnosis;
+    let basis = basis(d);
+    let plan = remainder_plan(d, &basis);
     let mut report = Report {
         greybox: Producer { version: env!("CARGO_PKG_VERSION").to_string(), seed: d.seed },
         model: ModelId { name: d.nominal.name.clone(), file: sources.model_file.to_string() },
@@ -37,16 +40,13 @@ pub fn report(diagnosis: &Diagnosis, sources: &Sources<'_>) -> Report {
             Answer::Unexplained => Verdict::Unexplained,
         },
         summary: Vec::new(),
-        mechanisms: d.mechanisms.iter().map(|m| mechanism(m, &d.improved)).collect(),
+        mechanisms: d.mechanisms.iter().map(|m| mechanism(m, &d.improved, &basis)).collect(),
         remainder: Remainder {
             significant: d.remainder.significant,
             location: location(&d.remainder.location),
             share_of_residual: d.remainder.share_of_residual,
-            experiment: d.remainder.shape.as_ref().map(|shape| {
-                format!(
-                    "the residual looks like {shape}; record slow sweeps over the whole range of that variable, at two amplitudes"
-                )
-            }),
+            experiment: plan.as_ref().map(|plan| plan.text.clone()),
+            experiment_plan: plan,
         },
         parameters: parameters(d),
         fit: fit(d),
@@ -86,7 +86,97 @@ fn equation_names(list: &[String]) -> Names {
     }
 }
 
-fn mechanism(found: &Found, improved: &Model) -> Mechanism {
+/// What the training recordings reach.
+fn basis(d: &Diagnosis) -> Basis {
+    let data = &d.train.data;
+    let inputs = d.nominal.inputs.iter().enumerate().map(|(u, input)| {
+        let values = || data.pieces.iter().filter_map(move |p| p.inputs.get(u)).flatten();
+        let count = values().count().max(1) as f64;
+        InputRange {
+            name: input.name.clone(),
+            unit: input.unit.text.clone(),
+            rms: (values().map(|v| v * v).sum::<f64>() / count).sqrt() / input.unit.factor,
+            largest: values().fold(0.0f64, |m, v| m.max(v.abs())) / input.unit.factor,
+        }
+    });
+    let mut coordinates = Ordered::new();
+    let mut first = 0;
+    for state in &d.improved.states {
+        let mut range = [f64::INFINITY, f64::NEG_INFINITY];
+        for (piece, x) in data.pieces.iter().zip(&d.train.improved.run.x) {
+            for v in x.iter().skip(first * piece.len).take(piece.len) {
+                range = [range[0].min(*v), range[1].max(*v)];
+            }
+        }
+        if range[0] < range[1] && range.iter().all(|v| v.is_finite()) {
+            coordinates.insert(state.name.clone(), range);
+        }
+        first += state.order;
+    }
+    Basis { inputs: inputs.collect(), coordinates, dt: data.pieces.iter().map(|p| p.dt).fold(0.0, f64::max) }
+}
+
+/// The input that stands in the first of these equations that has one.
+fn reaching<'a>(model: &'a Model, equations: &[String]) -> Option<&'a str> {
+    equations.iter().filter_map(|name| model.equation(name)).find_map(|e| {
+        let residual = model.equations[e].residual();
+        model.inputs.iter().map(|i| i.name.as_str()).find(|name| residual.mentions(name))
+    })
+}
+
+fn remainder_plan(d: &Diagnosis, basis: &Basis) -> Option<Experiment> {
+    let shape = d.remainder.shape.as_ref()?;
+    let input = reaching(&d.nominal, &d.remainder.location.equations);
+    Some(suggest::for_remainder(&location(&d.remainder.location), input, basis, shape))
+}
+
+/// The experiment that separates a mechanism from its alternatives, if it has any.
+fn plan(found: &Found, improved: &Model, basis: &Basis) -> Option<Experiment> {
+    let told = found.alternatives.iter().find(|a| !a.separate.is_empty());
+    let rival = told.or(found.alternatives.first())?;
+    let value = |name: &str| {
+        // In the model a name may carry the equation's behind it.
+        let is =
+            |given: &str| given == name || given.strip_prefix(name).is_some_and(|rest| rest.starts_with('_'));
+        let parameters = found.parameters.iter().map(|(n, _, e)| (n, e));
+        let figures = found.figures.iter().map(|(n, e)| (n, e));
+        parameters.chain(figures).find(|(n, _)| is(n)).map(|(_, e)| e.value)
+    };
+    // A threshold of an input is told in the input's unit.
+    let input = found.input.as_deref().or_else(|| reaching(improved, &found.equations));
+    let factor =
+        found.input.as_ref().and_then(|n| improved.input(n)).map_or(1.0, |i| improved.inputs[i].unit.factor);
+    let scaled =
+        |name: &str| value(name).map(|v| if matches!(name, "udz" | "usat") { v / factor } else { v });
+    let location = location(&found.location);
+    Some(suggest::experiment(
+        &Subject {
+            kind: &found.kind,
+            rival: &rival.kind,
+            input,
+            location: &location,
+            value: &scaled,
+            separate: &rival.separate,
+        },
+        basis,
+    ))
+}
+
+/// The unit of a figure that follows from the parameters: frequencies in Hz, damping ratios are pure.
+fn figure_unit(name: &str) -> &'static str {
+    let is = |base: &str| name == base || name.strip_prefix(base).is_some_and(|rest| rest.starts_with('_'));
+    if is("f0") {
+        "Hz"
+    } else if is("zeta") {
+        "1"
+    } else {
+        ""
+    }
+}
+
+fn mechanism(found: &Found, improved: &Model, basis: &Basis) -> Mechanism {
+    let figures =
+        found.figures.iter().map(|(name, e)| (name.clone(), estimate(e, figure_unit(name).to_owned())));
     Mechanism {
         kind: found.kind.clone(),
         equation: equation_names(&found.equations),
@@ -94,7 +184,7 @@ fn mechanism(found: &Found, improved: &Model) -> Mechanism {
         expression: found.expression.clone(),
         replaces: found.input.clone(),
         states: Ordered::new(),
-        drifting: None,
+        drifting: found.drifting.clone(),
         parameters: found
             .parameters
             .iter()
@@ -106,6 +196,7 @@ fn mechanism(found: &Found, improved: &Model) -> Mechanism {
                     .map_or_else(String::new, |u| u.text.clone());
                 (name.clone(), estimate(e, unit))
             })
+            .chain(figures)
             .collect(),
         share_explained: found.share_explained,
         confidence: found.confidence,
@@ -120,6 +211,7 @@ fn mechanism(found: &Found, improved: &Model) -> Mechanism {
                 separate: (!a.separate.is_empty()).then(|| a.separate.clone()),
             })
             .collect(),
+        experiment: plan(found, improved, basis),
         location: location(&found.location),
     }
 }
@@ -504,4 +596,58 @@ fn plots(d: &Diagnosis) -> Vec<MechanismPlot> {
             })
         })
         .collect()
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn figures_have_their_units() {
+        let units = ["f0", "f0_hub", "zeta", "breakaway", "f01"].map(figure_unit);
+        assert_eq!(units, ["Hz", "Hz", "1", "", ""]);
+    }
+
+    #[test]
+    fn a_mechanism_is_told_with_its_figures_and_what_drifts() {
+        let one = |value| Estimated { value, ci95: Some((0.9 * value, 1.1 * value)) };
+        let found = Found {
+            kind: "unmodeled_resonance".into(),
+            signature: String::new(),
+            equations: vec!["fall".into()],
+            channel: None,
+            input: None,
+            drifting: Some("g".into()),
+            expression: "ka*(z - a)".into(),
+            parameters: vec![("g".into(), 0, one(9.81))],
+            figures: vec![("f0".into(), one(4.0)), ("zeta".into(), one(0.02))],
+            share_explained: 0.5,
+            confidence: 0.9,
+            alternatives: vec![greybox_diagnose::diagnosis::Alternative {
+                kind: "actuator_lag".into(),
+                confidence: 0.1,
+                equivalent: false,
+                expression: String::new(),
+                separate: "a sine sweep".into(),
+            }],
+            location: Located::default(),
+            evidence: greybox_diagnose::evidence::Evidence::NONE,
+            curve: None,
+        };
+        let text = "[inputs]\nu = { unit = \"m/s^2\" }\n[states]\nz = { unit = \"m\" }\n[parameters]\n\
+                    g = { value = 9.81, unit = \"m/s^2\" }\n[equations]\nfall = \"z'' = u - g\"\n";
+        let model = Model::from_toml(text, "fall.toml").unwrap();
+        let inputs = vec![InputRange { name: "u".into(), unit: "m/s^2".into(), rms: 0.5, largest: 1.0 }];
+        let basis = Basis { inputs, dt: 0.01, ..Basis::default() };
+        let told = mechanism(&found, &model, &basis);
+        assert_eq!(told.drifting.as_deref(), Some("g"));
+        let units: Vec<(&str, &str)> =
+            told.parameters.iter().map(|(n, e)| (n.as_str(), e.unit.as_str())).collect();
+        assert_eq!(units, [("g", "m/s^2"), ("f0", "Hz"), ("zeta", "1")]);
+        assert_eq!(told.parameters["f0"].ci95, Some(Interval::new(3.6, 4.4)));
+        let experiment = told.experiment.unwrap();
+        assert_eq!(experiment.input.as_deref(), Some("u"), "the input of the equation");
+        let band = experiment.band_hz.unwrap();
+        assert!(band.low < 4.0 && 4.0 < band.high, "around f0: {band:?}");
+    }
 }

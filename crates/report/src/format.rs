@@ -145,8 +145,11 @@ pub fn probability(p: f64) -> String {
     }
 }
 
-/// A unit with raised exponents and middle dots: `kg m^2` → `kg m²`, `N*m/A` → `N·m/A`.
+/// A unit with raised exponents and middle dots: `kg m^2` → `kg m²`, `N*m/A` → `N·m/A`; nothing for a pure number, `1`.
 pub fn unit(text: &str) -> String {
+    if text.trim() == "1" {
+        return String::new();
+    }
     let mut out = String::with_capacity(text.len());
     let mut chars = text.trim().chars().peekable();
     while let Some(c) = chars.next() {

@@ -314,6 +314,7 @@ struct MechanismView {
     parameters: Vec<[String; 4]>,
     location: Vec<(&'static str, String)>,
     alternatives: Vec<AlternativeView>,
+    experiment: String,
     plots: Vec<LawView>,
 }
 
@@ -977,6 +978,10 @@ fn mechanism_view(page: &Page, index: usize, mechanism: &Mechanism) -> Mechanism
         Some(channel) => format!("in the measurement of {}", expression::text(channel)),
         None => sentence::equations(&mechanism.equation).trim_start().to_owned(),
     };
+    let place = match &mechanism.drifting {
+        Some(parameter) => format!("of {} {place}", expression::text(parameter)),
+        None => place,
+    };
     let mut expression_html = expression::html(&mechanism.expression);
     if let Some(replaced) = &mechanism.replaces {
         expression_html = format!("{} → {expression_html}", expression::html(replaced));
@@ -1006,6 +1011,7 @@ fn mechanism_view(page: &Page, index: usize, mechanism: &Mechanism) -> Mechanism
         parameters: parameters.collect(),
         location: location(&mechanism.location, page),
         alternatives: alternatives.collect(),
+        experiment: mechanism.experiment.as_ref().map_or_else(String::new, |e| e.text.clone()),
         plots: law_views(page, Some(index)),
     }
 }

@@ -8,6 +8,7 @@
 //! - [`identified`]: the same for an identification: [`IdentifyReport`]
 //! - [`page`]: what the page shows beside it; [`Page::to_html`] writes the file
 //! - [`sentence`]: the conclusion in plain language, to fill [`Report::summary`]
+//! - [`suggest`]: the experiment that separates a mechanism from its rivals
 //! - [`mod@format`], [`expression`], [`decimate`], [`diff`], [`svg`]: the pure functions underneath
 //!
 //! ```
@@ -38,6 +39,7 @@ mod html;
 pub mod identified;
 pub mod page;
 pub mod sentence;
+pub mod suggest;
 pub mod svg;
 
 pub use contract::Report;

@@ -265,3 +265,17 @@ fn without_an_improved_model_its_column_is_left_out() {
 fn equal_pages_give_equal_bytes() {
     assert_eq!(sample::page().to_html().unwrap(), sample::page().to_html().unwrap());
 }
+
+#[test]
+fn what_drifts_and_the_experiment_are_shown() {
+    let mut page = sample::page();
+    let html = page.to_html().unwrap();
+    assert!(html.contains("<b>To separate them:</b> drive v slowly, up to 3.5 V as now"), "the experiment");
+    let mechanism = &mut page.report.mechanisms[0];
+    mechanism.drifting = Some("ks".to_owned());
+    mechanism.experiment = None;
+    let html = page.to_html().unwrap();
+    let place = format!("of {} in the hub equation", greybox_report::expression::text("ks"));
+    assert!(html.contains(&place), "the parameter that drifts");
+    assert!(!html.contains("To separate them"));
+}

@@ -3,6 +3,7 @@
 use std::path::PathBuf;
 
 use clap::Args;
+use greybox_diagnose::Options;
 use greybox_model::Model;
 use greybox_recording::parse_csv;
 
@@ -46,7 +47,7 @@ pub(crate) fn run(arguments: &Arguments) -> Result<Answer, Failure> {
     let loaded = LoadedModel { model, text: MODEL.to_owned(), file: "rotary_link.toml".to_owned() };
     let train = [parse_csv(TRAIN, "rotary_link_train.csv")?];
     let holdout = [parse_csv(HOLDOUT, "rotary_link_test.csv")?];
-    let results = diagnose(&loaded, &train, &holdout, 0)?;
+    let results = diagnose(&loaded, &train, &holdout, &Options::default())?;
     let mut text = format!(
         "{ABOUT}\nThe model, rotary_link.toml:\n\n{}\nWhat greybox says:\n\n{}",
         indented(MODEL),

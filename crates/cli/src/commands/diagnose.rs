@@ -1,6 +1,6 @@
 //! `greybox diagnose`: what physics does the model leave out?
 
-use std::path::Path;
+use std::path::{Path, PathBuf};
 
 use clap::Args;
 use greybox_diagnose::Options;
@@ -10,7 +10,7 @@ use greybox_report::convert::{self, Sources};
 use crate::answer::Answer;
 use crate::arguments::ModelStudy;
 use crate::failure::Failure;
-use crate::loading::LoadedModel;
+use crate::loading::{self, LoadedModel, Mechanisms};
 use crate::output::OutputFolder;
 use crate::progress::Progress;
 use crate::story;
@@ -19,6 +19,7 @@ use crate::story;
 #[derive(Debug, Args)]
 #[command(after_help = "Example:
   greybox diagnose link.toml run1.csv run2.csv --holdout run3.csv --out result
+  greybox diagnose link.toml run1.csv --mechanisms mine --out result
 
 DIR receives report.json, report.html (self-contained, with plots) and improved.toml. With no --holdout, the
 last fifth of each recording is held out. The same seed and inputs give the same results.")]
@@ -29,15 +30,39 @@ pub(crate) struct Arguments {
     /// Seed of every random choice
     #[arg(long, value_name = "N", default_value_t = 0)]
     seed: u64,
+
+    /// Folder of mechanisms of your own (*.toml), tried beside the built-in ones
+    #[arg(long, value_name = "DIR")]
+    mechanisms: Option<PathBuf>,
 }
 
 pub(crate) fn run(arguments: &Arguments) -> Result<Answer, Failure> {
+    let own = arguments.mechanisms.as_deref().map(loading::mechanisms).transpose()?;
     let (loaded, recordings) = arguments.inputs.read()?;
-    let out = arguments.inputs.folder(&["report.json", "report.html", "improved.toml"])?;
-    let results = diagnose(&loaded, &recordings.train, &recordings.holdout, arguments.seed)?;
+    let results = ["report.json", "report.html", "improved.toml"];
+    let out = arguments.inputs.folder(&results)?;
+    out.spares(&results, own.iter().flat_map(|own| &own.files))?;
+    let options =
+        Options { seed: arguments.seed, library: own.as_ref().map(|o| o.library.mechanisms.clone()) };
+    let results = diagnose(&loaded, &recordings.train, &recordings.holdout, &options)?;
     results.write(&out)?;
-    let text = format!("{}\n{}", results.story, written(&arguments.inputs.study.out));
+    let tried = own.as_ref().map(tried).unwrap_or_default();
+    let text = format!("{}{tried}\n{}", results.story, written(&arguments.inputs.study.out));
     Ok(Answer::new(text, results.json))
+}
+
+/// Which mechanisms beside the built-in ones were tried.
+fn tried(own: &Mechanisms) -> String {
+    let mut text = String::new();
+    for (files, what) in [
+        (&own.library.added, "tried beside the built-in mechanisms"),
+        (&own.library.replaced, "tried in place of the built-in mechanism of the same name"),
+    ] {
+        if !files.is_empty() {
+            text.push_str(&format!("Note: {what}: {}.\n", files.join(", ")));
+        }
+    }
+    text
 }
 
 /// Where the results are.
@@ -88,11 +113,10 @@ pub(crate) fn diagnose(
     loaded: &LoadedModel,
     train: &[Recording],
     holdout: &[Recording],
-    seed: u64,
+    options: &Options,
 ) -> Result<Results, Failure> {
     let progress = Progress::open();
-    let options = Options { seed, ..Options::default() };
-    let diagnosis = greybox_diagnose::diagnose(&loaded.model, train, holdout, &options, &progress)?;
+    let diagnosis = greybox_diagnose::diagnose(&loaded.model, train, holdout, options, &progress)?;
     progress.stage("writing the report");
     let sources = Sources { model_file: &loaded.file, model_text: &loaded.text, train, holdout };
     let report = convert::report(&diagnosis, &sources);

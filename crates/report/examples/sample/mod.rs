@@ -4,8 +4,8 @@
 use std::f64::consts::TAU;
 
 use greybox_report::contract::{
-    Alternative, Estimate, Finding, Fit, FitSet, InputHold, Interval, Location, Mechanism, ModelId, Ordered,
-    Parameter, Producer, RecordingFit, Remainder, Report, Score, Severity, Verdict,
+    Alternative, Estimate, Experiment, Finding, Fit, FitSet, InputHold, Interval, Location, Mechanism,
+    ModelId, Ordered, Parameter, Producer, RecordingFit, Remainder, Report, Score, Severity, Verdict,
 };
 use greybox_report::page::{
     Channel, Input, MechanismPlot, ModelTexts, Page, Recording, Residual, Role, Spectrum, StateMap,
@@ -303,6 +303,17 @@ fn mechanism(windows: Vec<Interval>) -> Mechanism {
                 separate: Some("small reversals that stay inside the stuck zone".to_owned()),
             },
         ],
+        experiment: Some(Experiment {
+            text:
+                "drive v slowly, up to 3.5 V as now, 0.025 to 0.2 Hz, through |θ′| < 0.6: a slow sweep of v \
+                   through zero velocity"
+                    .to_owned(),
+            input: Some("v".to_owned()),
+            amplitude: Some(Interval::new(0.0, 3.5)),
+            band_hz: Some(Interval::new(0.025, 0.2)),
+            variable: Some("theta'".to_owned()),
+            range: Some([Some(-0.6), Some(0.6)]),
+        }),
         location: Location {
             equation: Some("hub".into()),
             windows_s: map([("train.csv", windows)]),
@@ -392,6 +403,7 @@ pub(crate) fn page() -> Page {
             location: Location::default(),
             share_of_residual: 0.03,
             experiment: None,
+            experiment_plan: None,
         },
         parameters: parameters(),
         fit: Fit {

@@ -1,0 +1,345 @@
+//! The experiment that separates an explanation from its rivals: which input, how large, at which
+//! frequencies, over which part of the state space.
+//!
+//! Every number is read off the recordings ([`Basis`]) or off the law that was found; a figure that neither
+//! gives is left out.
+
+use std::f64::consts::PI;
+
+use crate::contract::{Experiment, Interval, Location, Ordered};
+use crate::{expression, format};
+
+/// How far beyond the present recordings an experiment may go.
+const LOUDER: f64 = 1.5;
+
+/// What the present recordings reach.
+#[derive(Debug, Clone, PartialEq, Default)]
+pub struct Basis {
+    /// Each input of the model with its unit, and its RMS and largest magnitude in that unit.
+    pub inputs: Vec<InputRange>,
+    /// Range of each simulated coordinate, in the units of [`Location::region`].
+    pub coordinates: Ordered<[f64; 2]>,
+    /// Sample interval, s.
+    pub dt: f64,
+}
+
+impl Basis {
+    /// The input of this name, else the only one.
+    fn input(&self, name: Option<&str>) -> Option<&InputRange> {
+        let only = || self.inputs.first().filter(|_| self.inputs.len() == 1);
+        self.inputs.iter().find(|i| Some(i.name.as_str()) == name).or_else(only)
+    }
+}
+
+/// What the recordings hold of one input.
+#[derive(Debug, Clone, PartialEq)]
+pub struct InputRange {
+    /// Name in the model.
+    pub name: String,
+    /// Its unit as text.
+    pub unit: String,
+    /// Root mean square.
+    pub rms: f64,
+    /// Largest magnitude.
+    pub largest: f64,
+}
+
+/// What is known of the mechanism.
+#[derive(Clone, Copy)]
+pub struct Subject<'a> {
+    /// Kind.
+    pub kind: &'a str,
+    /// The rival that the experiment is about; empty where there is none.
+    pub rival: &'a str,
+    /// The input that reaches it, where one is known.
+    pub input: Option<&'a str>,
+    /// Where it acts.
+    pub location: &'a Location,
+    /// Value of a parameter or figure by its name in the library, SI.
+    pub value: &'a dyn Fn(&str) -> Option<f64>,
+    /// The kinds' own words on the recording that separates them.
+    pub separate: &'a str,
+}
+
+/// Ways to excite a machine.
+#[derive(Debug, Clone, Copy, PartialEq)]
+enum Way {
+    /// Slowly, up to the present amplitude.
+    Slow,
+    /// Slowly, and further than now.
+    Wide,
+    /// As now, and louder.
+    Loud,
+    /// Around a frequency, Hz.
+    Around(f64),
+    /// The input at zero.
+    Silent,
+    /// The same again.
+    Again,
+    /// A slow ramp of the input to this magnitude.
+    Ramp(f64),
+    /// Steps of the input beyond this magnitude.
+    Beyond(f64),
+    /// As the recordings are, at the frequencies where the mechanism acts.
+    AsNow,
+}
+
+/// What the rival asks for, as far as its figures are known; else what the mechanism itself does.
+fn way(subject: &Subject<'_>) -> Way {
+    match way_of(subject.rival, subject) {
+        Way::AsNow => way_of(subject.kind, subject),
+        found => found,
+    }
+}
+
+fn way_of(kind: &str, subject: &Subject<'_>) -> Way {
+    let corner = |name: &str| {
+        let time = (subject.value)(name).filter(|v| *v > 0.0);
+        time.map_or(Way::AsNow, |time| Way::Around(1.0 / (2.0 * PI * time)))
+    };
+    let threshold = |name: &str, of: fn(f64) -> Way| (subject.value)(name).map_or(Way::AsNow, of);
+    match kind {
+        "coulomb_friction"
+        | "asymmetric_coulomb_friction"
+        | "stribeck_friction"
+        | "presliding_friction"
+        | "viscous_friction"
+        | "load_dependent_friction"
+        | "dead_zone"
+        | "end_stop"
+        | "bouc_wen_hysteresis"
+        | "cogging" => Way::Slow,
+        "linear_stiffness" | "quadratic_stiffness" | "cubic_stiffness" | "gravity" => Way::Wide,
+        "quadratic_drag" | "position_dependent_inertia" => Way::Loud,
+        "actuator_lag" => corner("ta"),
+        "input_delay" => corner("tau"),
+        "sensor_delay" => corner("tsd"),
+        "feedback_delay" => corner("tau_f"),
+        "unmodeled_resonance" => (subject.value)("f0").filter(|f| *f > 0.0).map_or(Way::AsNow, Way::Around),
+        "constant_offset" | "input_offset" | "sensor_offset" | "periodic_disturbance" => Way::Silent,
+        "step_disturbance" | "parameter_drift" => Way::Again,
+        "input_dead_zone" => threshold("udz", |v| Way::Ramp(2.0 * v)),
+        "input_saturation" => threshold("usat", Way::Beyond),
+        _ => Way::AsNow,
+    }
+}
+
+/// The experiment for a mechanism.
+pub fn experiment(subject: &Subject<'_>, basis: &Basis) -> Experiment {
+    let input = basis.input(subject.input);
+    let way = way(subject);
+    let largest = input.map_or(0.0, |i| i.largest);
+    let amplitude = match way {
+        Way::Slow => Some([0.0, largest]),
+        Way::Wide | Way::Loud => Some([largest, LOUDER * largest]),
+        Way::Around(_) | Way::AsNow => input.map(|i| [i.rms, i.largest]),
+        Way::Silent => Some([0.0, 0.0]),
+        Way::Again => Some([largest, largest]),
+        Way::Ramp(end) => Some([0.0, end]),
+        Way::Beyond(start) => Some([start, LOUDER * start.max(largest)]),
+    };
+    // Time is not for the experimenter to pass through; with the input at zero nothing else is either.
+    let region = subject.location.region.iter().next().filter(|(name, _)| *name != "t" && way != Way::Silent);
+    let band = match way {
+        Way::Slow => slow_band(region, basis),
+        Way::Around(f) => decade(f, basis),
+        Way::Loud | Way::AsNow => subject.location.band_hz.map(|b| [b.low, b.high]),
+        Way::Wide | Way::Silent | Way::Again | Way::Ramp(_) | Way::Beyond(_) => None,
+    };
+    let mut found = Experiment {
+        text: String::new(),
+        input: input.map(|i| i.name.clone()),
+        amplitude: amplitude.filter(|_| input.is_some()).and_then(interval),
+        band_hz: band.and_then(interval),
+        variable: region.map(|(name, _)| name.clone()),
+        range: region.map(|(_, range)| *range),
+    };
+    found.text = words(way, &found, input, subject.separate);
+    found
+}
+
+/// The experiment for a remainder without a name: the recordings again, louder.
+pub fn for_remainder(location: &Location, input: Option<&str>, basis: &Basis, shape: &str) -> Experiment {
+    let separate = format!(
+        "the residual looks like {shape}: slow sweeps over the whole range of that variable, at two amplitudes"
+    );
+    let subject = Subject { kind: "", rival: "", input, location, value: &|_| None, separate: &separate };
+    let input = basis.input(subject.input);
+    let mut found = experiment(&subject, basis);
+    found.amplitude = input.and_then(|i| interval([i.largest, LOUDER * i.largest]));
+    found.text = words(Way::Loud, &found, input, &separate);
+    found
+}
+
+fn interval([low, high]: [f64; 2]) -> Option<Interval> {
+    (low.is_finite() && high.is_finite() && low <= high).then(|| Interval::new(low, high))
+}
+
+/// Up to where a sine over the present range would leave the region of rates: a sine of amplitude A and
+/// frequency f has the largest rate 2π f A. Nothing without such a region.
+fn slow_band(region: Option<(&String, &[Option<f64>; 2])>, basis: &Basis) -> Option<[f64; 2]> {
+    let (name, [low, high]) = region?;
+    let range = basis.coordinates.get(name.strip_suffix('\'')?)?;
+    let rate = match (low, high) {
+        (Some(low), Some(high)) => low.abs().max(high.abs()),
+        _ => return None,
+    };
+    let top = rate / (PI * (range[1] - range[0]));
+    (top > 0.0).then_some([0.0, top])
+}
+
+/// The decade around a frequency, as far as the sample interval shows it.
+fn decade(frequency: f64, basis: &Basis) -> Option<[f64; 2]> {
+    let half = 10f64.sqrt();
+    let nyquist = 0.5 / basis.dt;
+    let band = [frequency / half, (frequency * half).min(nyquist)];
+    (band[0] < band[1]).then_some(band)
+}
+
+/// `Drive u slowly, 0.05 … 0.3 Hz, up to 2 V, with θ′ from −0.2 to 0.2; then …`.
+fn words(way: Way, e: &Experiment, input: Option<&InputRange>, separate: &str) -> String {
+    let mut text = String::new();
+    if let (Some(input), Some(amplitude)) = (input, e.amplitude) {
+        let name = expression::text(&input.name);
+        let size = |v: f64| {
+            let unit = format::unit(&input.unit);
+            let space = if unit.is_empty() { "" } else { " " };
+            format!("{}{space}{unit}", format::plain(v))
+        };
+        let (low, high) = (size(amplitude.low), size(amplitude.high));
+        text = match way {
+            Way::Slow => format!("drive {name} slowly, up to {high} as now"),
+            Way::Wide => format!("drive {name} slowly, from {low} as now up to {high}"),
+            Way::Loud => format!("drive {name} as now, {low}, and at up to {high}"),
+            Way::Around(_) => format!("sweep {name} as a sine of {low} to {high}"),
+            Way::AsNow => format!("drive {name} with {low} to {high}"),
+            Way::Silent => format!("record with {name} at zero"),
+            Way::Again => format!("record the same again, {name} up to {high}"),
+            Way::Ramp(_) => format!("ramp {name} slowly between −{high} and {high}"),
+            Way::Beyond(_) => format!("step {name} from {low} up to {high}"),
+        };
+        if let Some(band) = e.band_hz {
+            let (low, high) = (format::plain(band.low), format::plain(band.high));
+            text.push_str(&match band.low > 0.0 {
+                true => format!(", {low} to {high} Hz"),
+                false => format!(", below {high} Hz"),
+            });
+        }
+        if let (Some(variable), Some(range)) = (&e.variable, e.range)
+            && !matches!(way, Way::Silent | Way::Ramp(_) | Way::Beyond(_))
+        {
+            let one = Ordered::from_iter([(variable.clone(), range)]);
+            for condition in crate::sentence::region(&one) {
+                let through = if way == Way::Wide { "beyond" } else { "through" };
+                text.push_str(&format!(", {through} {condition}"));
+            }
+        }
+    }
+    match (text.is_empty(), separate.is_empty()) {
+        (false, false) => format!("{text}: {}", separate.trim_end_matches('.')),
+        (true, _) => separate.trim_end_matches('.').to_owned(),
+        (_, true) => text,
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn basis() -> Basis {
+        Basis {
+            inputs: vec![InputRange { name: "v".into(), unit: "V".into(), rms: 1.0, largest: 2.0 }],
+            coordinates: Ordered::from_iter([("theta".to_owned(), [-0.5, 0.5])]),
+            dt: 0.01,
+        }
+    }
+
+    fn ask(kind: &str, region: &[(&str, [Option<f64>; 2])], values: &[(&str, f64)]) -> Experiment {
+        let region = region.iter().map(|(n, r)| ((*n).to_owned(), *r)).collect();
+        let location = Location { region, band_hz: Some(Interval::new(0.5, 3.0)), ..Location::default() };
+        let value = |name: &str| values.iter().find(|v| v.0 == name).map(|v| v.1);
+        experiment(
+            &Subject {
+                kind,
+                rival: "",
+                input: Some("v"),
+                location: &location,
+                value: &value,
+                separate: "look.",
+            },
+            &basis(),
+        )
+    }
+
+    fn near(found: Option<Interval>, [low, high]: [f64; 2]) {
+        let found = found.unwrap();
+        assert!((found.low - low).abs() < 1e-9 && (found.high - high).abs() < 1e-9, "{found:?}");
+    }
+
+    #[test]
+    fn friction_asks_for_slow_motion_that_stays_in_its_region() {
+        let e = ask("stribeck_friction", &[("theta'", [Some(-0.4), Some(0.4)])], &[]);
+        near(e.amplitude, [0.0, 2.0]);
+        // A sine of amplitude 0.5 and rate 0.4 has 0.4/(2 pi 0.5) Hz.
+        near(e.band_hz, [0.0, 0.4 / PI]);
+        assert_eq!((e.variable.as_deref(), e.range), (Some("theta'"), Some([Some(-0.4), Some(0.4)])));
+        assert_eq!(e.text, "drive v slowly, up to 2 V as now, below 0.127 Hz, through |θ′| < 0.4: look");
+        assert_eq!(
+            ask("gravity", &[("theta", [Some(-1.0), Some(1.0)])], &[]).band_hz,
+            None,
+            "no rate, no band"
+        );
+    }
+
+    #[test]
+    fn a_delay_asks_for_its_corner_and_a_resonance_for_its_frequency() {
+        let half = 10f64.sqrt();
+        let corner = 1.0 / (2.0 * PI * 0.05);
+        near(ask("input_delay", &[], &[("tau", 0.05)]).band_hz, [corner / half, corner * half]);
+        near(ask("unmodeled_resonance", &[], &[("f0", 40.0)]).band_hz, [40.0 / half, 50.0]);
+        assert_eq!(ask("actuator_lag", &[], &[("ta", 1e-5)]).band_hz, None, "above what the samples show");
+        near(ask("actuator_lag", &[], &[]).band_hz, [0.5, 3.0]);
+    }
+
+    #[test]
+    fn amplitudes_follow_the_present_ones_and_the_thresholds() {
+        near(ask("cubic_stiffness", &[], &[]).amplitude, [2.0, 3.0]);
+        near(ask("constant_offset", &[], &[]).amplitude, [0.0, 0.0]);
+        near(ask("parameter_drift", &[], &[]).amplitude, [2.0, 2.0]);
+        near(ask("input_dead_zone", &[], &[("udz", 0.3)]).amplitude, [0.0, 0.6]);
+        near(ask("input_saturation", &[], &[("usat", 1.5)]).amplitude, [1.5, 3.0]);
+        near(ask("belt_friction", &[], &[]).amplitude, [1.0, 2.0]);
+    }
+
+    #[test]
+    fn the_rival_says_what_to_do() {
+        let (location, b) = (Location::default(), basis());
+        let subject = |kind, rival| {
+            experiment(
+                &Subject { kind, rival, input: None, location: &location, value: &|_| None, separate: "" },
+                &b,
+            )
+        };
+        assert_eq!(subject("step_disturbance", "periodic_disturbance").text, "record with v at zero");
+        assert_eq!(subject("step_disturbance", "my_own").text, "record the same again, v up to 2 V");
+    }
+
+    #[test]
+    fn without_an_input_the_words_remain() {
+        let location = Location::default();
+        let subject = Subject {
+            kind: "gravity",
+            rival: "",
+            input: None,
+            location: &location,
+            value: &|_| None,
+            separate: "turn it.",
+        };
+        let mut two = basis();
+        two.inputs.push(InputRange { name: "w".into(), ..two.inputs[0].clone() });
+        for basis in [Basis::default(), two] {
+            let e = experiment(&subject, &basis);
+            assert_eq!((e.text.as_str(), e.input, e.amplitude), ("turn it", None, None));
+        }
+    }
+}
