@@ -634,7 +634,14 @@ fn figure(
 
 /// Three or more forces on one and the same motion: a list that describes some other law piece by piece.
 fn is_patchwork(improved: &Fitted) -> bool {
-    let motions: Vec<_> = improved.parts.iter().filter_map(|p| p.candidate.motion()).collect();
+    let motions: Vec<_> = improved
+        .parts
+        .iter()
+        .filter_map(|p| match &p.candidate.place {
+            Place::Motion(m) => Some(m),
+            _ => None,
+        })
+        .collect();
     motions.iter().any(|m| motions.iter().filter(|o| o.coefficients == m.coefficients).count() >= PATCHES)
 }
 
@@ -685,8 +692,7 @@ impl Left {
         match mechanisms {
             0 if lacks => Verdict::Unexplained,
             0 => Verdict::Consistent,
-            // A list of many effects that still does not reach the noise describes, it does not explain.
-            _ if lacks && (self.explained < 0.9 || mechanisms >= 3) => Verdict::Unexplained,
+            _ if lacks && self.explained < 0.9 => Verdict::Unexplained,
             _ => Verdict::MissingPhysics,
         }
     }

@@ -44,7 +44,7 @@ pub struct Variant {
 
 /// Share of a column's sum of squares that the model's own parameters must leave over: less is a parameter
 /// under another name, and its coefficient would be rounding.
-const INDEPENDENT: f64 = 1e-4;
+const INDEPENDENT: f64 = 3e-4;
 
 /// What the score test says of a candidate's best variant.
 #[derive(Debug, Clone)]
@@ -548,6 +548,8 @@ pub struct Gram {
     np: usize,
     /// JᵀJ + Λ.
     pub jj: Vec<f64>,
+    /// Λ, the prior's precision per parameter.
+    prior: Vec<f64>,
     /// Jᵀr with the prior's pull.
     pub jr: Vec<f64>,
     /// rᵀr.
@@ -626,6 +628,7 @@ pub fn gram(
             let mut part = Gram {
                 np,
                 jj: vec![0.0; np * np],
+                prior: vec![0.0; np],
                 jr: (0..np).map(|a| qr::dot(j(a), &s.r)).collect(),
                 rr: qr::dot(&s.r, &s.r),
                 jg: vec![0.0; np * lanes],
@@ -680,6 +683,7 @@ pub fn gram(
     let mut total = total.unwrap_or(Gram {
         np,
         jj: vec![0.0; np * np],
+        prior: vec![0.0; np],
         jr: vec![0.0; np],
         rr: 0.0,
         jg: vec![0.0; np * lanes],
@@ -691,10 +695,19 @@ pub fn gram(
     for (i, f) in setup.free.iter().enumerate() {
         if f.std.is_finite() && f.std > 0.0 {
             total.jj[i * np + i] += 1.0 / (f.std * f.std);
+            total.prior[i] = 1.0 / (f.std * f.std);
             total.jr[i] += (f.mean - point.parameters[f.index]) / (f.std * f.std);
         }
     }
     total
+}
+
+/// Solves a x = b, scaled to unit diagonal: the parameters' units differ by many decades.
+fn solve_scaled(a: &[f64], n: usize, b: &[f64]) -> Vec<f64> {
+    let d: Vec<f64> = (0..n).map(|i| if a[i * n + i] > 0.0 { a[i * n + i].sqrt() } else { 1.0 }).collect();
+    let scaled: Vec<f64> = (0..n * n).map(|i| a[i] / (d[i / n] * d[i % n])).collect();
+    let b: Vec<f64> = b.iter().zip(&d).map(|(b, d)| b / d).collect();
+    qr::solve_spd(&scaled, n, &b).iter().zip(&d).map(|(x, d)| x / d).collect()
 }
 
 /// A block regressed on the residual, everything else refitted.
@@ -714,14 +727,21 @@ impl Gram {
         (self.rr - qr::dot(&x, &self.jr)).max(0.0)
     }
 
+    /// Share of a column's sum of squares that the parameters cannot do, whatever the prior says of them.
+    fn independence(&self, column: usize, size: f64) -> f64 {
+        let jg: Vec<f64> = (0..self.np).map(|a| self.jg[a * self.lanes + column]).collect();
+        let mut data = self.jj.clone();
+        for (i, p) in self.prior.iter().enumerate() {
+            // A trace of the diagonal keeps unseen parameters from everything.
+            let d = (data[i * self.np + i] - p).max(0.0);
+            data[i * self.np + i] = d * (1.0 + 1e-9);
+        }
+        let x = solve_scaled(&data, self.np, &jg);
+        1.0 - qr::dot(&x, &jg) / size.max(1e-300)
+    }
+
     fn solve(&self, b: &[f64]) -> Vec<f64> {
-        // Scaled to unit diagonal: the parameters' units differ by many decades.
-        let n = self.np;
-        let d: Vec<f64> =
-            (0..n).map(|i| if self.jj[i * n + i] > 0.0 { self.jj[i * n + i].sqrt() } else { 1.0 }).collect();
-        let a: Vec<f64> = (0..n * n).map(|i| self.jj[i] / (d[i / n] * d[i % n])).collect();
-        let b: Vec<f64> = b.iter().zip(&d).map(|(b, d)| b / d).collect();
-        qr::solve_spd(&a, n, &b).iter().zip(&d).map(|(x, d)| x / d).collect()
+        solve_scaled(&self.jj, self.np, b)
     }
 
     /// Regresses block `index`; `positive[i]` drops column i when its coefficient comes out negative.
@@ -745,8 +765,12 @@ impl Gram {
             }
             gr[a] = self.gr[block.start + a] - (0..np).map(|i| jg(i, a) * base[i]).sum::<f64>();
         }
-        let mut kept: Vec<usize> =
-            (0..n).filter(|&a| gg[a * n + a] > INDEPENDENT * self.gg[index][a * n + a]).collect();
+        let mut kept: Vec<usize> = (0..n)
+            .filter(|&a| {
+                let size = self.gg[index][a * n + a];
+                gg[a * n + a] > 0.0 && self.independence(block.start + a, size) > INDEPENDENT
+            })
+            .collect();
         let rr = self.remaining();
         loop {
             if kept.is_empty() {
@@ -825,7 +849,9 @@ pub fn screen_pairs(
     let against = |a: usize| gram.gr[a] - onto(a, &base);
     let rr = gram.remaining().max(1e-300);
     let diagonal: Vec<f64> = (0..n).map(|a| projected(a, a)).collect();
-    let independent: Vec<bool> = (0..n).map(|a| diagonal[a] > INDEPENDENT * gram.gg[0][a * n + a]).collect();
+    let independent: Vec<bool> = (0..n)
+        .map(|a| diagonal[a] > 0.0 && gram.independence(a, gram.gg[0][a * n + a]) > INDEPENDENT)
+        .collect();
     let rest: Vec<f64> = (0..n).map(against).collect();
     let positive = |v: &Variant| -> Vec<bool> {
         let mechanism = &library[candidates[v.candidate].mechanism];

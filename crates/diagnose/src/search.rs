@@ -34,6 +34,8 @@ const SHORT_LIST: usize = 9;
 /// Pairs that are fitted when no single candidate pays, and the residual over noise that calls for them.
 const PAIRS: usize = 4;
 const PAIR_MISFIT: f64 = 1.1;
+/// Residual over noise from which a fit may be stuck.
+const STUCK: f64 = 1.2;
 /// Two explanations whose scores differ by less stay undecided.
 const UNDECIDED: f64 = 3.0;
 /// Log-likelihood gain that another hold must bring.
@@ -457,6 +459,27 @@ impl<'a> Search<'a> {
         if self.keep_holds {
             return best;
         }
+        let gain = |from: &Fitted, to: &Fitted| -> f64 {
+            let kappa = kappa(&to.setup, &to.level, scale, &to.fit.point);
+            (0..kappa.len())
+                .filter(|&c| to.fit.rss[c] > 0.0 && from.fit.rss[c] > 0.0)
+                .map(|c| to.fit.count[c] as f64 * kappa[c] * (from.fit.rss[c] / to.fit.rss[c]).ln())
+                .sum()
+        };
+        // What the model states counts unless the data speak clearly: another hold may have stood in for a
+        // delay that has its own name now.
+        for i in 0..fitted.setup.holds.len() {
+            let stated = self.nominal.holds[i];
+            if best.setup.holds[i] != stated {
+                let mut holds = best.setup.holds.clone();
+                holds[i] = stated;
+                let trial = Fitted { setup: best.setup.with_holds(holds), ..best.clone() };
+                let trial = self.refit(&trial, scale, 10);
+                if gain(&trial, &best) < HOLD_GAIN {
+                    best = trial;
+                }
+            }
+        }
         for i in 0..fitted.setup.holds.len() {
             for hold in [Hold::Zero, Hold::Linear, Hold::BandLimited] {
                 if hold == best.setup.holds[i] {
@@ -469,14 +492,7 @@ impl<'a> Search<'a> {
                 if trial.fit.cost < best.fit.cost * (1.0 - margin) {
                     // Significant for the information that a correlated residual holds, or else the
                     // hold would follow the misfit of a model that lacks something.
-                    let kappa = kappa(&trial.setup, &trial.level, scale, &trial.fit.point);
-                    let gain: f64 = (0..kappa.len())
-                        .filter(|&c| trial.fit.rss[c] > 0.0 && best.fit.rss[c] > 0.0)
-                        .map(|c| {
-                            trial.fit.count[c] as f64 * kappa[c] * (best.fit.rss[c] / trial.fit.rss[c]).ln()
-                        })
-                        .sum();
-                    if gain > HOLD_GAIN {
+                    if gain(&best, &trial) > HOLD_GAIN {
                         best = trial;
                     }
                 }
@@ -587,6 +603,7 @@ impl<'a> Search<'a> {
             }
             self.level(&mut calibrated, &mut state);
         }
+        self.anneal(&mut calibrated, &mut state);
         self.reconsider(&calibrated, &mut state);
         if self.is_coloured(&state, 0.6) && state.noise_is_coloured() {
             self.observer.stage(Stage::Whitening);
@@ -613,6 +630,35 @@ impl<'a> Search<'a> {
             .map(|i| (i, self.nominal.holds[i], current.setup.holds[i]))
             .collect();
         Found { calibrated, improved: current, accepted: state.accepted, better_holds, scale: state.scale }
+    }
+
+    /// A fit that is left well above the noise may be stuck where long segments led it: from the shortest
+    /// segments up again, with all its mechanisms; if that is better, the search goes on from there.
+    fn anneal(&self, calibrated: &mut Fitted, state: &mut State) {
+        if state.misfit() < STUCK || self.lengths.len() < 2 {
+            return;
+        }
+        let mut fitted = state.current.clone();
+        for &length in &self.lengths {
+            let level = same_level(&fitted.setup, &self.nominal.windows(length, MOST_SAMPLES));
+            let hats = Point {
+                parameters: fitted.fit.point.parameters.clone(),
+                starts: fitted.setup.starts(&level, &fitted.fit.point.parameters),
+            };
+            let stitched = fitted.setup.stitch(&fitted.level, &fitted.fit.point, &level, &state.scale);
+            // At the shortest, from the measurements alone: what the long segments believe is in doubt.
+            let points = if length == self.lengths[0] { vec![hats] } else { vec![stitched, hats] };
+            let fit = fitted.setup.fit(&level, &state.scale, &points, limits(25));
+            fitted = Fitted { level, fit, ..fitted };
+        }
+        if fitted.fit.cost < 0.98 * state.current.fit.cost {
+            if fitted.parts.is_empty() {
+                *calibrated = fitted.clone();
+            }
+            state.current = fitted;
+            self.settle(state);
+            self.level(calibrated, state);
+        }
     }
 
     /// Goes on with longer segments.
@@ -930,7 +976,8 @@ impl<'a> Search<'a> {
         let best: f64 = state.current.fit.rss.iter().sum();
         for (c, trial) in trials {
             let near = trial.fit.rss.iter().sum::<f64>() < 1.02 * best;
-            if !near || open[*c] == standing.candidate || trial.parts.len() != state.current.parts.len() {
+            let whole = !self.library[open[*c].mechanism].equals.is_empty();
+            if !near || whole || open[*c] == standing.candidate || trial.parts.len() != state.current.parts.len() {
                 continue;
             }
             for index in 0..trial.parts.len() - 1 {

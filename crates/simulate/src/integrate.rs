@@ -1212,7 +1212,7 @@ impl<'a> Core<'a> {
             // (A state that overflows within the step leaves no slack to interpolate.)
             let t = if t.is_finite() { t } else { 0.5 * (lo + hi) };
             let (least, most) = (lo + 1e-3 * (hi - lo), hi - 1e-3 * (hi - lo));
-            if !(least <= most) {
+            if least > most || least.is_nan() || most.is_nan() {
                 break;
             }
             let t = t.clamp(least, most);
