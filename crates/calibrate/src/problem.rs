@@ -169,7 +169,12 @@ struct Reduced {
 
 impl Problem<'_> {
     /// Simulates every segment and returns its rows; with `jacobian` false only the residuals.
-    pub fn rows(&self, point: &Point, jacobian: bool, signals: Option<&[Arc<SignalLanes>]>) -> Vec<SegmentRows> {
+    pub fn rows(
+        &self,
+        point: &Point,
+        jacobian: bool,
+        signals: Option<&[Arc<SignalLanes>]>,
+    ) -> Vec<SegmentRows> {
         if self.carried.is_empty() && !has_history(self.system) {
             return (0..self.segments.len())
                 .into_par_iter()

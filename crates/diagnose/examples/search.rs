@@ -15,7 +15,10 @@ impl Observer for Talk {
         println!("{:7.2}   best {kind}: {e:?} share {share:.2e}", self.0.elapsed().as_secs_f64());
     }
     fn tried(&self, kind: &str, expression: &str, e: &Evidence) {
-        println!("            {kind:26} {expression:40} score {:9.1} drop {:.4} cv {:.4} t {:.1} + {:.2} focus {:.2}", e.score, e.drop, e.held_out, e.t, e.improving, e.focus);
+        println!(
+            "            {kind:26} {expression:40} score {:9.1} drop {:.4} cv {:.4} t {:.1} + {:.2} focus {:.2}",
+            e.score, e.drop, e.held_out, e.t, e.improving, e.focus
+        );
     }
     fn screened(&self, ranking: &[(&str, f64)]) {
         let text: Vec<String> = ranking.iter().take(14).map(|(k, g)| format!("{k} {g:.3}")).collect();

@@ -16,7 +16,12 @@ pub struct Along<'a> {
 impl<'a> Along<'a> {
     /// Smoothed by model and measurements together ([`crate::smoother`]): states, and the force that each
     /// equation lacks.
-    pub fn observed(setup: &'a Setup, level: &Level, scale: &[f64], point: &Point) -> (Along<'a>, Vec<Vec<Vec<f64>>>) {
+    pub fn observed(
+        setup: &'a Setup,
+        level: &Level,
+        scale: &[f64],
+        point: &Point,
+    ) -> (Along<'a>, Vec<Vec<Vec<f64>>>) {
         let first = Along::smoothed(setup, level, scale, point);
         // Size of each equation's forces: its terms without highest derivatives, in quadrature.
         let model = &setup.model;
@@ -61,7 +66,8 @@ impl<'a> Along<'a> {
             tolerance: &setup.hats.tolerance,
         };
         let smoothed = crate::smoother::smooth(setup, &given);
-        let along = Along { setup, states: smoothed.states, parameters: point.parameters.clone(), simulated: false };
+        let along =
+            Along { setup, states: smoothed.states, parameters: point.parameters.clone(), simulated: false };
         (along, smoothed.forces)
     }
 

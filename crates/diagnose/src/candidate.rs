@@ -43,7 +43,7 @@ pub fn candidates(model: &Model, library: &[Mechanism], places: &[Place]) -> Vec
                 | (On::Feedback, Place::Spring { motion, .. }) => has(mechanism, "d", motion),
                 (On::Load, Place::Load { motion, .. }) => has(mechanism, "d", motion),
                 (On::Pair, Place::Pair { own, other }) => {
-                    let seen = symmetric && pairs.iter().any(|p| *p == (other, own));
+                    let seen = symmetric && pairs.contains(&(other, own));
                     pairs.push((own, other));
                     !seen && has(mechanism, "d", own) && has(mechanism, "o", other)
                 }
@@ -204,8 +204,11 @@ impl Candidate {
                 || matches!(n, "t" | "pi")
         };
         let suffix = self.place.equations(model).first().cloned().unwrap_or_default();
-        let plain: Vec<String> =
-            mechanism.parameters().chain(mechanism.states.iter().map(|s| s.name.as_str())).map(str::to_string).collect();
+        let plain: Vec<String> = mechanism
+            .parameters()
+            .chain(mechanism.states.iter().map(|s| s.name.as_str()))
+            .map(str::to_string)
+            .collect();
         let mut all = if plain.iter().any(|n| taken(n)) {
             plain
                 .iter()
@@ -321,7 +324,13 @@ impl Candidate {
             });
         }
         for (name, (lhs, rhs, unit)) in states.iter().zip(equations) {
-            model.states.push(State { name: name.clone(), unit, order: 1, channel: None, initial: Vec::new() });
+            model.states.push(State {
+                name: name.clone(),
+                unit,
+                order: 1,
+                channel: None,
+                initial: Vec::new(),
+            });
             model.equations.push(Equation { name: name.clone(), lhs, rhs });
         }
         model.recompute_orders();

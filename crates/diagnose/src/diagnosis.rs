@@ -384,10 +384,22 @@ fn conclude(
     let full: f64 = raw_rss(&improved, &found.scale).iter().sum();
     let base = search.rss_at(&calibrated, &improved, &found.scale);
     let left = Left::of(&improved, &found.scale, surface.as_ref(), base);
-    let verdict = if is_patchwork(&improved) { Verdict::Unexplained } else { left.verdict(improved.parts.len()) };
+    let verdict =
+        if is_patchwork(&improved) { Verdict::Unexplained } else { left.verdict(improved.parts.len()) };
     let significant = left.significant(improved.parts.len()) || verdict == Verdict::Unexplained;
     let mut mechanisms = if verdict == Verdict::MissingPhysics {
-        findings(&improved, &found, &nominal.model, library, search, &scale, base, full, &train_role, &uncertainty)
+        findings(
+            &improved,
+            &found,
+            &nominal.model,
+            library,
+            search,
+            &scale,
+            base,
+            full,
+            &train_role,
+            &uncertainty,
+        )
     } else {
         Vec::new()
     };
@@ -424,7 +436,11 @@ fn conclude(
 /// Residual RMS per channel, SI, whatever the noise model.
 fn residual_rms(fitted: &Fitted, scale: &[f64]) -> Vec<f64> {
     let rss = raw_rss(fitted, scale);
-    rss.iter().zip(&fitted.fit.count).zip(scale).map(|((r, n), s)| s * (r / (*n).max(1) as f64).sqrt()).collect()
+    rss.iter()
+        .zip(&fitted.fit.count)
+        .zip(scale)
+        .map(|((r, n), s)| s * (r / (*n).max(1) as f64).sqrt())
+        .collect()
 }
 
 fn residual_scale(fitted: &Fitted, scale: &[f64]) -> Vec<f64> {
@@ -543,7 +559,10 @@ impl Uncertainty {
                 let (from, to) = (b * n / parts, (b + 1) * n / parts);
                 let score = |a: usize| -> f64 {
                     let column = &p.jp[a * m..(a + 1) * m];
-                    (0..ny).map(|c| c * n + from..c * n + to).map(|r| qr::dot(&column[r.clone()], &p.r[r])).sum()
+                    (0..ny)
+                        .map(|c| c * n + from..c * n + to)
+                        .map(|r| qr::dot(&column[r.clone()], &p.r[r]))
+                        .sum()
                 };
                 scores.push((0..np).map(score).collect());
             }
@@ -735,10 +754,7 @@ fn findings(
             let mechanism = &library[part.candidate.mechanism];
             let accepted = found.accepted.iter().find(|a| a.candidate == part.candidate);
             let without = search.rss_without(improved, i, &found.scale).unwrap_or(base);
-            let evidence = accepted.map_or(
-                Evidence::NONE,
-                |a| a.evidence,
-            );
+            let evidence = accepted.map_or(Evidence::NONE, |a| a.evidence);
             // Posterior weights of the explanations tried; equivalent ones share their weight.
             let rivals = accepted.map_or(&[][..], |a| &a.rivals[..]);
             let weight = |score: f64| (0.5 * (score - evidence.score)).clamp(-60.0, 0.0).exp();
@@ -789,7 +805,9 @@ fn findings(
             let figures = mechanism
                 .report
                 .iter()
-                .filter_map(|(name, e)| Some((name.clone(), figure(improved, uncertainty, mechanism, part, e)?)))
+                .filter_map(|(name, e)| {
+                    Some((name.clone(), figure(improved, uncertainty, mechanism, part, e)?))
+                })
                 .collect();
             // Where the data cannot tell at which of several places it acts, all are named.
             let mut places = part.candidate.place.equations(nominal);

@@ -188,8 +188,8 @@ pub struct Side<'a> {
 /// Weighs the richer model (`new`) against the simpler (`old`), both fitted with the same scale.
 pub fn weigh(old: &Side<'_>, new: &Side<'_>, count: &[usize], kappa: &[f64], whitened: bool) -> Evidence {
     let effective: f64 = count.iter().zip(kappa).map(|(n, k)| *n as f64 * k).sum();
-    let mut score = -(new.parameters - old.parameters) * effective.max(2.0).ln()
-        - 2.0 * (new.surcharge - old.surcharge);
+    let mut score =
+        -(new.parameters - old.parameters) * effective.max(2.0).ln() - 2.0 * (new.surcharge - old.surcharge);
     for c in 0..count.len() {
         if new.rss[c] > 0.0 && old.rss[c] > 0.0 {
             score += count[c] as f64 * kappa[c] * (old.rss[c] / new.rss[c]).ln();

@@ -7,9 +7,9 @@ pub mod library;
 pub mod locate;
 pub mod place;
 pub mod screen;
-pub mod spectra;
 pub mod search;
 pub mod smoother;
+pub mod spectra;
 pub mod surface;
 
 pub use diagnosis::{Calibration, DiagnoseError, Diagnosis, Estimate, Options, Verdict, calibrate, diagnose};

@@ -109,8 +109,7 @@ impl Place {
 /// Names of the equations with weight, the one whose own coordinate is the motion first.
 fn weighted_equations(model: &Model, weights: &[f64], coefficients: &[f64]) -> Vec<String> {
     let own = own_coordinates(model);
-    let mut named: Vec<usize> =
-        (0..weights.len().min(own.len())).filter(|&e| weights[e] != 0.0).collect();
+    let mut named: Vec<usize> = (0..weights.len().min(own.len())).filter(|&e| weights[e] != 0.0).collect();
     named.sort_by_key(|&e| {
         let alone =
             own[e].is_some_and(|j| coefficients.iter().enumerate().all(|(i, c)| (*c != 0.0) == (i == j)));
@@ -186,11 +185,8 @@ pub fn places(model: &Model) -> Vec<Place> {
         c[j] = 1.0;
         (w, c)
     };
-    let own: Vec<(usize, usize)> = own_coordinates(model)
-        .into_iter()
-        .enumerate()
-        .filter_map(|(e, own)| own.map(|j| (e, j)))
-        .collect();
+    let own: Vec<(usize, usize)> =
+        own_coordinates(model).into_iter().enumerate().filter_map(|(e, own)| own.map(|j| (e, j))).collect();
     for &(e, j) in &own {
         let (w, c) = alone(e, j);
         add(w, c);
@@ -220,10 +216,14 @@ pub fn places(model: &Model) -> Vec<Place> {
     out.extend((0..model.equations.len()).map(Place::Equation));
     out.extend((0..model.inputs.len()).map(Place::Input));
     out.extend((0..model.measurements.len()).map(Place::Measurement));
-    out.extend((0..model.parameters.len()).filter(|&p| {
-        let name = &model.parameters[p].name;
-        !model.parameters[p].fixed && model.equations.iter().any(|e| e.residual().mentions(name))
-    }).map(Place::Parameter));
+    out.extend(
+        (0..model.parameters.len())
+            .filter(|&p| {
+                let name = &model.parameters[p].name;
+                !model.parameters[p].fixed && model.equations.iter().any(|e| e.residual().mentions(name))
+            })
+            .map(Place::Parameter),
+    );
     out.extend(springs);
     let single: Vec<Motion> = own
         .iter()

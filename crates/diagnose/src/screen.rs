@@ -245,8 +245,7 @@ fn variants(
                 .collect()
         };
         let Some(columns) = columns else { continue };
-        let variant =
-            Variant { candidate: index, inner, scales: scales.clone(), columns: 0..0, secant };
+        let variant = Variant { candidate: index, inner, scales: scales.clone(), columns: 0..0, secant };
         out.push((variant, columns));
     }
     out
@@ -284,7 +283,8 @@ impl<'a> Law<'a> {
     ) -> Option<Law<'a>> {
         let model = &setup.model;
         // The file's own names may also be names of the model: mark them.
-        let own = |n: &str| mechanism.parameters().any(|p| p == n) || mechanism.states.iter().any(|s| s.name == n);
+        let own =
+            |n: &str| mechanism.parameters().any(|p| p == n) || mechanism.states.iter().any(|s| s.name == n);
         let rename = |n: &str| if own(n) { format!("mechanism#{n}") } else { n.to_string() };
         let mut change = vec![candidate.translate(model, &mechanism.law, &rename) - candidate.base(model)];
         if let Some(reaction) = &mechanism.reaction {
@@ -395,9 +395,7 @@ impl Recall {
         }
         let signal = |name: &str, primes: u8| format!("{name}#{primes}");
         let put = |e: &Expr| {
-            e.substitute(&|n, p| {
-                used.iter().any(|u| u.0 == n && u.1 == p).then(|| Expr::var(&signal(n, p)))
-            })
+            e.substitute(&|n, p| used.iter().any(|u| u.0 == n && u.1 == p).then(|| Expr::var(&signal(n, p))))
         };
         let none = Unit::dimensionless;
         let mut model = Model {
@@ -412,7 +410,13 @@ impl Recall {
             states: mechanism
                 .states
                 .iter()
-                .map(|s| State { name: s.name.clone(), unit: none(), order: 1, channel: None, initial: vec![] })
+                .map(|s| State {
+                    name: s.name.clone(),
+                    unit: none(),
+                    order: 1,
+                    channel: None,
+                    initial: vec![],
+                })
                 .collect(),
             parameters: mechanism
                 .parameters()
@@ -431,10 +435,8 @@ impl Recall {
         };
         model.recompute_orders();
         let system = System::compile(&model).ok()?;
-        let exprs: Vec<Expr> = used
-            .iter()
-            .map(|(n, p)| candidate.translate(&setup.model, &Expr::prime(n, *p), &keep))
-            .collect();
+        let exprs: Vec<Expr> =
+            used.iter().map(|(n, p)| candidate.translate(&setup.model, &Expr::prime(n, *p), &keep)).collect();
         let series = along.eval(&exprs, &[])?;
         let environments = setup
             .data
@@ -526,7 +528,8 @@ fn grid(
         let mut values: Vec<f64> = inner.grid.iter().map(|g| g * scale).collect();
         if let Some(variable) = &inner.spectral {
             let proposed = spectra.propose(candidate, variable);
-            values.extend(proposed.into_iter().filter(|v| *v >= inner.low * scale && *v <= inner.high * scale));
+            values
+                .extend(proposed.into_iter().filter(|v| *v >= inner.low * scale && *v <= inner.high * scale));
         }
         out = out
             .iter()
@@ -912,9 +915,9 @@ pub fn screen_pairs(
     let mut out: Vec<Pair> = Vec::new();
     for (gain, i, j, c) in found {
         let (v, w) = (&lanes.variants[usable[i].0], &lanes.variants[usable[j].0]);
-        let known = out.iter().any(|p| {
-            p.members[0].candidate == v.candidate && p.members[1].candidate == w.candidate
-        });
+        let known = out
+            .iter()
+            .any(|p| p.members[0].candidate == v.candidate && p.members[1].candidate == w.candidate);
         if known {
             continue;
         }

@@ -8,11 +8,11 @@ use greybox_model::system::CompileError;
 use greybox_model::{Hold, Model};
 use rayon::prelude::*;
 
+use crate::along::Along;
 use crate::candidate::{Candidate, Instance, candidates};
 use crate::evidence::{Evidence, Side, folds, kappa, weigh};
 use crate::library::Mechanism;
 use crate::place::{Place, places};
-use crate::along::Along;
 use crate::screen::{Pair, Scored, first_states, screen, screen_pairs};
 use crate::{Observer, Stage};
 
@@ -154,7 +154,13 @@ fn limits(iterations: usize) -> Limits {
 
 /// Start values for another model of the same data: states of the same name keep theirs, new ones get
 /// `fresh` (their chains in order, per piece; zero where there is none).
-fn transfer(from: &Setup, level: &Level, starts: &[Vec<f64>], to: &Setup, fresh: &[Vec<f64>]) -> Vec<Vec<f64>> {
+fn transfer(
+    from: &Setup,
+    level: &Level,
+    starts: &[Vec<f64>],
+    to: &Setup,
+    fresh: &[Vec<f64>],
+) -> Vec<Vec<f64>> {
     level
         .segments
         .iter()
@@ -283,7 +289,13 @@ impl<'a> Search<'a> {
     }
 
     /// Fits `base` plus two candidates.
-    fn extend_by_pair(&self, base: &Fitted, open: &[Candidate], pair: &Pair, scale: &[f64]) -> Option<Fitted> {
+    fn extend_by_pair(
+        &self,
+        base: &Fitted,
+        open: &[Candidate],
+        pair: &Pair,
+        scale: &[f64],
+    ) -> Option<Fitted> {
         let n0 = self.nominal.model.parameters.len();
         let old = &base.fit.point;
         let mut parts = self.parts(base);
@@ -295,7 +307,8 @@ impl<'a> Search<'a> {
             let own = first_states(&base.setup, &self.library[candidate.mechanism], candidate, &along)?;
             fresh.iter_mut().zip(own).for_each(|(f, o)| f.extend(o));
         }
-        let (setup, parts) = self.assemble(&base.setup.holds, &old.parameters[..n0], &parts, &base.setup).ok()?;
+        let (setup, parts) =
+            self.assemble(&base.setup.holds, &old.parameters[..n0], &parts, &base.setup).ok()?;
         let parameters = old
             .parameters
             .iter()
@@ -345,7 +358,9 @@ impl<'a> Search<'a> {
         let trials: Vec<Fitted> =
             pairs.par_iter().filter_map(|p| self.extend_by_pair(&current, &open, p, &scale)).collect();
         let total = |f: &Fitted| f.fit.rss.iter().sum::<f64>();
-        let Some(best) = trials.into_iter().min_by(|a, b| total(a).total_cmp(&total(b))) else { return false };
+        let Some(best) = trials.into_iter().min_by(|a, b| total(a).total_cmp(&total(b))) else {
+            return false;
+        };
         let control = self.control(&current, &best, &scale);
         let evidence = self.weigh(&control, &best, &scale);
         let share = (total(&control) - total(&best)) / calibrated_rss(calibrated, &scale).max(1e-300);
@@ -544,7 +559,11 @@ impl<'a> Search<'a> {
             return true;
         }
         if e.whitened {
-            return e.score > threshold && e.drop > 0.003 && e.held_out > 0.0015 && e.t > 1.5 && e.improving >= 0.6;
+            return e.score > threshold
+                && e.drop > 0.003
+                && e.held_out > 0.0015
+                && e.t > 1.5
+                && e.improving >= 0.6;
         }
         let enough = (e.drop > 0.02 && e.held_out > 0.01)
             || (e.kappa > 0.8 && e.drop > 0.005 && e.held_out > 0.004 && e.t > 2.5);
@@ -758,7 +777,8 @@ impl<'a> Search<'a> {
             .par_iter()
             .filter_map(|s| self.trial(current, &open[s.candidate], s, &scale).map(|f| (s.candidate, f)))
             .collect();
-        let Some((winner, chosen, rivals, evidence)) = self.decide(calibrated, current, &open, trials, &scale)
+        let Some((winner, chosen, rivals, evidence)) =
+            self.decide(calibrated, current, &open, trials, &scale)
         else {
             return false;
         };
@@ -778,7 +798,8 @@ impl<'a> Search<'a> {
         let share = if evidence.whitened {
             1.0
         } else {
-            (state.current.fit.rss.iter().sum::<f64>() - chosen.fit.rss.iter().sum::<f64>()) / total.max(1e-300)
+            (state.current.fit.rss.iter().sum::<f64>() - chosen.fit.rss.iter().sum::<f64>())
+                / total.max(1e-300)
         };
         let mechanism = &self.library[winner.mechanism];
         self.observer.weighed(&mechanism.kind, &evidence, share);
@@ -897,8 +918,7 @@ impl<'a> Search<'a> {
             let taken = |c: &Candidate| base.parts.iter().any(|p| p.candidate == *c);
             let open: Vec<Candidate> = self.all.iter().filter(|c| !taken(c)).cloned().collect();
             self.observer.stage(Stage::Screening { candidates: open.len(), found: base.parts.len() });
-            let scored =
-                screen(&base.setup, self.library, &open, &base.level, &state.scale, &base.fit.point);
+            let scored = screen(&base.setup, self.library, &open, &base.level, &state.scale, &base.fit.point);
             let relatives = &self.library[part.candidate.mechanism].about.confused_with;
             let mut short = self.short_list(&open, &scored, 0.003);
             // Those it is confused with at the same place, even where the score test ranks them low.
@@ -915,7 +935,9 @@ impl<'a> Search<'a> {
             let mut trials: Vec<(usize, Fitted)> = short
                 .par_iter()
                 .filter(|s| open[s.candidate] != part.candidate)
-                .filter_map(|s| self.trial(&base, &open[s.candidate], s, &state.scale).map(|f| (s.candidate, f)))
+                .filter_map(|s| {
+                    self.trial(&base, &open[s.candidate], s, &state.scale).map(|f| (s.candidate, f))
+                })
                 .collect();
             if let Some(own) = open.iter().position(|c| *c == part.candidate) {
                 // The fit that stands, its part at the end like that of the others.
@@ -977,7 +999,11 @@ impl<'a> Search<'a> {
         for (c, trial) in trials {
             let near = trial.fit.rss.iter().sum::<f64>() < 1.02 * best;
             let whole = !self.library[open[*c].mechanism].equals.is_empty();
-            if !near || whole || open[*c] == standing.candidate || trial.parts.len() != state.current.parts.len() {
+            if !near
+                || whole
+                || open[*c] == standing.candidate
+                || trial.parts.len() != state.current.parts.len()
+            {
                 continue;
             }
             for index in 0..trial.parts.len() - 1 {

@@ -76,7 +76,8 @@ pub fn smooth(setup: &Setup, given: &Assumptions<'_>) -> Smoothed {
         parts.iter().sum()
     };
     let scored: Vec<f64> = INTENSITIES.iter().map(|q| likelihood(*q)).collect();
-    let best = (0..scored.len()).filter(|&i| scored[i].is_finite()).max_by(|&a, &b| scored[a].total_cmp(&scored[b]));
+    let best =
+        (0..scored.len()).filter(|&i| scored[i].is_finite()).max_by(|&a, &b| scored[a].total_cmp(&scored[b]));
     let power = INTENSITIES[best.unwrap_or(2)];
     let done: Vec<Vec<Vec<f64>>> = chunks
         .par_iter()
@@ -137,7 +138,8 @@ impl<'a> Filter<'a> {
         for e in 0..nz {
             weights[e * nz + e] = 1.0;
         }
-        let signals = SignalLanes { lanes: nz, weights, force: vec![1.0; len * nz], ..SignalLanes::default() };
+        let signals =
+            SignalLanes { lanes: nz, weights, force: vec![1.0; len * nz], ..SignalLanes::default() };
         Filter {
             setup,
             given,
@@ -161,7 +163,8 @@ impl<'a> Filter<'a> {
             seeds: &self.seeds,
         };
         let first = &self.given.first[self.piece];
-        let mut x: Vec<f64> = (0..nx).map(|i| first[i][range.start]).chain(std::iter::repeat_n(0.0, nz)).collect();
+        let mut x: Vec<f64> =
+            (0..nx).map(|i| first[i][range.start]).chain(std::iter::repeat_n(0.0, nz)).collect();
         let mut p = vec![0.0; n * n];
         for i in 0..n {
             let std = if i < nx {
@@ -320,7 +323,7 @@ fn solve_scaled(p: &[f64], b: &[f64], n: usize) -> Option<Vec<f64>> {
                 sum -= l[i * n + k] * l[j * n + k];
             }
             if i == j {
-                if !(sum > 0.0) {
+                if sum <= 0.0 || sum.is_nan() {
                     return None;
                 }
                 l[i * n + i] = sum.sqrt();

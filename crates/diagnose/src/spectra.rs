@@ -67,7 +67,11 @@ impl<'a> Spectra<'a> {
         {
             return values;
         }
-        let values = if variable == Expr::var("t") { self.over_time(equation) } else { self.over(equation, &variable) };
+        let values = if variable == Expr::var("t") {
+            self.over_time(equation)
+        } else {
+            self.over(equation, &variable)
+        };
         if let Ok(mut known) = self.known.lock() {
             known.push((equation, variable, values.clone()));
         }
@@ -90,7 +94,8 @@ impl<'a> Spectra<'a> {
             q.extend(c.iter().flatten().map(|v| if v.is_finite() { *v } else { 0.0 }));
         }
         qr::orthonormalise(&mut q, n, columns.len());
-        let mut f: Vec<f64> = force.iter().copied().flatten().map(|v| if v.is_finite() { *v } else { 0.0 }).collect();
+        let mut f: Vec<f64> =
+            force.iter().copied().flatten().map(|v| if v.is_finite() { *v } else { 0.0 }).collect();
         qr::project_off(&q, n, &mut f);
         let limit = CLIP * (qr::dot(&f, &f) / n.max(1) as f64).sqrt();
         let mut rest = f.into_iter().map(|v| v.clamp(-limit, limit));
@@ -126,7 +131,8 @@ impl<'a> Spectra<'a> {
         let rows = self.setup.with_problem(self.level, self.scale, |p| p.rows(self.point, false, None));
         (0..self.setup.system.ny)
             .map(|c| {
-                let mut out: Vec<Vec<f64>> = self.setup.data.pieces.iter().map(|p| vec![0.0; p.len]).collect();
+                let mut out: Vec<Vec<f64>> =
+                    self.setup.data.pieces.iter().map(|p| vec![0.0; p.len]).collect();
                 for (segment, rows) in self.level.segments.iter().zip(&rows) {
                     let n = segment.range.len();
                     out[segment.piece][segment.range.clone()].copy_from_slice(&rows.r[c * n..(c + 1) * n]);
@@ -150,7 +156,7 @@ impl<'a> Spectra<'a> {
             .collect();
         let low = pairs.iter().fold(f64::INFINITY, |m, p| m.min(p.0));
         let high = pairs.iter().fold(f64::NEG_INFINITY, |m, p| m.max(p.0));
-        if !(high > low) {
+        if high <= low || pairs.is_empty() {
             return Vec::new();
         }
         let step = 0.4 / (high - low) * 2.0;
@@ -160,7 +166,8 @@ impl<'a> Spectra<'a> {
         let jump = jumps.get(jumps.len() * 9 / 10).copied().unwrap_or(0.0);
         let count = ((std::f64::consts::PI / jump.max(1e-300) / step) as usize).clamp(8, MOST);
         // e^{−i n q} by rotation from one n to the next.
-        let turns: Vec<(f64, f64)> = pairs.iter().map(|(q, _)| ((step * q).cos(), -(step * q).sin())).collect();
+        let turns: Vec<(f64, f64)> =
+            pairs.iter().map(|(q, _)| ((step * q).cos(), -(step * q).sin())).collect();
         let mut phasors: Vec<(f64, f64)> = vec![(1.0, 0.0); pairs.len()];
         let power: Vec<f64> = (0..count)
             .map(|_| {
@@ -222,7 +229,8 @@ mod tests {
     #[test]
     fn strong_and_prominent_lines_are_both_proposed() {
         // A steep continuum with a weak line far out: only its prominence shows it.
-        let mut power: Vec<f64> = (0..400).map(|i| 1e6 / (1.0 + (i as f64).powi(3)) * (1.5 + (i as f64 * 2.3).sin())).collect();
+        let mut power: Vec<f64> =
+            (0..400).map(|i| 1e6 / (1.0 + (i as f64).powi(3)) * (1.5 + (i as f64 * 2.3).sin())).collect();
         power[300] += 1.0;
         assert!(lines(&power).contains(&300));
         assert!(!lines(&power)[..LINES].contains(&300));

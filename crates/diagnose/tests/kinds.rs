@@ -92,9 +92,8 @@ fn value(d: &Diagnosis, name: &str) -> f64 {
 #[test]
 fn hysteresis_is_named_and_sized() {
     // z' = v − β|v|z − γ v|z|, force 30 z.
-    let effect = |_: f64, s: &State, _: f64| {
-        (30.0 * s[2], s[1] - 12.0 * s[1].abs() * s[2] - 9.0 * s[1] * s[2].abs())
-    };
+    let effect =
+        |_: f64, s: &State, _: f64| (30.0 * s[2], s[1] - 12.0 * s[1].abs() * s[2] - 9.0 * s[1] * s[2].abs());
     let d = answer(MODEL, 1, &LINES, &effect, 0.0);
     assert_eq!(kinds(&d), ["bouc_wen_hysteresis"]);
     for (name, truth) in [("kh", 30.0), ("be", 12.0), ("ga", 9.0)] {

@@ -150,7 +150,8 @@ fn judge_effects(truth: &Truth, report: &Report, score: &mut Score) {
     // Asymmetric Coulomb friction is Coulomb friction and an offset (DESIGN §2.1).
     for (effect, pair) in truth.effects.iter().zip(&mut pairs) {
         let offset = |m: &Mechanism| matches!(m.kind.as_str(), "constant_offset" | "input_offset");
-        if effect.kind != "asymmetric_coulomb_friction" || pair.is_some() {
+        let whole = pair.is_some_and(|i: usize| mechanisms[i].kind == effect.kind);
+        if effect.kind != "asymmetric_coulomb_friction" || whole {
             continue;
         }
         let coulomb = mechanisms.iter().position(|m| m.kind == "coulomb_friction");
