@@ -168,7 +168,8 @@ impl Setup {
                 }
             }
             let horizon = a..a + ((b - a) as f64 * START_SHARE) as usize;
-            if horizon.len() >= 2 {
+            // Where the past matters, a stretch without it would be fitted to the wrong start.
+            if horizon.len() >= 2 && !greybox_simulate::has_history(&self.system) {
                 let level = Level { segments: vec![Segment { piece, range: horizon }], priors: vec![prior] };
                 let point = Point { parameters: parameters.to_vec(), starts: vec![x0.clone()] };
                 let limits = Limits { iterations: 6, tolerance: 1e-4 };

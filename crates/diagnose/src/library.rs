@@ -248,6 +248,8 @@ pub struct Mechanism {
     pub rank: u8,
     /// The law acts rarely: judged by what it gains where it acts.
     pub rare: bool,
+    /// Reversals of the motion that the data must show at least (a memory is seen by returning).
+    pub reversals: usize,
     /// Whether the mirror image (d → −d) is another candidate.
     pub mirror: bool,
     /// Kinds of which this one is a refinement: at the same place it replaces them.
@@ -335,6 +337,8 @@ struct File {
     rank: Option<u8>,
     #[serde(default)]
     rare: bool,
+    #[serde(default)]
+    reversals: usize,
     #[serde(default)]
     linear: Vec<String>,
     #[serde(default)]
@@ -471,6 +475,7 @@ impl Mechanism {
                 u8::from(raw.on == On::Input)
             }),
             rare: raw.rare,
+            reversals: raw.reversals,
             mirror: raw.mirror,
             refines: raw.refines,
             require: raw.require.iter().map(|t| expression(t, "", "require")).collect::<Result<_, _>>()?,

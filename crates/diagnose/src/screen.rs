@@ -220,6 +220,9 @@ fn variants(
 ) -> Vec<(Variant, Vec<Vec<Component>>)> {
     let mut out = Vec::new();
     let Some(scales) = inner_scales(mechanism, candidate, along, setup) else { return out };
+    if mechanism.reversals > 0 && reversals(candidate, along) < mechanism.reversals {
+        return out;
+    }
     let Some(law) = Law::new(setup, mechanism, candidate, along) else { return out };
     for inner in grid(mechanism, candidate, &scales, spectra) {
         let count = mechanism.linear.len();
@@ -249,6 +252,24 @@ fn variants(
         out.push((variant, columns));
     }
     out
+}
+
+/// How often the motion turns round, small tremors not counted.
+fn reversals(candidate: &Candidate, along: &Along<'_>) -> usize {
+    let rate = candidate.motion().and_then(|m| m.rate.clone());
+    let Some(rate) = rate.and_then(|e| along.eval(&[e], &[])?.pop()) else { return 0 };
+    let n = rate.iter().map(Vec::len).sum::<usize>().max(1) as f64;
+    let rms = (rate.iter().flatten().map(|v| v * v).sum::<f64>() / n).sqrt();
+    rate.iter()
+        .map(|piece| {
+            let (mut sign, mut count) = (0.0, 0);
+            for v in piece.iter().filter(|v| v.abs() > 0.1 * rms) {
+                count += usize::from(sign * v < 0.0);
+                sign = v.signum();
+            }
+            count
+        })
+        .sum()
 }
 
 fn largest(components: &[Component]) -> f64 {

@@ -3,7 +3,7 @@
 
 use std::sync::Arc;
 
-use greybox_calibrate::{Fit, Free, Level, Limits, Point, Setup, free_parameters};
+use greybox_calibrate::{Ending, Fit, Free, Level, Limits, Point, Setup, free_parameters};
 use greybox_model::system::CompileError;
 use greybox_model::{Hold, Model};
 use rayon::prelude::*;
@@ -34,10 +34,19 @@ const SHORT_LIST: usize = 9;
 /// Pairs that are fitted when no single candidate pays, and the residual over noise that calls for them.
 const PAIRS: usize = 4;
 const PAIR_MISFIT: f64 = 1.1;
+/// Fewest samples among which pairs are looked for: there are many pairs.
+const PAIR_SAMPLES: usize = 500;
 /// Residual over noise from which a fit may be stuck.
 const STUCK: f64 = 1.2;
+/// Residual over noise from which a model is far from the noise.
+const FAR: f64 = 2.0;
+/// Fewest samples from which a mechanism with states of its own is looked for.
+const MEMORY_SAMPLES: usize = 200;
 /// Two explanations whose scores differ by less stay undecided.
 const UNDECIDED: f64 = 3.0;
+/// Candidates of a short-list that are fitted to the end, and the steps that decide which.
+const FINALISTS: usize = 5;
+const FIRST_STEPS: usize = 6;
 /// Log-likelihood gain that another hold must bring.
 const HOLD_GAIN: f64 = 10.0;
 /// A simpler model wins when its score is no further behind than this.
@@ -67,6 +76,13 @@ pub struct Fitted {
     pub level: Level,
     /// The fit; its `rss` is in units of the scale it was fitted with.
     pub fit: Fit,
+}
+
+impl Fitted {
+    /// Largest residual RMS over the noise.
+    fn misfit(&self, scale: &[f64]) -> f64 {
+        rms(&self.fit, scale).iter().zip(&self.setup.data.sigma).map(|(r, s)| r / s).fold(0.0, f64::max)
+    }
 }
 
 /// What was tried beside an accepted mechanism.
@@ -202,7 +218,9 @@ impl<'a> Search<'a> {
     /// Prepares the search for a laid-out nominal model.
     pub fn new(nominal: Setup, library: &'a [Mechanism], observer: &'a dyn Observer) -> Search<'a> {
         let places = places(&nominal.model);
-        let all = candidates(&nominal.model, library, &places);
+        let mut all = candidates(&nominal.model, library, &places);
+        let samples: usize = nominal.data.lengths().iter().sum();
+        all.retain(|c| samples >= MEMORY_SAMPLES || library[c.mechanism].states.is_empty());
         let lengths = lengths(&nominal);
         Search { library, observer, keep_holds: false, nominal, all, lengths }
     }
@@ -338,7 +356,11 @@ impl<'a> Search<'a> {
     /// When no single candidate is believable and yet something is missing: the best pairs of those that
     /// only pay together.
     fn pair_round(&self, calibrated: &mut Fitted, state: &mut State) -> bool {
-        if state.current.parts.len() + 2 > MOST_MECHANISMS || state.misfit() < PAIR_MISFIT {
+        let samples: usize = state.current.fit.count.iter().sum();
+        if state.current.parts.len() + 2 > MOST_MECHANISMS
+            || state.misfit() < PAIR_MISFIT
+            || samples < PAIR_SAMPLES
+        {
             return false;
         }
         let current = state.current.clone();
@@ -773,10 +795,7 @@ impl<'a> Search<'a> {
             return false;
         }
         self.observer.stage(Stage::Fitting { candidates: short.len() });
-        let trials: Vec<(usize, Fitted)> = short
-            .par_iter()
-            .filter_map(|s| self.trial(current, &open[s.candidate], s, &scale).map(|f| (s.candidate, f)))
-            .collect();
+        let trials = self.trials(current, &open, &short, &scale);
         let Some((winner, chosen, rivals, evidence)) =
             self.decide(calibrated, current, &open, trials, &scale)
         else {
@@ -808,6 +827,33 @@ impl<'a> Search<'a> {
         }
         self.accept(state, winner, chosen, rivals, evidence);
         true
+    }
+
+    /// Fits a short-list: all of it a little, the more promising half to the end.
+    fn trials(
+        &self,
+        base: &Fitted,
+        open: &[Candidate],
+        short: &[&Scored],
+        scale: &[f64],
+    ) -> Vec<(usize, Fitted)> {
+        let mut trials: Vec<(usize, Fitted)> = short
+            .par_iter()
+            .filter_map(|s| self.trial(base, &open[s.candidate], s, scale).map(|f| (s.candidate, f)))
+            .collect();
+        let total = |f: &Fitted| f.fit.rss.iter().sum::<f64>();
+        trials.sort_by(|a, b| total(&a.1).total_cmp(&total(&b.1)).then(a.0.cmp(&b.0)));
+        let rest = trials.split_off(trials.len().min(FINALISTS));
+        let mut finished: Vec<(usize, Fitted)> = trials
+            .into_par_iter()
+            .map(|(c, f)| {
+                let f = if f.fit.ending == Ending::Limit { self.refit(&f, scale, 12) } else { f };
+                (c, f)
+            })
+            .filter(|(_, f)| self.admissible(f))
+            .collect();
+        finished.extend(rest);
+        finished
     }
 
     /// The strongest candidates, no more than two of a kind.
@@ -932,13 +978,8 @@ impl<'a> Search<'a> {
                 }
             }
             self.observer.stage(Stage::Fitting { candidates: short.len() });
-            let mut trials: Vec<(usize, Fitted)> = short
-                .par_iter()
-                .filter(|s| open[s.candidate] != part.candidate)
-                .filter_map(|s| {
-                    self.trial(&base, &open[s.candidate], s, &state.scale).map(|f| (s.candidate, f))
-                })
-                .collect();
+            short.retain(|s| open[s.candidate] != part.candidate);
+            let mut trials = self.trials(&base, &open, &short, &state.scale);
             if let Some(own) = open.iter().position(|c| *c == part.candidate) {
                 // The fit that stands, its part at the end like that of the others.
                 let mut standing = state.current.clone();
@@ -975,7 +1016,10 @@ impl<'a> Search<'a> {
             }
             let mechanism = &self.library[winner.mechanism];
             self.observer.weighed(&mechanism.kind, &evidence, 1.0);
-            if !self.believable(&evidence, mechanism, 1.0, base.parts.is_empty(), state.loose) {
+            // On few data, what was found on short segments is not traded for a whim of the long ones.
+            if state.current.fit.count.iter().sum::<usize>() < PAIR_SAMPLES
+                || !self.believable(&evidence, mechanism, 1.0, base.parts.is_empty(), state.loose)
+            {
                 continue;
             }
             state.accepted.retain(|a| a.candidate != part.candidate);
@@ -1049,7 +1093,7 @@ impl<'a> Search<'a> {
                     .contains(&self.library[p.candidate.mechanism].kind)
         });
         match refined {
-            None => self.extend(current, candidate, scored, scale, 15),
+            None => self.extend(current, candidate, scored, scale, FIRST_STEPS),
             Some(index) => {
                 let base = self.without(current, index, scale, 6)?;
                 let again = screen(
@@ -1060,7 +1104,7 @@ impl<'a> Search<'a> {
                     scale,
                     &base.fit.point,
                 );
-                self.extend(&base, candidate, again.first()?, scale, 20)
+                self.extend(&base, candidate, again.first()?, scale, FIRST_STEPS)
             }
         }
     }
@@ -1153,9 +1197,11 @@ impl<'a> Search<'a> {
                         *y < (1.0 + slack) * x || (slack > 0.01 && (y - x) < LEAST_SHARE * total)
                     })
                 };
-            // As good in every channel, or within what a likelihood can tell.
-            let simpler =
-                complexity(&b.1) < complexity(&a.1) && (near(0.02) || a.2.score - b.2.score < PARSIMONY);
+            // As good in every channel, or within what a likelihood can tell. Far above the noise each
+            // parameter more must buy its share: there, any flexible law follows what another law lacks.
+            let surplus = complexity(&a.1) - complexity(&b.1);
+            let slack = if a.1.misfit(scale) > FAR { 0.02 * surplus.max(1.0) } else { 0.02 };
+            let simpler = surplus > 0.0 && (near(slack) || a.2.score - b.2.score < PARSIMONY);
             let tie = complexity(&b.1) == complexity(&a.1) && near(0.005) && priority(b.0) < priority(a.0);
             if simpler || tie {
                 best = i;
@@ -1227,7 +1273,7 @@ impl State {
 
     /// Largest residual RMS over the noise.
     fn misfit(&self) -> f64 {
-        rms(&self.current.fit, &self.scale).iter().zip(&self.sigma).map(|(r, s)| r / s).fold(0.0, f64::max)
+        self.current.misfit(&self.scale)
     }
 
     fn rescale(&mut self) {

@@ -22,6 +22,8 @@ const LINES: usize = 6;
 const NEIGHBOURS: usize = 31;
 /// Most values of the spectral variable that are tried.
 const MOST: usize = 3000;
+/// Share of an input's power around a frequency from which the input itself is periodic there.
+const DRIVEN: f64 = 0.15;
 /// Deviations beyond this many standard deviations are clipped.
 const CLIP: f64 = 6.0;
 
@@ -123,7 +125,23 @@ impl<'a> Spectra<'a> {
         for residual in self.residuals() {
             of(&residual);
         }
+        // A frequency that the input itself is made of cannot be told from what the motion does.
+        values.retain(|w| !self.drives(*w));
         distinct(values)
+    }
+
+    /// Whether a good part of an input's power lies at this angular frequency.
+    fn drives(&self, w: f64) -> bool {
+        let pieces = &self.setup.data.pieces;
+        let Some(piece) = pieces.iter().max_by_key(|p| p.len) else { return false };
+        piece.inputs.iter().any(|u| {
+            let (frequency, power) = spectrum(u, piece.dt);
+            let step = frequency.get(1).copied().unwrap_or(f64::INFINITY);
+            let total: f64 = power.iter().sum();
+            let near = |f: f64| (f - w / (2.0 * std::f64::consts::PI)).abs() <= 2.5 * step;
+            let here: f64 = frequency.iter().zip(&power).filter(|(f, _)| near(**f)).map(|(_, p)| p).sum();
+            here > DRIVEN * total
+        })
     }
 
     /// Residuals of the outputs, `[channel][piece][sample]`.

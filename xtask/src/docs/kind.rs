@@ -102,7 +102,13 @@ fn role(on: On) -> &'static str {
 /// The example with the mechanism at its first place.
 fn inserted(m: &Mechanism) -> Result<(Model, Vec<String>)> {
     let mut model = Model::from_toml(EXAMPLE, "example")?;
-    let at = candidates(&model, std::slice::from_ref(m), &places(&model));
+    let mut at = candidates(&model, std::slice::from_ref(m), &places(&model));
+    if at.is_empty() {
+        // What is a free parameter of the example already: shown beside known ones.
+        let mut known = model.clone();
+        known.parameters.iter_mut().for_each(|p| p.fixed = true);
+        at = candidates(&known, std::slice::from_ref(m), &places(&known));
+    }
     // A drift of the friction reads better than one of an inertia.
     let friction = model.parameter("b");
     let chosen = at.iter().find(|c| matches!(c.place, Place::Parameter(p) if Some(p) == friction));
