@@ -26,7 +26,7 @@ const SHORTEST: usize = 40;
 /// Innovations over high-frequency noise from which a correlated residual passes for coloured noise.
 const CLEAR: f64 = 1.35;
 /// Most samples that a level of the search looks at; longer recordings are seen through windows.
-const MOST_SAMPLES: usize = 9000;
+const MOST_SAMPLES: usize = 5000;
 /// Most mechanisms that are looked for.
 const MOST_MECHANISMS: usize = 4;
 /// Most candidates that are fitted per round.
