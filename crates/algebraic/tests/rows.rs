@@ -180,17 +180,6 @@ fn white_noise_scatters_and_correlates_as_the_weights_say() {
     assert!((both.values()[20] - 2.0 * second.values()[20] - 6.0 * value.values()[20]).abs() < 1e-12);
 }
 
-#[test]
-#[ignore = "a time, read by hand: cargo test --release -- --ignored --nocapture"]
-fn time_of_a_long_recording() {
-    let y: Vec<f64> = (0..60_000).map(|k| (0.003 * f64::from(k)).sin()).collect();
-    let kernel = Kernel::new(2, 3, 1000, 1e-3).unwrap();
-    let columns: Vec<_> = (0..20).map(|c| column(&y, c % 3, Hold::Smooth)).collect();
-    let start = std::time::Instant::now();
-    let r = rows(&kernel, &columns, 20).unwrap();
-    println!("{} rows × 20 columns: {:?}", r.len(), start.elapsed());
-}
-
 proptest! {
     #![proptest_config(ProptestConfig::with_cases(64))]
 

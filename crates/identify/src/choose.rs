@@ -35,6 +35,27 @@ pub(crate) struct Solution {
 }
 
 impl Reduced {
+    /// From the triangular factor of \[columns | right-hand side\], `columns + 1` squared, row major.
+    pub(crate) fn from_triangle(t: &[f64], columns: usize, samples: f64, floor: f64) -> Reduced {
+        let stride = columns + 1;
+        Reduced {
+            columns,
+            r: (0..columns * columns).map(|k| t[k / columns * stride + k % columns]).collect(),
+            z: (0..columns).map(|i| t[i * stride + columns]).collect(),
+            rest: t[columns * stride + columns].powi(2),
+            samples,
+            floor,
+        }
+    }
+
+    /// The same with every row counting as `share` of one: sums shrink, the mean square stays as it is.
+    pub(crate) fn weighted(mut self, share: f64) -> Reduced {
+        self.r.iter_mut().chain(&mut self.z).for_each(|v| *v *= share.sqrt());
+        self.rest *= share;
+        self.samples *= share;
+        self
+    }
+
     /// Least squares on `columns`.
     pub(crate) fn solve(&self, columns: &[usize]) -> Solution {
         let (p, k) = (self.columns, columns.len());
@@ -68,15 +89,16 @@ impl Reduced {
         Solution { columns: columns.to_vec(), values, inverse, rss: self.rest + corner * corner }
     }
 
-    /// n ln(RSS/n + floor) + c k + surcharges + [an even term is chosen] · c_e, with k chosen optional terms. The floor
-    /// keeps a noise-free record from paying for terms that only mend rounding.
+    /// n ln(RSS/n + floor) + c k + surcharges + \[an even term is chosen\] · c_e, with k chosen optional
+    /// terms. The floor keeps a noise-free record from paying for terms that only mend rounding.
     fn criterion(&self, solution: &Solution, price: &Price<'_>) -> f64 {
         let n = self.samples;
-        let chosen = solution.columns.iter().filter(|c| !price.kept.contains(c)).count();
-        let broken = solution.columns.iter().any(|c| price.even.contains(c));
+        let Roles { kept, even, surcharge, .. } = price.roles;
+        let chosen = solution.columns.iter().filter(|c| !kept.contains(c)).count();
+        let broken = solution.columns.iter().any(|c| even.contains(c));
         n * (solution.rss / n + self.floor).max(1e-300).ln()
             + price.term * chosen as f64
-            + solution.columns.iter().filter_map(|c| price.surcharge.get(*c)).sum::<f64>()
+            + solution.columns.iter().filter_map(|c| surcharge.get(*c)).sum::<f64>()
             + if broken { BROKEN_SYMMETRY } else { 0.0 }
     }
 
@@ -98,23 +120,23 @@ impl Reduced {
     /// c = ½ ln n + ½ ln(1 + t²) at the lower quartile of |t|,   within   2 ln q ≤ c ≤ ln n .
     /// ```
     ///
-    /// Schwarz's price takes one row's worth of information as prior, whatever the noise. ln(1 + t²) is what a normal prior as wide as the effects costs a coefficient (the empirical-Bayes
-    /// g-prior of George & Foster, Biometrika 87, 2000; a quartile, because sizes spread over decades): where
-    /// true terms stand a hundred standard errors clear of the noise, one at three is doubted; where they
-    /// are barely visible, it is believed. The lower limit pays for looking at q candidates (risk
-    /// inflation, Foster & George, Ann. Statist. 22, 1994), the upper is Schwarz's.
+    /// Schwarz's price takes one row's worth of information as prior, whatever the noise. ln(1 + t²) is what a
+    /// normal prior as wide as the effects costs a coefficient (the empirical-Bayes g-prior of George & Foster,
+    /// Biometrika 87, 2000; a quartile, because sizes spread over decades): where true terms stand a hundred
+    /// standard errors clear of the noise, one at three is doubted; where they are barely visible, it is
+    /// believed. The lower limit pays for looking at q candidates (risk inflation, Foster & George, Ann.
+    /// Statist. 22, 1994), the upper is Schwarz's.
     pub(crate) fn choose(&self, roles: &Roles) -> Solution {
-        let Roles { kept, optional: allowed, even, surcharge } = roles;
         let schwarz = self.samples.ln();
-        let least = 2.0 * (allowed.len().max(2) as f64).ln();
-        let mut solution = self.search(allowed, &Price { kept, even, surcharge, term: schwarz });
+        let least = 2.0 * (roles.optional.len().max(2) as f64).ln();
+        let mut solution = self.search(&Price { roles, term: schwarz });
         let mut price = schwarz;
         for _ in 0..4 {
             let mut sizes: Vec<f64> = self
                 .t_squared(&solution)
                 .into_iter()
                 .zip(&solution.columns)
-                .filter(|(_, c)| !kept.contains(c))
+                .filter(|(_, c)| !roles.kept.contains(c))
                 .map(|(t, _)| t.max(1e-12).ln())
                 .collect();
             sizes.sort_by(f64::total_cmp);
@@ -130,26 +152,27 @@ impl Reduced {
                 break;
             }
             price = middle;
-            solution = self.search(allowed, &Price { kept, even, surcharge, term: price });
+            solution = self.search(&Price { roles, term: price });
         }
         solution
     }
 
     /// The best choice found by backward elimination followed by single additions, removals and
     /// exchanges until none improves the criterion; from all terms and from the odd ones alone.
-    fn search(&self, allowed: &[usize], price: &Price<'_>) -> Solution {
-        let odd: Vec<usize> = allowed.iter().copied().filter(|c| !price.even.contains(c)).collect();
-        let all = self.search_from(allowed, allowed, price);
-        if odd.len() == allowed.len() {
+    fn search(&self, price: &Price<'_>) -> Solution {
+        let Roles { optional, even, .. } = price.roles;
+        let odd: Vec<usize> = optional.iter().copied().filter(|c| !even.contains(c)).collect();
+        let all = self.search_from(optional, price);
+        if odd.len() == optional.len() {
             return all;
         }
-        let symmetric = self.search_from(&odd, allowed, price);
+        let symmetric = self.search_from(&odd, price);
         if self.criterion(&symmetric, price) <= self.criterion(&all, price) { symmetric } else { all }
     }
 
-    /// Backward from `start`, then locally among all `allowed`.
-    fn search_from(&self, start: &[usize], allowed: &[usize], price: &Price<'_>) -> Solution {
-        let kept = price.kept;
+    /// Backward from `start`, then locally among all optional columns.
+    fn search_from(&self, start: &[usize], price: &Price<'_>) -> Solution {
+        let Roles { kept, optional: allowed, .. } = price.roles;
         let value = |s: &Solution| self.criterion(s, price);
         let with = |columns: &mut Vec<usize>| {
             columns.sort_unstable();
@@ -245,10 +268,10 @@ impl Roles {
     }
 }
 
+/// What a choice costs.
 struct Price<'a> {
-    kept: &'a [usize],
-    even: &'a [usize],
-    surcharge: &'a [f64],
+    roles: &'a Roles,
+    /// A term.
     term: f64,
 }
 

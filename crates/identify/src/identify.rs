@@ -239,9 +239,9 @@ pub fn identify(
 
     observer.stage("output error");
     let refined = best_refined(&structure, &data, &first).ok_or(IdentifyError::NoFit)?;
-    let (structure, data, refined) = match options.hold {
-        Some(_) => (structure, data, refined),
-        None => better_hold(structure, data, refined),
+    let (structure, refined) = match options.hold {
+        Some(_) => (structure, refined),
+        None => better_hold(structure, refined),
     };
 
     observer.stage("precision");
@@ -296,20 +296,12 @@ pub(crate) fn structure(recordings: &[Recording], options: &Options) -> Result<S
         check_term(term, options)?;
     }
     // Further inputs act like terms with coefficients of their own.
-    let own_terms = library.terms.len();
     library.terms.extend(options.inputs.iter().skip(1).cloned());
     let mut taken: Vec<String> = options.states.iter().chain(&options.inputs).cloned().collect();
     taken.extend(["t", "pi", "tau", "kp"].map(String::from));
     let mut setting =
         Setting { states: &options.states, derivatives: options.derivatives, orders: options.order, taken };
-    let mut terms = library.terms(&mut setting);
-    for term in &mut terms {
-        // User terms come without parentheses in the report where they need none.
-        let bare = term.expression.trim_start_matches('(').trim_end_matches(')');
-        if options.inputs.iter().skip(1).any(|u| u == bare) && own_terms < library.terms.len() {
-            term.expression = bare.to_string();
-        }
-    }
+    let terms = library.terms(&mut setting);
     let mut extras = Vec::new();
     if let Some(delay) = &options.delay {
         if !options.states.contains(&delay.state) {
@@ -561,9 +553,9 @@ fn best_refined(structure: &Structure, data: &Arc<Data>, first: &First) -> Optio
 }
 
 /// The hold of the inputs that fits best, where the difference is beyond chance.
-fn better_hold(structure: Structure, data: Arc<Data>, refined: Refined) -> (Structure, Arc<Data>, Refined) {
+fn better_hold(structure: Structure, refined: Refined) -> (Structure, Refined) {
     if structure.inputs.is_empty() {
-        return (structure, data, refined);
+        return (structure, refined);
     }
     let mut best: Option<(f64, Structure, Refined)> = None;
     for hold in [Hold::Zero, Hold::BandLimited] {
@@ -577,8 +569,8 @@ fn better_hold(structure: Structure, data: Arc<Data>, refined: Refined) -> (Stru
         }
     }
     match best {
-        Some((_, structure, refined)) => (structure, data, refined),
-        None => (structure, data, refined),
+        Some((_, structure, refined)) => (structure, refined),
+        None => (structure, refined),
     }
 }
 

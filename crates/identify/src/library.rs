@@ -174,8 +174,10 @@ impl Library {
             }
         }
         for (i, term) in self.terms.iter().enumerate() {
+            // A name alone needs no parentheses.
+            let alone = term.chars().all(|c| c.is_alphanumeric() || c == '_');
             out.push(Candidate {
-                expression: format!("({term})"),
+                expression: if alone { term.clone() } else { format!("({term})") },
                 base: format!("a{}", i + 1),
                 powers: Vec::new(),
                 order: 1,

@@ -9,7 +9,7 @@
 
 use std::sync::Arc;
 
-use greybox_calibrate::{Data, Fit, Free, Level, Limits, Point, Setup, qr};
+use greybox_calibrate::{Data, Fit, Free, Level, Limits, Point, SegmentRows, Setup, qr};
 use rayon::prelude::*;
 
 use crate::choose::{Reduced, Roles};
@@ -114,14 +114,8 @@ impl Linearised {
         for &b in drawn {
             gram.iter_mut().zip(&self.blocks[b]).for_each(|(g, v)| *g += v);
         }
-        let r = cholesky(&gram, p + 1);
-        let triangle = |i: usize, j: usize| r[i * (p + 1) + j];
-        Reduced {
-            r: (0..p * p).map(|k| triangle(k / p, k % p)).collect(),
-            z: (0..p).map(|i| triangle(i, p)).collect(),
-            rest: triangle(p, p).powi(2),
-            ..self.reduced.clone()
-        }
+        let Reduced { samples, floor, .. } = self.reduced;
+        Reduced::from_triangle(&cholesky(&gram, p + 1), p, samples, floor)
     }
 }
 
@@ -164,6 +158,17 @@ struct Projected {
     z: Vec<f64>,
 }
 
+/// An orthonormal basis of what a segment's start can absorb, from `jx` in place, and `jp` with it projected
+/// off; columns of `rows`.
+pub(crate) fn project_start(rows: usize, mut jx: Vec<f64>, mut jp: Vec<f64>) -> (Vec<f64>, Vec<f64>) {
+    let nx = jx.len() / rows;
+    qr::orthonormalise(&mut jx, rows, nx);
+    for column in jp.chunks_exact_mut(rows) {
+        qr::project_off(&jx, rows, column);
+    }
+    (jx, jp)
+}
+
 /// Linearises around `refined` with all candidates in `allowed`; `blocks` asks for about as many block Grams.
 pub(crate) fn linearise(
     structure: &Structure,
@@ -185,19 +190,13 @@ pub(crate) fn linearise(
     let projected: Vec<Projected> = rows
         .into_par_iter()
         .map(|s| {
-            let mut q = s.jx;
-            let nx = q.len() / s.rows;
-            qr::orthonormalise(&mut q, s.rows, nx);
-            let mut j = s.jp;
-            for column in j.chunks_exact_mut(s.rows) {
-                qr::project_off(&q, s.rows, column);
-            }
-            let mut z = s.r;
-            qr::project_off(&q, s.rows, &mut z);
-            for (column, theta) in j.chunks_exact(s.rows).zip(&theta) {
+            let SegmentRows { rows, jx, jp, r: mut z, .. } = s;
+            let (q, j) = project_start(rows, jx, jp);
+            qr::project_off(&q, rows, &mut z);
+            for (column, theta) in j.chunks_exact(rows).zip(&theta) {
                 z.iter_mut().zip(column).for_each(|(z, v)| *z += theta * v);
             }
-            Projected { rows: s.rows, j, z }
+            Projected { rows, j, z }
         })
         .collect();
     if projected.iter().any(|s| s.z.iter().chain(&s.j).any(|v| !v.is_finite())) {
@@ -223,8 +222,6 @@ pub(crate) fn linearise(
         }
     }
     let t = qr::triangle(&mut a, m, stride);
-    let r: Vec<f64> = (0..np * np).map(|k| t[(k / np) * stride + k % np]).collect();
-    let z: Vec<f64> = (0..np).map(|i| t[i * stride + np]).collect();
     let of =
         |name: &str| wide.model.parameter(name).and_then(|i| wide.free.iter().position(|f| f.index == i));
     let column = structure
@@ -242,16 +239,12 @@ pub(crate) fn linearise(
         .map(|(spread, scale)| (NUMERICAL * spread / scale).powi(2))
         .sum::<f64>()
         / data.spread.len() as f64;
-    let mut reduced =
-        Reduced { columns: np, r, z, rest: t[np * stride + np].powi(2), samples: count as f64, floor };
+    let reduced = Reduced::from_triangle(&t, np, count as f64, floor);
     // Correlated residuals: as many rows as are independent.
     let all: Vec<usize> = (0..np).collect();
     let best = reduced.solve(&all).values;
-    let kappa = correlation_time(&projected, &best, refined, wide.system.ny);
-    let share = 1.0 / kappa;
-    reduced.r.iter_mut().chain(&mut reduced.z).for_each(|v| *v *= share.sqrt());
-    reduced.rest *= share;
-    reduced.samples *= share;
+    let share = 1.0 / correlation_time(&projected, &best, refined, wide.system.ny);
+    let reduced = reduced.weighted(share);
     let blocks = if blocks > 0 { block_grams(&projected, np, share, blocks) } else { Vec::new() };
     Some(Linearised { reduced, column, blocks })
 }

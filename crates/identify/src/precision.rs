@@ -16,7 +16,7 @@ pub(crate) struct Precision {
     pub half: Vec<Option<f64>>,
     /// The same for the parameters of the extras.
     pub extra_half: Vec<Option<f64>>,
-    /// The same for the parameters of the extras.
+    /// Their Cramér–Rao standard deviations.
     pub extra_bound: Vec<Option<f64>>,
     /// Correlation of the first two parameters of the extras.
     pub extra_correlation: Option<f64>,
@@ -59,13 +59,7 @@ pub(crate) fn assess(
     let projected: Vec<(Vec<f64>, &[f64], usize)> = rows
         .par_iter()
         .map(|s| {
-            let mut q = s.jx.clone();
-            let nx = q.len() / s.rows;
-            qr::orthonormalise(&mut q, s.rows, nx);
-            let mut j = s.jp.clone();
-            for column in j.chunks_exact_mut(s.rows) {
-                qr::project_off(&q, s.rows, column);
-            }
+            let (_, j) = output_error::project_start(s.rows, s.jx.clone(), s.jp.clone());
             (j, s.r.as_slice(), s.rows)
         })
         .collect();

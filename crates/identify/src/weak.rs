@@ -229,30 +229,11 @@ pub(crate) fn reduce(structure: &Structure, rows: &Rows, gain: Option<f64>) -> (
     }
     a.extend_from_slice(&target);
     let t = qr::triangle(&mut a, n, k + 1);
-    let stride = k + 1;
-    let mut r = vec![0.0; k * k];
-    for i in 0..k {
-        r[i * k..(i + 1) * k].copy_from_slice(&t[i * stride..i * stride + k]);
-    }
-    let z = (0..k).map(|i| t[i * stride + k]).collect();
-    // Rows of overlapping windows share their noise: a window's worth of them counts as one. The same
-    // factor in sum and count leaves the mean square as it is.
-    let share = rows.independent / n as f64;
-    let rest = t[k * stride + k].powi(2) * share;
-    let root = share.sqrt();
-    let reduced = Reduced {
-        columns: k,
-        r: r.iter().map(|v| v * root).collect(),
-        z: z_scaled(z, root),
-        rest,
-        samples: rows.independent.max(k as f64 + 2.0),
-        floor: 1e-10 * target.iter().map(|v| v * v).sum::<f64>() / n.max(1) as f64,
-    };
-    (reduced, columns.into_iter().map(|c| c.0).collect())
-}
-
-fn z_scaled(z: Vec<f64>, factor: f64) -> Vec<f64> {
-    z.into_iter().map(|v| v * factor).collect()
+    let floor = 1e-10 * target.iter().map(|v| v * v).sum::<f64>() / n.max(1) as f64;
+    // Rows of overlapping windows share their noise: a window's worth of them counts as one.
+    let reduced = Reduced::from_triangle(&t, k, n as f64, floor).weighted(rows.independent / n as f64);
+    let samples = rows.independent.max(k as f64 + 2.0);
+    (Reduced { samples, ..reduced }, columns.into_iter().map(|c| c.0).collect())
 }
 
 /// Length of a typical oscillation, s: twice the mean time between crossings of the mean, the shortest

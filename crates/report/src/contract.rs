@@ -480,15 +480,25 @@ impl JsonSchema for Interval {
     }
 }
 
+/// A document as indented JSON with a final newline.
+pub(crate) fn document<T: Serialize>(of: &T) -> Result<String, ReportError> {
+    let mut text = serde_json::to_string_pretty(of)?;
+    text.push('\n');
+    Ok(text)
+}
+
+/// JSON schema (draft 2020-12) of a document.
+pub(crate) fn schema_of<T: JsonSchema>() -> serde_json::Value {
+    SchemaSettings::draft2020_12().for_serialize().into_generator().into_root_schema_for::<T>().to_value()
+}
+
 impl Report {
     /// The report as indented JSON with a final newline.
     ///
     /// # Errors
     /// [`ReportError::Json`] if serialisation fails; the types leave no known way for that.
     pub fn to_json(&self) -> Result<String, ReportError> {
-        let mut text = serde_json::to_string_pretty(self)?;
-        text.push('\n');
-        Ok(text)
+        document(self)
     }
 
     /// Reads a report; `null` numbers become NaN and keys that are not known are skipped.
@@ -502,8 +512,7 @@ impl Report {
 
 /// JSON schema (draft 2020-12) of `report.json`, generated from the types of this module.
 pub fn schema() -> serde_json::Value {
-    let generator = SchemaSettings::draft2020_12().for_serialize().into_generator();
-    generator.into_root_schema_for::<Report>().to_value()
+    schema_of::<Report>()
 }
 
 fn finite(value: f64) -> Option<f64> {

@@ -8,6 +8,16 @@ use crate::contract::Interval;
 /// What stands for a number that is not known.
 pub const UNKNOWN: &str = "–";
 
+/// What stands between a sum so far and its next term of this sign: nothing or `−` before the first.
+pub(crate) fn joint(first: bool, value: f64) -> &'static str {
+    match (first, value < 0.0) {
+        (true, true) => "−",
+        (true, false) => "",
+        (false, true) => " − ",
+        (false, false) => " + ",
+    }
+}
+
 /// A number to three significant digits: `0.115`, `−12.3`, `1.23 × 10⁻⁶`; `–` where not finite.
 ///
 /// ```

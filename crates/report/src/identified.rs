@@ -2,20 +2,20 @@
 //!
 //! A document of its own: an identification has no verdict and no mechanisms. What both documents say, they
 //! say alike: [`Fit`], `noise_floor`, [`InputHold`] and [`Finding`] are the types of [`crate::contract`]. The
-//! identified model stands in `fit.train.improved` and `fit.holdout.improved`; `nominal` and `calibrated` stay empty, since there is no
-//! model to begin with. `docs/identify.schema.json` is generated from these types by [`schema`].
+//! identified model stands in `fit.train.improved` and `fit.holdout.improved`; `nominal` and `calibrated` stay
+//! empty, since there is no model to begin with. `docs/identify.schema.json` is generated from these types by
+//! [`schema`].
 //!
 //! **The equation reads: Σ value × term = input**, with states and inputs in the units of
 //! [`Variable::unit`], which are SI; `model.toml` means the same numbers.
 
-use schemars::generate::SchemaSettings;
 use schemars::{JsonSchema, Schema, SchemaGenerator, json_schema};
 use serde::{Deserialize, Deserializer, Serialize, Serializer};
 
 use crate::ReportError;
 use crate::contract::{
-    Finding, Fit, InputHold, Interval, ModelId, Ordered, Producer, number, number_map, number_map_schema,
-    number_schema,
+    Finding, Fit, InputHold, Interval, ModelId, Ordered, Producer, document, number, number_map,
+    number_map_schema, number_schema, schema_of,
 };
 
 /// The whole of `report.json`, as `greybox identify` writes it.
@@ -225,9 +225,7 @@ impl IdentifyReport {
     /// # Errors
     /// [`ReportError::Json`] if serialisation fails; the types leave no known way for that.
     pub fn to_json(&self) -> Result<String, ReportError> {
-        let mut text = serde_json::to_string_pretty(self)?;
-        text.push('\n');
-        Ok(text)
+        document(self)
     }
 
     /// Reads a report; `null` numbers become NaN and keys that are not known are skipped.
@@ -241,6 +239,5 @@ impl IdentifyReport {
 
 /// JSON schema (draft 2020-12) of an identification's `report.json`, generated from the types of this module.
 pub fn schema() -> serde_json::Value {
-    let generator = SchemaSettings::draft2020_12().for_serialize().into_generator();
-    generator.into_root_schema_for::<IdentifyReport>().to_value()
+    schema_of::<IdentifyReport>()
 }

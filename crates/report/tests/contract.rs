@@ -1,37 +1,21 @@
 //! `report.json` against its schema, and the schema against its checked-in copy.
 #![allow(clippy::unwrap_used, reason = "helpers of tests panic like the tests themselves")]
 
-use std::path::Path;
-
 use greybox_report::Report;
 use greybox_report::contract::{Interval, Location, Names, Verdict, schema};
 
+#[path = "common/schema.rs"]
+mod documents;
 #[path = "../examples/sample/mod.rs"]
 mod sample;
 
 fn assert_valid(report: &Report) -> serde_json::Value {
-    let json: serde_json::Value = serde_json::from_str(&report.to_json().unwrap()).unwrap();
-    let validator = jsonschema::validator_for(&schema()).unwrap();
-    let errors: Vec<String> =
-        validator.iter_errors(&json).map(|e| format!("{}: {e}", e.instance_path())).collect();
-    assert!(errors.is_empty(), "{errors:#?}");
-    json
+    documents::assert_valid(&report.to_json().unwrap(), &schema())
 }
 
-/// `UPDATE=1 cargo test -p greybox-report` rewrites the file.
 #[test]
 fn the_checked_in_schema_is_current() {
-    let path = Path::new(env!("CARGO_MANIFEST_DIR")).join("../../docs/report.schema.json");
-    let generated = schema();
-    if std::env::var_os("UPDATE").is_some() {
-        let text = serde_json::to_string_pretty(&generated).unwrap() + "\n";
-        std::fs::create_dir_all(path.parent().unwrap()).unwrap();
-        std::fs::write(&path, text).unwrap();
-    }
-    let text =
-        std::fs::read_to_string(&path).expect("docs/report.schema.json exists; else run with UPDATE=1");
-    let checked_in: serde_json::Value = serde_json::from_str(&text).unwrap();
-    assert_eq!(checked_in, generated, "docs/report.schema.json is stale: run the tests with UPDATE=1");
+    documents::assert_current("report.schema.json", &schema());
 }
 
 #[test]

@@ -1,8 +1,6 @@
 //! An identification's `report.json` against its schema, its sentences, and its page.
 #![allow(clippy::unwrap_used, reason = "helpers of tests panic like the tests themselves")]
 
-use std::path::Path;
-
 use greybox_report::contract::{Finding, Interval, Severity};
 use greybox_report::identified::{OrderValue, schema};
 use greybox_report::page::IdentifyPage;
@@ -11,6 +9,8 @@ use serde_json::{Value, json};
 
 #[path = "common/browser.rs"]
 mod browser;
+#[path = "common/schema.rs"]
+mod documents;
 #[path = "../examples/sample/mod.rs"]
 mod sample;
 
@@ -73,26 +73,12 @@ fn page() -> IdentifyPage {
 }
 
 fn assert_valid(report: &IdentifyReport) -> Value {
-    let json: Value = serde_json::from_str(&report.to_json().unwrap()).unwrap();
-    let validator = jsonschema::validator_for(&schema()).unwrap();
-    let errors: Vec<String> =
-        validator.iter_errors(&json).map(|e| format!("{}: {e}", e.instance_path())).collect();
-    assert!(errors.is_empty(), "{errors:#?}");
-    json
+    documents::assert_valid(&report.to_json().unwrap(), &schema())
 }
 
-/// `UPDATE=1 cargo test -p greybox-report` rewrites the file.
 #[test]
 fn the_checked_in_schema_is_current() {
-    let path = Path::new(env!("CARGO_MANIFEST_DIR")).join("../../docs/identify.schema.json");
-    let generated = schema();
-    if std::env::var_os("UPDATE").is_some() {
-        std::fs::write(&path, serde_json::to_string_pretty(&generated).unwrap() + "\n").unwrap();
-    }
-    let text =
-        std::fs::read_to_string(&path).expect("docs/identify.schema.json exists; else run with UPDATE=1");
-    let checked_in: Value = serde_json::from_str(&text).unwrap();
-    assert_eq!(checked_in, generated, "docs/identify.schema.json is stale: run the tests with UPDATE=1");
+    documents::assert_current("identify.schema.json", &schema());
 }
 
 /// Renaming a field must fail here.

@@ -146,12 +146,7 @@ fn equation_view(state: &str, equation: &Equation, delays: &Ordered<Delay>) -> E
 fn values_html(equation: &Equation, delays: &Ordered<Delay>) -> String {
     let mut out = String::new();
     let mut push = |value: f64, factor: &str| {
-        out.push_str(match (out.is_empty(), value < 0.0) {
-            (true, true) => "−",
-            (true, false) => "",
-            (false, true) => " − ",
-            (false, false) => " + ",
-        });
+        out.push_str(format::joint(out.is_empty(), value));
         let size = value.abs();
         if size != 1.0 || factor.is_empty() {
             out.push_str(&escape(&format::significant(size, 4)));

@@ -57,12 +57,7 @@ pub(crate) fn delayed<'a>(term: &Term, delays: &'a Ordered<Delay>) -> Option<(&'
 }
 
 fn push_signed(text: &mut String, value: f64, factor: &str) {
-    text.push_str(match (text.is_empty(), value < 0.0) {
-        (true, true) => "−",
-        (true, false) => "",
-        (false, true) => " − ",
-        (false, false) => " + ",
-    });
+    text.push_str(format::joint(text.is_empty(), value));
     let size = value.abs();
     if size != 1.0 || factor.is_empty() {
         text.push_str(&format::significant(size, 4));

@@ -1,5 +1,5 @@
-//! The time of Algorithm 1 at full size; run with `cargo test --release -p greybox-sparse -- --ignored`.
-#![allow(clippy::single_range_in_vec_init)]
+//! The time of Algorithm 1 at full size: `cargo run --release -p greybox-sparse --example time`.
+#![allow(clippy::single_range_in_vec_init, clippy::print_stdout)]
 
 use std::time::Instant;
 
@@ -7,9 +7,7 @@ use greybox_sparse::folds::train_test;
 use greybox_sparse::select::{logspace, search};
 use greybox_sparse::{Library, Options, Problem, Rows, Selector};
 
-#[test]
-#[ignore = "a timing, judged on a quiet machine"]
-fn six_orders_of_forty_thousand_rows() {
+fn main() -> Result<(), Box<dyn std::error::Error>> {
     let n = 40_000;
     let x: Vec<f64> =
         (0..n).map(|i| 1.3 * (0.0051 * i as f64).sin() + 0.4 * (0.0031 * i as f64).cos()).collect();
@@ -18,23 +16,22 @@ fn six_orders_of_forty_thousand_rows() {
         .map(|i| x[i] + 0.5 * v[i] + 0.8 * x[i].powi(3) + 0.01 * (12.9898 * (i * i) as f64).sin())
         .collect();
     let library = Library::tensor(&["x", "x'"], &[6, 6]);
-    let columns = library.evaluate(&[&x, &v], &[]).unwrap();
+    let columns = library.evaluate(&[&x, &v], &[])?;
     for selector in [Selector::StlsqRaw, Selector::StlsqNormalised, Selector::LassoRefit, Selector::Backward]
     {
-        let rows = Rows::from_vecs(&columns, &y).unwrap();
-        let split = train_test(&[0..n], 0.5, 100).unwrap();
-        let problem = Problem::new(rows, library.lengths(), &[], split).unwrap();
+        let rows = Rows::from_vecs(&columns, &y)?;
+        let split = train_test(&[0..n], 0.5, 100)?;
+        let problem = Problem::new(rows, library.lengths(), &[], split)?;
         let mut options = Options::raw();
         options.selector = selector;
         options.grid = logspace(1e-4, 1.0, 50);
         let mut best = f64::INFINITY;
         for _ in 0..5 {
             let start = Instant::now();
-            let found = search(&problem, &options).unwrap();
+            search(&problem, &options)?;
             best = best.min(start.elapsed().as_secs_f64());
-            assert_eq!(found.orders.len(), 6);
         }
         println!("{selector:?}: {:.1} ms", 1e3 * best);
-        assert!(best < 2.0);
     }
+    Ok(())
 }
