@@ -409,11 +409,17 @@ impl Hats {
                             _ => f64::INFINITY,
                         })
                         .collect();
+                    let bend = data
+                        .pieces
+                        .iter()
+                        .map(|p| if *d == 0 { p.smooth[*c].value_bend } else { p.smooth[*c].d1_bend })
+                        .fold(0.0, f64::max);
                     let all: Vec<f64> =
                         states.iter().filter_map(|s| s[i].as_ref()).flatten().copied().collect();
                     // Ten standard errors: noise of real sensors is coloured, and the estimate of it from
-                    // fast differences is too small then; and room for what the smoothing bends.
-                    10.0 * errors.iter().copied().fold(0.0, f64::max) + 1e-3 * spread(&all)
+                    // fast differences is too small then; and room for what the smoothing bends, whose
+                    // peaks stand well above its RMS.
+                    10.0 * errors.iter().copied().fold(0.0, f64::max) + 5.0 * bend + 1e-3 * spread(&all)
                 }
             })
             .collect();

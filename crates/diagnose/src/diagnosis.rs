@@ -8,6 +8,7 @@ use greybox_calibrate::{
 use greybox_model::system::CompileError;
 use greybox_model::{Hold, Model};
 use greybox_recording::Recording;
+use rayon::prelude::*;
 
 use crate::along::Along;
 use crate::evidence::Evidence;
@@ -15,7 +16,7 @@ use crate::library::{Mechanism, MechanismError, built_in};
 use crate::locate::{Location, force, locate};
 use crate::place::Place;
 use crate::screen::project;
-use crate::search::{Fitted, Found, Search, raw_rss, rms};
+use crate::search::{Fitted, Found, Search, raw_rms, raw_rss, rms};
 use crate::surface::{Surface, Variable};
 use crate::{Observer, Stage};
 
@@ -384,22 +385,21 @@ fn conclude(
     let full: f64 = raw_rss(&improved, &found.scale).iter().sum();
     let base = search.rss_at(&calibrated, &improved, &found.scale);
     let left = Left::of(&improved, &found.scale, surface.as_ref(), base);
-    let verdict =
-        if is_patchwork(&improved) { Verdict::Unexplained } else { left.verdict(improved.parts.len()) };
+    let shares: Vec<f64> = (0..improved.parts.len())
+        .into_par_iter()
+        .map(|i| {
+            let without = search.rss_without(&improved, i, &found.scale).unwrap_or(base);
+            ((without - full) / base.max(1e-300)).clamp(0.0, 1.0)
+        })
+        .collect();
+    let verdict = if is_patchwork(&improved, &shares) {
+        Verdict::Unexplained
+    } else {
+        left.verdict(improved.parts.len())
+    };
     let significant = left.significant(improved.parts.len()) || verdict == Verdict::Unexplained;
     let mut mechanisms = if verdict == Verdict::MissingPhysics {
-        findings(
-            &improved,
-            &found,
-            &nominal.model,
-            library,
-            search,
-            &scale,
-            base,
-            full,
-            &train_role,
-            &uncertainty,
-        )
+        findings(&improved, &found, &nominal.model, library, &scale, &shares, &train_role, &uncertainty)
     } else {
         Vec::new()
     };
@@ -431,16 +431,6 @@ fn conclude(
         better_holds: found.better_holds.iter().map(|b| b.0).collect(),
         seed: options.seed,
     })
-}
-
-/// Residual RMS per channel, SI, whatever the noise model.
-fn residual_rms(fitted: &Fitted, scale: &[f64]) -> Vec<f64> {
-    let rss = raw_rss(fitted, scale);
-    rss.iter()
-        .zip(&fitted.fit.count)
-        .zip(scale)
-        .map(|((r, n), s)| s * (r / (*n).max(1) as f64).sqrt())
-        .collect()
 }
 
 fn residual_scale(fitted: &Fitted, scale: &[f64]) -> Vec<f64> {
@@ -651,18 +641,25 @@ fn figure(
     Some(Estimate { value: v, ci95: Some((v - w, v + w)) })
 }
 
-/// Three or more forces on one and the same motion: a list that describes some other law piece by piece.
-fn is_patchwork(improved: &Fitted) -> bool {
+/// Three or more forces on one and the same motion, each a considerable part of what is missing: a list
+/// that describes some other law piece by piece. (Beside a law that explains nearly everything, small
+/// corrections are what a real machine has.)
+fn is_patchwork(improved: &Fitted, shares: &[f64]) -> bool {
     let motions: Vec<_> = improved
         .parts
         .iter()
-        .filter_map(|p| match &p.candidate.place {
+        .zip(shares)
+        .filter(|(_, share)| **share > CORRECTION)
+        .filter_map(|(p, _)| match &p.candidate.place {
             Place::Motion(m) => Some(m),
             _ => None,
         })
         .collect();
     motions.iter().any(|m| motions.iter().filter(|o| o.coefficients == m.coefficients).count() >= PATCHES)
 }
+
+/// Share of the calibrated model's misfit up to which a mechanism counts as a small correction.
+const CORRECTION: f64 = 0.02;
 
 /// Forces on one motion that make a patchwork.
 const PATCHES: usize = 3;
@@ -682,7 +679,7 @@ struct Left {
 impl Left {
     fn of(improved: &Fitted, scale: &[f64], surface: Option<&Surface>, base: f64) -> Left {
         let sigma = &improved.setup.data.sigma;
-        let rms = residual_rms(improved, scale);
+        let rms = raw_rms(improved, scale);
         let coloured = crate::search::coloured_channels(improved, scale);
         let misfit = rms.iter().zip(sigma).map(|(r, s)| r / s).fold(0.0, f64::max);
         let slow = rms.iter().zip(sigma).zip(&coloured).any(|((r, s), c)| r / s > MISFIT && !c);
@@ -732,10 +729,8 @@ fn findings(
     found: &Found,
     nominal: &Model,
     library: &[Mechanism],
-    search: &Search<'_>,
     scale: &[f64],
-    base: f64,
-    full: f64,
+    shares: &[f64],
     train: &Role,
     uncertainty: &Uncertainty,
 ) -> Vec<Finding> {
@@ -753,7 +748,6 @@ fn findings(
         .map(|(i, part)| {
             let mechanism = &library[part.candidate.mechanism];
             let accepted = found.accepted.iter().find(|a| a.candidate == part.candidate);
-            let without = search.rss_without(improved, i, &found.scale).unwrap_or(base);
             let evidence = accepted.map_or(Evidence::NONE, |a| a.evidence);
             // Posterior weights of the explanations tried; equivalent ones share their weight.
             let rivals = accepted.map_or(&[][..], |a| &a.rivals[..]);
@@ -830,7 +824,7 @@ fn findings(
                 figures,
                 expression: part.instance.expression.to_string(),
                 parameters,
-                share_explained: ((without - full) / base.max(1e-300)).clamp(0.0, 1.0),
+                share_explained: shares[i],
                 confidence,
                 alternatives,
                 location: crate::locate::Location {

@@ -5,7 +5,7 @@
 //!
 //! ```text
 //! N_eff = Σ n_c κ_c,   κ_c = 1 / (1 + 2 Σ_k ρ_c(k))      (until ρ < 0.05)
-//! score = Σ n_c κ_c ln(RSS_old/RSS_new) − k ln N_eff − 2·surcharge
+//! score = Σ n_c κ_c ln(RSS_old/RSS_new) − price(k, N_eff) − 2·surcharge,   price ≈ k ln N_eff
 //! ```
 //!
 //! Consistency is judged on ten folds of contiguous blocks: leaving fold k out moves the parameters, to
@@ -185,11 +185,19 @@ pub struct Side<'a> {
     pub surcharge: f64,
 }
 
+/// Price of `k` parameters: BIC's ln N for each, no less than AIC's 2, and on little information more, by the
+/// small-sample factor N/(N − k − 1) (Hurvich and Tsai 1989), three at most.
+fn price(k: f64, information: f64) -> f64 {
+    let n = information.max(2.0);
+    k * n.ln().max(2.0) * n / (n - k - 1.0).max(n / 3.0)
+}
+
 /// Weighs the richer model (`new`) against the simpler (`old`), both fitted with the same scale.
 pub fn weigh(old: &Side<'_>, new: &Side<'_>, count: &[usize], kappa: &[f64], whitened: bool) -> Evidence {
     let effective: f64 = count.iter().zip(kappa).map(|(n, k)| *n as f64 * k).sum();
-    let mut score =
-        -(new.parameters - old.parameters) * effective.max(2.0).ln() - 2.0 * (new.surcharge - old.surcharge);
+    let mut score = price(old.parameters, effective)
+        - price(new.parameters, effective)
+        - 2.0 * (new.surcharge - old.surcharge);
     for c in 0..count.len() {
         if new.rss[c] > 0.0 && old.rss[c] > 0.0 {
             score += count[c] as f64 * kappa[c] * (old.rss[c] / new.rss[c]).ln();

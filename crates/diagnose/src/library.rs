@@ -248,6 +248,8 @@ pub struct Mechanism {
     pub rank: u8,
     /// The law acts rarely: judged by what it gains where it acts.
     pub rare: bool,
+    /// The law acts all the time with one strength: every part of a recording must show it.
+    pub steady: bool,
     /// Reversals of the motion that the data must show at least (a memory is seen by returning).
     pub reversals: usize,
     /// Whether the mirror image (d → −d) is another candidate.
@@ -337,6 +339,8 @@ struct File {
     rank: Option<u8>,
     #[serde(default)]
     rare: bool,
+    #[serde(default)]
+    steady: bool,
     #[serde(default)]
     reversals: usize,
     #[serde(default)]
@@ -475,6 +479,7 @@ impl Mechanism {
                 u8::from(raw.on == On::Input)
             }),
             rare: raw.rare,
+            steady: raw.steady,
             reversals: raw.reversals,
             mirror: raw.mirror,
             refines: raw.refines,

@@ -25,12 +25,17 @@ const PERIODS: f64 = 3.0;
 const SHORTEST: usize = 40;
 /// Innovations over high-frequency noise from which a correlated residual passes for coloured noise.
 const CLEAR: f64 = 1.35;
+/// Residual over innovations up to which a correlated residual passes for noise: slower ones (a pole beyond
+/// 0.995) are what a model leaves over.
+const SLOWEST: f64 = 10.0;
 /// Most samples that a level of the search looks at; longer recordings are seen through windows.
 const MOST_SAMPLES: usize = 5000;
 /// Most mechanisms that are looked for.
 const MOST_MECHANISMS: usize = 4;
 /// Most candidates that are fitted per round.
 const SHORT_LIST: usize = 9;
+/// Most candidates that a mechanism is held against once more, beside its relatives.
+const RIVALS: usize = 6;
 /// Pairs that are fitted when no single candidate pays, and the residual over noise that calls for them.
 const PAIRS: usize = 4;
 const PAIR_MISFIT: f64 = 1.1;
@@ -40,6 +45,12 @@ const PAIR_SAMPLES: usize = 500;
 const STUCK: f64 = 1.2;
 /// Residual over noise from which a model is far from the noise.
 const FAR: f64 = 2.0;
+/// Ratio of sums of squares at which a whitened estimate simulates no longer what it is fitted to.
+const FORGETS: f64 = 1.5;
+/// Share of the misfit that each parameter more must buy far from the noise.
+const SHARE_PER_PARAMETER: f64 = 0.05;
+/// Least mean over standard error of the folds' gains, for a force that never rests.
+const STEADY: f64 = 2.5;
 /// Fewest samples from which a mechanism with states of its own is looked for.
 const MEMORY_SAMPLES: usize = 200;
 /// Two explanations whose scores differ by less stay undecided.
@@ -47,6 +58,10 @@ const UNDECIDED: f64 = 3.0;
 /// Candidates of a short-list that are fitted to the end, and the steps that decide which.
 const FINALISTS: usize = 5;
 const FIRST_STEPS: usize = 6;
+/// Steps that bring the starts of new segments to given parameters.
+const STARTS: usize = 6;
+/// Residual on all data over that of the windows from which a model holds for the windows alone.
+const BEYOND_WINDOWS: f64 = 2.0;
 /// Log-likelihood gain that another hold must bring.
 const HOLD_GAIN: f64 = 10.0;
 /// A simpler model wins when its score is no further behind than this.
@@ -296,7 +311,10 @@ impl<'a> Search<'a> {
             parameters: fitted.fit.point.parameters.clone(),
             starts: fitted.setup.starts(&level, &fitted.fit.point.parameters),
         };
-        let fit = fitted.setup.fit(&level, scale, &[stitched, hats], limits(iterations));
+        // The starts alone first: parameters that fit elsewhere must not give way to starts that do not yet.
+        let held = Setup { free: Vec::new(), ..fitted.setup.clone() };
+        let settled = held.fit(&level, scale, &[stitched.clone(), hats.clone()], limits(STARTS)).point;
+        let fit = fitted.setup.fit(&level, scale, &[settled, stitched, hats], limits(iterations));
         Fitted { level, fit, ..fitted.clone() }
     }
 
@@ -589,6 +607,11 @@ impl<'a> Search<'a> {
         }
         let enough = (e.drop > 0.02 && e.held_out > 0.01)
             || (e.kappa > 0.8 && e.drop > 0.005 && e.held_out > 0.004 && e.t > 2.5);
+        // Of a force that never rests, each fold brings its share of the score, with a spread near its
+        // square root: where the score is beyond doubt, so is t.
+        if mechanism.steady && (e.t < STEADY || e.improving < 0.8) {
+            return false;
+        }
         let steady = (e.t > 2.0 && e.improving >= 0.6) || (e.t > 1.5 && e.improving >= 0.8);
         // A second effect may be small beside the first; it must then be seen everywhere.
         let visible = first || share > LEAST_SHARE || (e.drop > 0.1 && e.t > 5.0 && e.improving >= 0.9);
@@ -648,18 +671,26 @@ impl<'a> Search<'a> {
         self.reconsider(&calibrated, &mut state);
         if self.is_coloured(&state, 0.6) && state.noise_is_coloured() {
             self.observer.stage(Stage::Whitening);
+            let plain = (calibrated.clone(), state.clone());
             self.whitened(&mut calibrated, &mut state);
+            // An estimate that takes noise for noise simulates as well as one that does not. One that takes
+            // a misfit for noise predicts the next sample and forgets the simulation.
+            let before = raw_rss(&plain.1.current, &plain.1.scale);
+            let after = raw_rss(&state.current, &plain.1.scale);
+            if after.iter().zip(&before).any(|(a, b)| *a > FORGETS * b) {
+                (calibrated, state) = plain;
+            }
         }
         // What was searched through windows is fitted to all data in the end.
         let length = self.lengths.last().copied().unwrap_or(SHORTEST);
         let whole = self.nominal.windows(length, usize::MAX);
         if whole.segments != state.current.level.segments {
             calibrated = self.relevel(&calibrated, whole.clone(), &state.scale, 15);
-            state.current = if state.current.parts.is_empty() {
-                Fitted { setup: state.current.setup.clone(), ..calibrated.clone() }
+            if state.current.parts.is_empty() {
+                state.current = Fitted { setup: state.current.setup.clone(), ..calibrated.clone() };
             } else {
-                self.relevel(&state.current, whole, &state.scale, 15)
-            };
+                self.widen(&mut state, &whole);
+            }
             if state.current.setup.noise.is_none() {
                 state.rescale();
                 state.current = self.refit(&state.current, &state.scale, 5);
@@ -671,6 +702,34 @@ impl<'a> Search<'a> {
             .map(|i| (i, self.nominal.holds[i], current.setup.holds[i]))
             .collect();
         Found { calibrated, improved: current, accepted: state.accepted, better_holds, scale: state.scale }
+    }
+
+    /// From the windows to all data. A mechanism that fits what the windows show and nothing beyond them is
+    /// let go.
+    fn widen(&self, state: &mut State, whole: &Level) {
+        let ratio = |wide: &Fitted, narrow: &Fitted| -> f64 {
+            let (a, b) = (raw_rms(wide, &state.scale), raw_rms(narrow, &state.scale));
+            a.iter().zip(&b).map(|(a, b)| a / b.max(1e-300)).fold(0.0, f64::max)
+        };
+        let mut narrow = state.current.clone();
+        let mut wide = self.relevel(&narrow, whole.clone(), &state.scale, 15);
+        while narrow.parts.len() > 1 && !(ratio(&wide, &narrow) < BEYOND_WINDOWS) {
+            let smaller: Vec<(Fitted, Fitted)> = (0..narrow.parts.len())
+                .into_par_iter()
+                .filter_map(|i| {
+                    let without = self.without(&narrow, i, &state.scale, 12)?;
+                    let wide = self.relevel(&without, whole.clone(), &state.scale, 15);
+                    Some((without, wide))
+                })
+                .collect();
+            let best = smaller.into_iter().min_by(|a, b| a.1.fit.cost.total_cmp(&b.1.fit.cost));
+            match best {
+                Some(best) if !(wide.fit.cost < best.1.fit.cost) => (narrow, wide) = best,
+                _ => break,
+            }
+        }
+        state.accepted.retain(|a| wide.parts.iter().any(|p| p.candidate == a.candidate));
+        state.current = wide;
     }
 
     /// A fit that is left well above the noise may be stuck where long segments led it: from the shortest
@@ -729,6 +788,7 @@ impl<'a> Search<'a> {
     /// sensitivities and candidates are whitened by it, and models are compared by the likelihood of
     /// their innovations.
     fn whitened(&self, calibrated: &mut Fitted, state: &mut State) {
+        let before = state.candidates();
         // Not the shortest: they hide the low frequencies of the noise.
         for &length in &self.lengths[self.lengths.len().saturating_sub(2)..] {
             let plain = Setup { noise: None, ..state.current.setup.clone() };
@@ -749,7 +809,11 @@ impl<'a> Search<'a> {
             state.whiten();
             self.level(calibrated, state);
         }
-        self.reconsider(calibrated, state);
+        // What was found before has been held against its rivals already.
+        let found = state.candidates();
+        if found.len() != before.len() || found.iter().any(|c| !before.contains(c)) {
+            self.reconsider(calibrated, state);
+        }
     }
 
     /// One level: rounds until nothing more is believable.
@@ -790,7 +854,7 @@ impl<'a> Search<'a> {
             scored.iter().map(|s| (&*self.library[open[s.candidate].mechanism].kind, s.gain)).collect();
         self.observer.screened(&ranking);
         let least = if current.setup.noise.is_some() { 0.001 } else { 0.003 };
-        let short = self.short_list(&open, &scored, least);
+        let short = self.short_list(&open, &scored, least, SHORT_LIST);
         if short.is_empty() {
             return false;
         }
@@ -857,13 +921,19 @@ impl<'a> Search<'a> {
     }
 
     /// The strongest candidates, no more than two of a kind.
-    fn short_list<'s>(&self, open: &[Candidate], scored: &'s [Scored], least: f64) -> Vec<&'s Scored> {
+    fn short_list<'s>(
+        &self,
+        open: &[Candidate],
+        scored: &'s [Scored],
+        least: f64,
+        most: usize,
+    ) -> Vec<&'s Scored> {
         let mut short: Vec<&Scored> = Vec::new();
         for s in scored {
             let kind = &self.library[open[s.candidate].mechanism].kind;
             let of_kind =
                 short.iter().filter(|o| self.library[open[o.candidate].mechanism].kind == *kind).count();
-            if s.gain > least && of_kind < 2 && short.len() < SHORT_LIST {
+            if s.gain > least && of_kind < 2 && short.len() < most {
                 short.push(s);
             }
         }
@@ -966,7 +1036,7 @@ impl<'a> Search<'a> {
             self.observer.stage(Stage::Screening { candidates: open.len(), found: base.parts.len() });
             let scored = screen(&base.setup, self.library, &open, &base.level, &state.scale, &base.fit.point);
             let relatives = &self.library[part.candidate.mechanism].about.confused_with;
-            let mut short = self.short_list(&open, &scored, 0.003);
+            let mut short = self.short_list(&open, &scored, 0.003, RIVALS);
             // Those it is confused with at the same place, even where the score test ranks them low.
             for s in &scored {
                 let c = &open[s.candidate];
@@ -1200,7 +1270,7 @@ impl<'a> Search<'a> {
             // As good in every channel, or within what a likelihood can tell. Far above the noise each
             // parameter more must buy its share: there, any flexible law follows what another law lacks.
             let surplus = complexity(&a.1) - complexity(&b.1);
-            let slack = if a.1.misfit(scale) > FAR { 0.02 * surplus.max(1.0) } else { 0.02 };
+            let slack = if a.1.misfit(scale) > FAR { SHARE_PER_PARAMETER * surplus } else { 0.0 }.max(0.02);
             let simpler = surplus > 0.0 && (near(slack) || a.2.score - b.2.score < PARSIMONY);
             let tie = complexity(&b.1) == complexity(&a.1) && near(0.005) && priority(b.0) < priority(a.0);
             if simpler || tie {
@@ -1255,6 +1325,7 @@ impl<'a> Search<'a> {
 }
 
 /// Where the search stands.
+#[derive(Clone)]
 struct State {
     current: Fitted,
     accepted: Vec<Accepted>,
@@ -1298,15 +1369,19 @@ impl State {
 }
 
 /// Per channel: the residual is correlated, and its innovations stand clear of the noise that fast
-/// differences show. Coloured noise has little power at high frequencies (for an autoregression with a
-/// coefficient near one, innovations are twice what the differences say); a slow misfit over white noise
-/// leaves innovations of just that noise.
+/// differences show and are no tiny part of it. Coloured noise has little power at high frequencies (for an
+/// autoregression with a coefficient near one, innovations are twice what the differences say); a slow misfit
+/// over white noise leaves innovations of just that noise.
 pub fn coloured_channels(f: &Fitted, scale: &[f64]) -> Vec<bool> {
     let noise = f.setup.innovations(&f.level, scale, &f.fit.point);
     noise
         .iter()
         .zip(&f.setup.data.sigma)
-        .map(|(a, sigma)| a.order() > 0 && a.variance().sqrt() > CLEAR * sigma)
+        .zip(raw_rms(f, scale))
+        .map(|((a, sigma), rms)| {
+            let innovation = a.variance().sqrt();
+            a.order() > 0 && innovation > CLEAR * sigma && rms < SLOWEST * innovation
+        })
         .collect()
 }
 
@@ -1321,6 +1396,16 @@ fn innovations(f: &Fitted, scale: &[f64]) -> Vec<f64> {
 pub fn raw_rss(fitted: &Fitted, scale: &[f64]) -> Vec<f64> {
     let plain = Setup { noise: None, ..fitted.setup.clone() };
     plain.with_problem(&fitted.level, scale, |p| p.rss(&p.rows(&fitted.fit.point, false, None)).0)
+}
+
+/// Residual RMS per channel in SI, not whitened.
+pub fn raw_rms(fitted: &Fitted, scale: &[f64]) -> Vec<f64> {
+    let rss = raw_rss(fitted, scale);
+    rss.iter()
+        .zip(&fitted.fit.count)
+        .zip(scale)
+        .map(|((r, n), s)| s * (r / (*n).max(1) as f64).sqrt())
+        .collect()
 }
 
 fn calibrated_rss(calibrated: &Fitted, scale: &[f64]) -> f64 {

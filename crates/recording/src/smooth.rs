@@ -30,6 +30,10 @@ pub struct Smoothed {
     pub value_gain: f64,
     /// Standard error of `d1` per unit of white noise, 1/s, away from the ends.
     pub d1_gain: f64,
+    /// What the smoothing bends `value` by, RMS (estimated by [`adaptive`]; zero otherwise).
+    pub value_bend: f64,
+    /// What the smoothing bends `d1` by, RMS, unit/s (estimated by [`adaptive`]; zero otherwise).
+    pub d1_bend: f64,
 }
 
 impl Smoothed {
@@ -69,6 +73,8 @@ pub fn savitzky_golay(y: &[f64], dt: f64, window: usize, order: usize) -> Smooth
         derivative_window: fit.window,
         value_gain: norm(&fit.centre[0]),
         d1_gain: norm(&fit.centre[1]) / dt,
+        value_bend: 0.0,
+        d1_bend: 0.0,
     }
 }
 
@@ -82,6 +88,10 @@ pub fn savitzky_golay(y: &[f64], dt: f64, window: usize, order: usize) -> Smooth
 /// the residual that pure noise of standard deviation `sigma` would leave (2.25/w is the share of the noise that
 /// a cubic over w samples keeps), with 15 % to spare. Derivatives come from the same window, seven samples at
 /// least. Missing samples as in [`savitzky_golay`].
+///
+/// Where even the shortest windows bend the signal (few samples per period), it says by how much: the value by
+/// what the residual holds beyond noise, the derivative by what a polynomial of order 5 over the same window
+/// says otherwise, beyond the noise in that difference (σ² (‖k₅‖² − ‖k₃‖²), the kernels being projections).
 pub fn adaptive(y: &[f64], dt: f64, sigma: f64) -> Smoothed {
     const ORDER: usize = 3;
     let mut best = LocalFit::new(y.len(), WINDOWS[0], ORDER);
@@ -104,6 +114,14 @@ pub fn adaptive(y: &[f64], dt: f64, sigma: f64) -> Smoothed {
         best.clone()
     };
     let [_, d1, d2] = derivative_fit.apply::<3>(y, dt);
+    let beyond = |power: f64, noise: f64| (power - noise).max(0.0).sqrt();
+    let kept = sigma * sigma * (1.0 - 2.25 / best.window as f64);
+    let value_bend = beyond(residual_rms(y, &value).powi(2), kept);
+    let finer = LocalFit::new(y.len(), derivative_fit.window, ORDER + 2);
+    let [_, fine] = finer.apply::<2>(y, dt);
+    let (rough_gain, fine_gain) = (norm(&derivative_fit.centre[1]) / dt, norm(&finer.centre[1]) / dt);
+    let noise = sigma * sigma * (fine_gain * fine_gain - rough_gain * rough_gain);
+    let d1_bend = beyond(residual_rms(&fine, &d1).powi(2), noise);
     Smoothed {
         value,
         d1,
@@ -111,7 +129,9 @@ pub fn adaptive(y: &[f64], dt: f64, sigma: f64) -> Smoothed {
         window: best.window,
         derivative_window: derivative_fit.window,
         value_gain: norm(&best.centre[0]),
-        d1_gain: norm(&derivative_fit.centre[1]) / dt,
+        d1_gain: rough_gain,
+        value_bend,
+        d1_bend,
     }
 }
 
