@@ -368,6 +368,19 @@ impl Setup {
         })
     }
 
+    /// The `most` points of least cost, best first; points that cannot be simulated are left out, and so is
+    /// what costs the same as a better one.
+    pub fn best_points(&self, level: &Level, scale: &[f64], points: Vec<Point>, most: usize) -> Vec<Point> {
+        self.with_problem(level, scale, |problem| {
+            let mut priced: Vec<(f64, Point)> = points.into_iter().map(|p| (problem.cost(&p), p)).collect();
+            priced.retain(|p| p.0.is_finite());
+            priced.sort_by(|a, b| a.0.total_cmp(&b.0));
+            priced.dedup_by(|a, b| a.0 == b.0);
+            priced.truncate(most);
+            priced.into_iter().map(|p| p.1).collect()
+        })
+    }
+
     /// Start values for a finer or coarser level read off a fitted trajectory (stitched segments).
     pub fn stitch(&self, from: &Level, fit: &Point, to: &Level, scale: &[f64]) -> Point {
         let rows = self.with_problem(from, scale, |p| p.rows(fit, false, None));

@@ -409,6 +409,11 @@ fn conclude(
             m.confidence = m.confidence.min(DOUBTED);
         }
     }
+    for (i, m) in mechanisms.iter_mut().enumerate() {
+        if is_shared(&improved, &shares, library, i) {
+            m.confidence = m.confidence.min(DOUBTED);
+        }
+    }
     mechanisms.sort_by(|a, b| b.share_explained.total_cmp(&a.share_explained));
     let remainder = remainder(&improved, surface, significant, full / base.max(1e-300));
     let noise_floor = train.sigma.iter().zip(&train.spread).map(|(s, d)| s / d.max(1e-300)).collect();
@@ -656,6 +661,21 @@ fn is_patchwork(improved: &Fitted, shares: &[f64]) -> bool {
         })
         .collect();
     motions.iter().any(|m| motions.iter().filter(|o| o.coefficients == m.coefficients).count() >= PATCHES)
+}
+
+/// Whether a considerable law stands beside another one of its family on the same motion: two shapes of a
+/// restoring force may well be one shape that the library lacks.
+fn is_shared(improved: &Fitted, shares: &[f64], library: &[Mechanism], index: usize) -> bool {
+    let of = |i: usize| {
+        let candidate = &improved.parts[i].candidate;
+        match &candidate.place {
+            Place::Motion(m) if shares[i] > CORRECTION => {
+                Some((&m.coefficients, &library[candidate.mechanism].family))
+            }
+            _ => None,
+        }
+    };
+    of(index).is_some_and(|own| (0..improved.parts.len()).any(|i| i != index && of(i) == Some(own)))
 }
 
 /// Share of the calibrated model's misfit up to which a mechanism counts as a small correction.

@@ -55,6 +55,8 @@ const STEADY: f64 = 2.5;
 const MEMORY_SAMPLES: usize = 200;
 /// Two explanations whose scores differ by less stay undecided.
 const UNDECIDED: f64 = 3.0;
+/// Whitened scores that differ by less are the same.
+const SAME_SCORE: f64 = 1.0;
 /// Candidates of a short-list that are fitted to the end, and the steps that decide which.
 const FINALISTS: usize = 5;
 const FIRST_STEPS: usize = 6;
@@ -62,6 +64,9 @@ const FIRST_STEPS: usize = 6;
 const STARTS: usize = 6;
 /// Residual on all data over that of the windows from which a model holds for the windows alone.
 const BEYOND_WINDOWS: f64 = 2.0;
+/// Starting points of a mechanism with a memory that are followed, and for how many steps.
+const STARTING_POINTS: usize = 3;
+const STEPS_TO_TELL: usize = 3;
 /// Log-likelihood gain that another hold must bring.
 const HOLD_GAIN: f64 = 10.0;
 /// A simpler model wins when its score is no further behind than this.
@@ -489,6 +494,16 @@ impl<'a> Search<'a> {
             }
             points.push(Point { parameters, starts: kept.clone() });
         }
+        // With a memory of its own, where a fit starts decides where it ends: a few steps from the best few.
+        if !mechanism.states.is_empty() {
+            points = setup.best_points(&level, scale, points, STARTING_POINTS);
+            if points.len() > 1 {
+                points = points
+                    .into_iter()
+                    .map(|p| setup.fit(&level, scale, &[p], limits(STEPS_TO_TELL)).point)
+                    .collect();
+            }
+        }
         let fit = setup.fit(&level, scale, &points, limits(iterations));
         fit.cost.is_finite().then(|| Fitted { setup, parts, level, fit })
     }
@@ -590,11 +605,13 @@ impl<'a> Search<'a> {
         let threshold = 2.0 * (self.all.len().max(1) as f64).ln() + 6.0;
         // An effect that acts rarely is seen in few folds: it must pay much where it acts and cost nothing
         // elsewhere, and the baseline must have shown a misfit while its segments were short.
+        // (Where the residual is white, the likelihood can be taken at its word.)
+        let (times, focus) = if e.kappa > 0.8 && !e.whitened { (2.0, 0.7) } else { (4.0, 0.85) };
         let rare = mechanism.rare
             && loose
-            && e.score > (4.0 * threshold).max(60.0)
+            && e.score > times * threshold.max(15.0)
             && e.drop > if e.whitened { 0.01 } else { 0.05 }
-            && e.focus > 0.85;
+            && e.focus > focus;
         if rare {
             return true;
         }
@@ -612,7 +629,11 @@ impl<'a> Search<'a> {
         if mechanism.steady && (e.t < STEADY || e.improving < 0.8) {
             return false;
         }
-        let steady = (e.t > 2.0 && e.improving >= 0.6) || (e.t > 1.5 && e.improving >= 0.8);
+        // Steady over the folds; or, where a few strong moments hold most of the gain, for the better in
+        // nearly every fold and to no one's loss (the sign test).
+        let steady = (e.t > 2.0 && e.improving >= 0.6)
+            || (e.t > 1.5 && e.improving >= 0.8)
+            || (e.improving >= 0.9 && e.focus > 0.95);
         // A second effect may be small beside the first; it must then be seen everywhere.
         let visible = first || share > LEAST_SHARE || (e.drop > 0.1 && e.t > 5.0 && e.improving >= 0.9);
         e.score > threshold && visible && enough && steady
@@ -668,7 +689,7 @@ impl<'a> Search<'a> {
             self.level(&mut calibrated, &mut state);
         }
         self.anneal(&mut calibrated, &mut state);
-        self.reconsider(&calibrated, &mut state);
+        let mut settled = false;
         if self.is_coloured(&state, 0.6) && state.noise_is_coloured() {
             self.observer.stage(Stage::Whitening);
             let plain = (calibrated.clone(), state.clone());
@@ -677,9 +698,13 @@ impl<'a> Search<'a> {
             // a misfit for noise predicts the next sample and forgets the simulation.
             let before = raw_rss(&plain.1.current, &plain.1.scale);
             let after = raw_rss(&state.current, &plain.1.scale);
-            if after.iter().zip(&before).any(|(a, b)| *a > FORGETS * b) {
+            settled = !after.iter().zip(&before).any(|(a, b)| *a > FORGETS * b);
+            if !settled {
                 (calibrated, state) = plain;
             }
+        }
+        if !settled {
+            self.reconsider(&calibrated, &mut state);
         }
         // What was searched through windows is fitted to all data in the end.
         let length = self.lengths.last().copied().unwrap_or(SHORTEST);
@@ -788,7 +813,6 @@ impl<'a> Search<'a> {
     /// sensitivities and candidates are whitened by it, and models are compared by the likelihood of
     /// their innovations.
     fn whitened(&self, calibrated: &mut Fitted, state: &mut State) {
-        let before = state.candidates();
         // Not the shortest: they hide the low frequencies of the noise.
         for &length in &self.lengths[self.lengths.len().saturating_sub(2)..] {
             let plain = Setup { noise: None, ..state.current.setup.clone() };
@@ -807,13 +831,10 @@ impl<'a> Search<'a> {
             let samples = state.current.fit.count.iter().sum::<usize>().max(1) as f64;
             state.current = self.redecide_holds(&state.current, &state.scale, 4.0 / samples);
             state.whiten();
+            self.prune(state);
             self.level(calibrated, state);
         }
-        // What was found before has been held against its rivals already.
-        let found = state.candidates();
-        if found.len() != before.len() || found.iter().any(|c| !before.contains(c)) {
-            self.reconsider(calibrated, state);
-        }
+        self.reconsider(calibrated, state);
     }
 
     /// One level: rounds until nothing more is believable.
@@ -1261,18 +1282,22 @@ impl<'a> Search<'a> {
         let mut best = 0;
         for i in 1..weighed.len() {
             let (a, b) = (&weighed[best], &weighed[i]);
-            let near =
-                |slack: f64| {
-                    a.1.fit.rss.iter().zip(&b.1.fit.rss).all(|(x, y)| {
+            // (Of innovations a per cent is much: they hold what cannot be predicted. There, the likelihood
+            // alone speaks.)
+            let near = |slack: f64| {
+                !a.2.whitened
+                    && a.1.fit.rss.iter().zip(&b.1.fit.rss).all(|(x, y)| {
                         *y < (1.0 + slack) * x || (slack > 0.01 && (y - x) < LEAST_SHARE * total)
                     })
-                };
+            };
             // As good in every channel, or within what a likelihood can tell. Far above the noise each
             // parameter more must buy its share: there, any flexible law follows what another law lacks.
             let surplus = complexity(&a.1) - complexity(&b.1);
             let slack = if a.1.misfit(scale) > FAR { SHARE_PER_PARAMETER * surplus } else { 0.0 }.max(0.02);
             let simpler = surplus > 0.0 && (near(slack) || a.2.score - b.2.score < PARSIMONY);
-            let tie = complexity(&b.1) == complexity(&a.1) && near(0.005) && priority(b.0) < priority(a.0);
+            let tie = complexity(&b.1) == complexity(&a.1)
+                && (near(0.005) || (a.2.whitened && a.2.score - b.2.score < SAME_SCORE))
+                && priority(b.0) < priority(a.0);
             if simpler || tie {
                 best = i;
             }
@@ -1287,6 +1312,7 @@ impl<'a> Search<'a> {
                 // The data cannot separate what fits as well with no more parameters, nor what the evidence
                 // leaves at odds that no one would bet on.
                 let as_good = complexity(&f) <= complexity(&fitted)
+                    && !e.whitened
                     && f.fit.rss.iter().zip(&fitted.fit.rss).all(|(x, y)| *x < 1.005 * y);
                 let equivalent = as_good || (e.score - evidence.score).abs() < UNDECIDED;
                 let instance = f.parts.last()?.instance.clone();
@@ -1299,7 +1325,9 @@ impl<'a> Search<'a> {
     /// Drops what no longer pays.
     fn prune(&self, state: &mut State) {
         let mut index = 0;
-        while state.current.parts.len() > 1 && index < state.current.parts.len() {
+        // What was found on coloured residuals stands the test of white ones, or goes.
+        let least_parts = if state.current.setup.noise.is_some() { 0 } else { 1 };
+        while state.current.parts.len() > least_parts && index < state.current.parts.len() {
             let Some(smaller) = self.without(&state.current, index, &state.scale, 12) else {
                 index += 1;
                 continue;
