@@ -6,17 +6,17 @@ use greybox_calibrate::{
     Data, DataError, FreeRun, Limits, Point, Score, Setup, free_parameters, qr, window_length,
 };
 use greybox_model::system::CompileError;
-use greybox_model::{Hold, Model};
+use greybox_model::{Expr, Func, Hold, Model};
 use greybox_recording::Recording;
 use rayon::prelude::*;
 
 use crate::along::Along;
-use crate::evidence::Evidence;
+use crate::evidence::{Evidence, folds};
 use crate::library::{Mechanism, MechanismError, built_in};
 use crate::locate::{Location, force, locate};
 use crate::place::Place;
 use crate::screen::project;
-use crate::search::{Fitted, Found, Search, raw_rms, raw_rss, rms};
+use crate::search::{Fitted, Found, Part, Search, raw_rms, raw_rss, rms};
 use crate::surface::{Surface, Variable};
 use crate::{Observer, Stage};
 
@@ -344,7 +344,7 @@ fn conclude(
         model
     };
     let (calibrated_model, improved_model) = (final_model(&calibrated), final_model(&improved));
-    let parameters = (0..nominal.model.parameters.len())
+    let mut parameters: Vec<ParameterChange> = (0..nominal.model.parameters.len())
         .map(|i| ParameterChange {
             index: i,
             nominal: nominal.model.parameters[i].value,
@@ -377,8 +377,8 @@ fn conclude(
             improved: run(&improved.setup, &improved.fit.point.parameters, &scale)?,
         })
     };
-    let train_role = role(&train, false)?;
-    let holdout_role = role(&holdout, true)?;
+    let mut train_role = role(&train, false)?;
+    let mut holdout_role = role(&holdout, true)?;
 
     // Mechanisms, remainder, verdict.
     let surface = surface(&improved, &scale);
@@ -392,7 +392,8 @@ fn conclude(
             ((without - full) / base.max(1e-300)).clamp(0.0, 1.0)
         })
         .collect();
-    let verdict = if is_patchwork(&improved, &shares) {
+    let rivalled = !improved.parts.is_empty() && is_rivalled(search, &found, library);
+    let verdict = if rivalled || is_patchwork(&improved, &shares) {
         Verdict::Unexplained
     } else {
         left.verdict(improved.parts.len())
@@ -410,7 +411,7 @@ fn conclude(
         }
     }
     for (i, m) in mechanisms.iter_mut().enumerate() {
-        if is_shared(&improved, &shares, library, i) {
+        if is_shared(&improved, &shares, i) {
             m.confidence = m.confidence.min(DOUBTED);
         }
     }
@@ -419,6 +420,12 @@ fn conclude(
     let noise_floor = train.sigma.iter().zip(&train.spread).map(|(s, d)| s / d.max(1e-300)).collect();
     let holds = nominal.holds.iter().copied().zip(improved.setup.holds.iter().copied()).collect();
     let unexplained = verdict != Verdict::MissingPhysics && !improved.parts.is_empty();
+    if unexplained {
+        // What is not believed improves nothing.
+        train_role.improved = train_role.calibrated.clone();
+        holdout_role.improved = holdout_role.calibrated.clone();
+        parameters.iter_mut().for_each(|p| p.improved = p.calibrated);
+    }
     Ok(Diagnosis {
         verdict,
         nominal: nominal.model.clone(),
@@ -663,20 +670,55 @@ fn is_patchwork(improved: &Fitted, shares: &[f64]) -> bool {
     motions.iter().any(|m| motions.iter().filter(|o| o.coefficients == m.coefficients).count() >= PATCHES)
 }
 
-/// Whether a considerable law stands beside another one of its family on the same motion: two shapes of a
-/// restoring force may well be one shape that the library lacks.
-fn is_shared(improved: &Fitted, shares: &[f64], library: &[Mechanism], index: usize) -> bool {
-    let of = |i: usize| {
-        let candidate = &improved.parts[i].candidate;
-        match &candidate.place {
-            Place::Motion(m) if shares[i] > CORRECTION => {
-                Some((&m.coefficients, &library[candidate.mechanism].family))
-            }
-            _ => None,
+/// Whether a law stands beside another one of the same variables on the same motion: two shapes of a
+/// restoring force may well be one shape that the library lacks. Beside a small correction, the law that
+/// explains nearly everything stands.
+fn is_shared(improved: &Fitted, shares: &[f64], index: usize) -> bool {
+    let of = |part: &Part| match &part.candidate.place {
+        Place::Motion(m) => {
+            let mut variables: Vec<(String, u8)> = Vec::new();
+            part.instance.expression.walk(&mut |e| {
+                if let Expr::Var { name, primes } = e
+                    && improved.setup.model.state(name).is_some()
+                {
+                    variables.push((name.to_string(), *primes));
+                }
+            });
+            variables.sort();
+            variables.dedup();
+            Some((m.coefficients.clone(), variables))
         }
+        _ => None,
     };
-    of(index).is_some_and(|own| (0..improved.parts.len()).any(|i| i != index && of(i) == Some(own)))
+    let own = of(&improved.parts[index]);
+    own.is_some()
+        && improved.parts.iter().enumerate().any(|(i, part)| {
+            i != index && of(part) == own && (shares[i] > shares[index] || shares[i] > CORRECTION)
+        })
 }
+
+/// Whether forces of free shape beat the mechanisms: held out by folds, they explain clearly more of the
+/// calibrated model's residual, or as much where the mechanisms need a memory and the shapes need none. A law
+/// of the library is at least as good as a free shape of its variables; what imitates another law is not.
+fn is_rivalled(search: &Search<'_>, found: &Found, library: &[Mechanism]) -> bool {
+    let (base, improved) = search.comparable(found);
+    let Some(free) = surface(&base, &found.scale).filter(|s| s.t > STEADY_SHAPE) else { return false };
+    let held_out = |f: &Fitted| folds(&f.setup, &f.level, &found.scale, &f.fit.point).sse.iter().sum::<f64>();
+    let named = 1.0 - held_out(&improved) / held_out(&base).max(1e-300);
+    let remembers = improved.parts.iter().all(|part| {
+        let mut delayed = false;
+        part.instance.expression.walk(&mut |e| delayed |= matches!(e, Expr::Call(Func::Delay, _)));
+        delayed || !library[part.candidate.mechanism].states.is_empty()
+    });
+    free.gain > named * if remembers { RIVALS_MEMORY } else { RIVALS_LAW }
+}
+
+/// Mean over standard error of the folds' gains from which free shapes are taken seriously.
+const STEADY_SHAPE: f64 = 2.0;
+/// Gain of free shapes over that of the mechanisms from which these are imitations: laws of the state, and
+/// mechanisms with a memory or a delay (which no shape of the state should come near).
+const RIVALS_LAW: f64 = 1.1;
+const RIVALS_MEMORY: f64 = 0.97;
 
 /// Share of the calibrated model's misfit up to which a mechanism counts as a small correction.
 const CORRECTION: f64 = 0.02;

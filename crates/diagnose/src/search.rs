@@ -651,6 +651,22 @@ impl<'a> Search<'a> {
         calibrated_rss(&f, scale)
     }
 
+    /// The calibrated and the improved model on the search's longest windows, with one noise model, refitted.
+    pub fn comparable(&self, found: &Found) -> (Fitted, Fitted) {
+        let length = self.lengths.last().copied().unwrap_or(SHORTEST);
+        let windows = self.nominal.windows(length, MOST_SAMPLES);
+        let on_windows = |f: &Fitted| {
+            let mut f = f.clone();
+            f.setup.noise.clone_from(&found.improved.setup.noise);
+            if f.level.segments == windows.segments {
+                self.refit(&f, &found.scale, 10)
+            } else {
+                self.relevel(&f, windows.clone(), &found.scale, 15)
+            }
+        };
+        (on_windows(&found.calibrated), on_windows(&found.improved))
+    }
+
     /// Residual sum of squares of a model without its part `index`, refitted.
     pub fn rss_without(&self, fitted: &Fitted, index: usize, scale: &[f64]) -> Option<f64> {
         Some(raw_rss(&self.without(fitted, index, scale, 10)?, scale).iter().sum())
