@@ -748,13 +748,15 @@ impl<'a> Search<'a> {
     /// From the windows to all data. A mechanism that fits what the windows show and nothing beyond them is
     /// let go.
     fn widen(&self, state: &mut State, whole: &Level) {
+        // A simulation that has left every bound is worse than any number.
+        let worst = |a: f64, b: f64| if b.is_nan() { f64::INFINITY } else { a.max(b) };
         let ratio = |wide: &Fitted, narrow: &Fitted| -> f64 {
             let (a, b) = (raw_rms(wide, &state.scale), raw_rms(narrow, &state.scale));
-            a.iter().zip(&b).map(|(a, b)| a / b.max(1e-300)).fold(0.0, f64::max)
+            a.iter().zip(&b).map(|(a, b)| a / b.max(1e-300)).fold(0.0, worst)
         };
         let mut narrow = state.current.clone();
         let mut wide = self.relevel(&narrow, whole.clone(), &state.scale, 15);
-        while narrow.parts.len() > 1 && !(ratio(&wide, &narrow) < BEYOND_WINDOWS) {
+        while narrow.parts.len() > 1 && ratio(&wide, &narrow) > BEYOND_WINDOWS {
             let smaller: Vec<(Fitted, Fitted)> = (0..narrow.parts.len())
                 .into_par_iter()
                 .filter_map(|i| {
@@ -765,7 +767,7 @@ impl<'a> Search<'a> {
                 .collect();
             let best = smaller.into_iter().min_by(|a, b| a.1.fit.cost.total_cmp(&b.1.fit.cost));
             match best {
-                Some(best) if !(wide.fit.cost < best.1.fit.cost) => (narrow, wide) = best,
+                Some(best) if best.1.fit.cost.total_cmp(&wide.fit.cost).is_lt() => (narrow, wide) = best,
                 _ => break,
             }
         }
@@ -1061,6 +1063,7 @@ impl<'a> Search<'a> {
     /// stand in its stead? The better (or the simpler of equals) takes its place; the others are the
     /// alternatives of the report.
     fn reconsider(&self, calibrated: &Fitted, state: &mut State) {
+        self.reconsider_pair(state);
         let mut index = 0;
         let mut relieved = 0;
         while index < state.current.parts.len() {
@@ -1131,6 +1134,49 @@ impl<'a> Search<'a> {
             }
             state.accepted.retain(|a| a.candidate != part.candidate);
             self.accept(state, winner, chosen, rivals, evidence);
+        }
+    }
+
+    /// Two mechanisms of one family may be the round-about way to another two that only pay together (which
+    /// the search, one at a time, does not see): the best simpler pair that fits as well takes their place.
+    fn reconsider_pair(&self, state: &mut State) {
+        let current = state.current.clone();
+        let family = |p: &Part| &self.library[p.candidate.mechanism].family;
+        let complexity = |f: &Fitted| -> f64 {
+            f.parts.iter().map(|p| self.library[p.candidate.mechanism].complexity()).sum()
+        };
+        let samples: usize = current.fit.count.iter().sum();
+        let [first, second] = &current.parts[..] else { return };
+        if family(first) != family(second) || complexity(&current) <= 2.0 || samples < PAIR_SAMPLES {
+            return;
+        }
+        let scale = state.scale.clone();
+        let Some(base) =
+            self.without(&current, 1, &scale, 12).and_then(|one| self.without(&one, 0, &scale, 12))
+        else {
+            return;
+        };
+        let pairs =
+            screen_pairs(&base.setup, self.library, &self.all, &base.level, &scale, &base.fit.point, PAIRS);
+        self.observer.stage(Stage::Fitting { candidates: pairs.len() });
+        let total = |f: &Fitted| f.fit.rss.iter().sum::<f64>();
+        let best = pairs
+            .par_iter()
+            .filter_map(|p| self.extend_by_pair(&base, &self.all, p, &scale))
+            .filter(|f| complexity(f) < complexity(&current))
+            .collect::<Vec<_>>()
+            .into_iter()
+            .min_by(|a, b| total(a).total_cmp(&total(b)));
+        let Some(best) = best else { return };
+        let evidence = self.weigh(&base, &best, &scale);
+        if evidence.score + PARSIMONY > self.weigh(&base, &current, &scale).score {
+            state.accepted = best
+                .parts
+                .iter()
+                .map(|p| Accepted { candidate: p.candidate.clone(), evidence, rivals: Vec::new() })
+                .collect();
+            state.current = best;
+            self.settle(state);
         }
     }
 
