@@ -226,6 +226,34 @@ fn savitzky_golay_survives_every_small_size() {
     }
 }
 
+/// A sine of nine samples per period, with hardly any noise: a cubic over seven samples bends its derivative, and
+/// `adaptive` says by how much. A slow sine under noise is not bent, and the noise is not taken for it.
+#[test]
+fn the_smoothing_says_what_it_bends() {
+    let (dt, sigma) = (0.01, 1e-4);
+    for (per_period, bends) in [(9.0, true), (400.0, false)] {
+        let omega = 2.0 * PI / (per_period * dt);
+        let t: Vec<f64> = (0..4000).map(|k| f64::from(k) * dt).collect();
+        let y: Vec<f64> = t.iter().zip(white(11, 4000, sigma)).map(|(t, n)| (omega * t).sin() + n).collect();
+        let smooth = adaptive(&y, dt, sigma);
+        let inner = 20..3980;
+        let rms = |made: &[f64], truth: &dyn Fn(f64) -> f64| {
+            let sum: f64 = inner.clone().map(|k| (made[k] - truth(t[k])).powi(2)).sum();
+            (sum / inner.len() as f64).sqrt()
+        };
+        let (value, d1) =
+            (rms(&smooth.value, &|t| (omega * t).sin()), rms(&smooth.d1, &|t| omega * (omega * t).cos()));
+        if bends {
+            assert!((smooth.value_bend / value - 1.0).abs() < 0.2, "{} of {value}", smooth.value_bend);
+            // By the next even order, which is bent too, but less.
+            assert!((0.6..1.1).contains(&(smooth.d1_bend / d1)), "{} of {d1}", smooth.d1_bend);
+        } else {
+            assert!(smooth.value_bend < sigma, "{}", smooth.value_bend);
+            assert!(smooth.d1_bend < 2.0 * smooth.d1_std_error(sigma), "{}", smooth.d1_bend);
+        }
+    }
+}
+
 #[test]
 fn the_adaptive_window_follows_the_noise() {
     let dt = 1e-3;
