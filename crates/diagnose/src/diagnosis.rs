@@ -392,11 +392,13 @@ fn conclude(
             ((without - full) / base.max(1e-300)).clamp(0.0, 1.0)
         })
         .collect();
-    let rivalled = !improved.parts.is_empty() && is_rivalled(search, &found, library);
-    let verdict = if rivalled || is_patchwork(&improved, &shares) {
-        Verdict::Unexplained
-    } else {
-        left.verdict(improved.parts.len())
+    let verdict = match left.verdict(improved.parts.len()) {
+        Verdict::MissingPhysics
+            if is_patchwork(&improved, &shares) || is_rivalled(search, &found, library) =>
+        {
+            Verdict::Unexplained
+        }
+        verdict => verdict,
     };
     let significant = left.significant(improved.parts.len()) || verdict == Verdict::Unexplained;
     let mut mechanisms = if verdict == Verdict::MissingPhysics {
@@ -404,14 +406,9 @@ fn conclude(
     } else {
         Vec::new()
     };
-    if significant {
-        // What is still missing may be what was taken for this.
-        for m in &mut mechanisms {
-            m.confidence = m.confidence.min(DOUBTED);
-        }
-    }
     for (i, m) in mechanisms.iter_mut().enumerate() {
-        if is_shared(&improved, &shares, i) {
+        // What is still missing may be what was taken for this.
+        if significant || is_shared(&improved, &shares, i) {
             m.confidence = m.confidence.min(DOUBTED);
         }
     }
@@ -776,7 +773,7 @@ impl Left {
     }
 }
 
-/// Most confidence in a mechanism beside which something unexplained remains.
+/// Most confidence in a mechanism beside which something unexplained remains, or that may be part of another law.
 const DOUBTED: f64 = 0.8;
 
 /// Residual over noise from which a slow residual is a misfit.

@@ -221,3 +221,20 @@ pub fn weigh(old: &Side<'_>, new: &Side<'_>, count: &[usize], kappa: &[f64], whi
         whitened,
     }
 }
+
+#[cfg(test)]
+mod tests {
+    use super::price;
+
+    #[test]
+    fn parameters_cost_as_bic_says_and_more_where_little_is_known() {
+        // Much information: k ln N, to the factor N/(N − k − 1).
+        assert!((price(3.0, 1e5) / (3.0 * 1e5_f64.ln()) - 1.0).abs() < 1e-4);
+        assert!(price(0.0, 50.0).abs() < 1e-300);
+        // Hurvich and Tsai's factor at N = 20, k = 4: 20/15.
+        assert!((price(4.0, 20.0) - 4.0 * 20_f64.ln() * 20.0 / 15.0).abs() < 1e-12);
+        // Below e² samples AIC's 2, and the factor three at most.
+        assert!((price(2.0, 6.0) - 2.0 * 2.0 * 6.0 / 3.0).abs() < 1e-12);
+        assert!((price(5.0, 6.0) - 5.0 * 2.0 * 3.0).abs() < 1e-12);
+    }
+}

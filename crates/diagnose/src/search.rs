@@ -99,6 +99,11 @@ pub struct Fitted {
 }
 
 impl Fitted {
+    /// Residual sum of squares over all channels, in units of the fit's scale.
+    fn rss(&self) -> f64 {
+        self.fit.rss.iter().sum()
+    }
+
     /// Largest residual RMS over the noise.
     fn misfit(&self, scale: &[f64]) -> f64 {
         rms(&self.fit, scale).iter().zip(&self.setup.data.sigma).map(|(r, s)| r / s).fold(0.0, f64::max)
@@ -226,7 +231,11 @@ fn same_level(setup: &Setup, level: &Level) -> Level {
 
 /// Residual RMS per channel in SI.
 pub fn rms(fit: &Fit, scale: &[f64]) -> Vec<f64> {
-    fit.rss.iter().zip(&fit.count).zip(scale).map(|((r, n), s)| s * (r / (*n).max(1) as f64).sqrt()).collect()
+    rms_of(&fit.rss, &fit.count, scale)
+}
+
+fn rms_of(rss: &[f64], count: &[usize], scale: &[f64]) -> Vec<f64> {
+    rss.iter().zip(count).zip(scale).map(|((r, n), s)| s * (r / (*n).max(1) as f64).sqrt()).collect()
 }
 
 /// The scale for the next comparison: the model's own residual, never below 0.7 of the noise.
@@ -318,8 +327,8 @@ impl<'a> Search<'a> {
         };
         // The starts alone first: parameters that fit elsewhere must not give way to starts that do not yet.
         let held = Setup { free: Vec::new(), ..fitted.setup.clone() };
-        let settled = held.fit(&level, scale, &[stitched.clone(), hats.clone()], limits(STARTS)).point;
-        let fit = fitted.setup.fit(&level, scale, &[settled, stitched, hats], limits(iterations));
+        let settled = held.fit(&level, scale, &[stitched, hats], limits(STARTS)).point;
+        let fit = fitted.setup.fit(&level, scale, &[settled], limits(iterations));
         Fitted { level, fit, ..fitted.clone() }
     }
 
@@ -364,6 +373,11 @@ impl<'a> Search<'a> {
         (fitted.fit.cost.is_finite() && self.admissible(&fitted)).then_some(fitted)
     }
 
+    /// Complexity of all mechanisms of a model.
+    fn complexity(&self, fitted: &Fitted) -> f64 {
+        fitted.parts.iter().map(|p| self.library[p.candidate.mechanism].complexity()).sum()
+    }
+
     /// Whether every mechanism's requirements on its parameters hold.
     fn admissible(&self, fitted: &Fitted) -> bool {
         fitted.parts.iter().all(|part| {
@@ -402,13 +416,12 @@ impl<'a> Search<'a> {
         self.observer.stage(Stage::Fitting { candidates: pairs.len() });
         let trials: Vec<Fitted> =
             pairs.par_iter().filter_map(|p| self.extend_by_pair(&current, &open, p, &scale)).collect();
-        let total = |f: &Fitted| f.fit.rss.iter().sum::<f64>();
-        let Some(best) = trials.into_iter().min_by(|a, b| total(a).total_cmp(&total(b))) else {
+        let Some(best) = trials.into_iter().min_by(|a, b| a.rss().total_cmp(&b.rss())) else {
             return false;
         };
         let control = self.control(&current, &best, &scale);
         let evidence = self.weigh(&control, &best, &scale);
-        let share = (total(&control) - total(&best)) / calibrated_rss(calibrated, &scale).max(1e-300);
+        let share = (control.rss() - best.rss()) / calibrated_rss(calibrated, &scale).max(1e-300);
         let (n, first) = (self.all.len() as f64, current.parts.is_empty());
         let members = &best.parts[best.parts.len() - 2..];
         for part in members {
@@ -917,12 +930,8 @@ impl<'a> Search<'a> {
             evidence
         };
         let total: f64 = calibrated_rss(calibrated, &scale);
-        let share = if evidence.whitened {
-            1.0
-        } else {
-            (state.current.fit.rss.iter().sum::<f64>() - chosen.fit.rss.iter().sum::<f64>())
-                / total.max(1e-300)
-        };
+        let share =
+            if evidence.whitened { 1.0 } else { (state.current.rss() - chosen.rss()) / total.max(1e-300) };
         let mechanism = &self.library[winner.mechanism];
         self.observer.weighed(&mechanism.kind, &evidence, share);
         if !self.believable(&evidence, mechanism, share, state.current.parts.is_empty(), state.loose) {
@@ -944,8 +953,7 @@ impl<'a> Search<'a> {
             .par_iter()
             .filter_map(|s| self.trial(base, &open[s.candidate], s, scale).map(|f| (s.candidate, f)))
             .collect();
-        let total = |f: &Fitted| f.fit.rss.iter().sum::<f64>();
-        trials.sort_by(|a, b| total(&a.1).total_cmp(&total(&b.1)).then(a.0.cmp(&b.0)));
+        trials.sort_by(|a, b| a.1.rss().total_cmp(&b.1.rss()).then(a.0.cmp(&b.0)));
         let rest = trials.split_off(trials.len().min(FINALISTS));
         let mut finished: Vec<(usize, Fitted)> = trials
             .into_par_iter()
@@ -1142,12 +1150,9 @@ impl<'a> Search<'a> {
     fn reconsider_pair(&self, state: &mut State) {
         let current = state.current.clone();
         let family = |p: &Part| &self.library[p.candidate.mechanism].family;
-        let complexity = |f: &Fitted| -> f64 {
-            f.parts.iter().map(|p| self.library[p.candidate.mechanism].complexity()).sum()
-        };
         let samples: usize = current.fit.count.iter().sum();
         let [first, second] = &current.parts[..] else { return };
-        if family(first) != family(second) || complexity(&current) <= 2.0 || samples < PAIR_SAMPLES {
+        if family(first) != family(second) || self.complexity(&current) <= 2.0 || samples < PAIR_SAMPLES {
             return;
         }
         let scale = state.scale.clone();
@@ -1159,14 +1164,13 @@ impl<'a> Search<'a> {
         let pairs =
             screen_pairs(&base.setup, self.library, &self.all, &base.level, &scale, &base.fit.point, PAIRS);
         self.observer.stage(Stage::Fitting { candidates: pairs.len() });
-        let total = |f: &Fitted| f.fit.rss.iter().sum::<f64>();
         let best = pairs
             .par_iter()
             .filter_map(|p| self.extend_by_pair(&base, &self.all, p, &scale))
-            .filter(|f| complexity(f) < complexity(&current))
+            .filter(|f| self.complexity(f) < self.complexity(&current))
             .collect::<Vec<_>>()
             .into_iter()
-            .min_by(|a, b| total(a).total_cmp(&total(b)));
+            .min_by(|a, b| a.rss().total_cmp(&b.rss()));
         let Some(best) = best else { return };
         let evidence = self.weigh(&base, &best, &scale);
         if evidence.score + PARSIMONY > self.weigh(&base, &current, &scale).score {
@@ -1192,9 +1196,9 @@ impl<'a> Search<'a> {
         if state.current.parts.len() < 2 {
             return false;
         }
-        let best: f64 = state.current.fit.rss.iter().sum();
+        let best = state.current.rss();
         for (c, trial) in trials {
-            let near = trial.fit.rss.iter().sum::<f64>() < 1.02 * best;
+            let near = trial.rss() < 1.02 * best;
             let whole = !self.library[open[*c].mechanism].equals.is_empty();
             if !near
                 || whole
@@ -1319,8 +1323,7 @@ impl<'a> Search<'a> {
         scale: &[f64],
     ) -> Option<(Candidate, Fitted, Vec<Rival>, Evidence)> {
         // One information per sample for all: that of the residual which fits best.
-        let total_rss = |f: &Fitted| f.fit.rss.iter().sum::<f64>();
-        let best = trials.iter().min_by(|a, b| total_rss(&a.1).total_cmp(&total_rss(&b.1)))?;
+        let best = trials.iter().min_by(|a, b| a.1.rss().total_cmp(&b.1.rss()))?;
         let kappa = kappa(&best.1.setup, &best.1.level, scale, &best.1.fit.point);
         let mut weighed: Vec<(usize, Fitted, Evidence)> = trials
             .into_par_iter()
@@ -1337,9 +1340,6 @@ impl<'a> Search<'a> {
             }
         }
         let total = calibrated_rss(calibrated, scale);
-        let complexity = |f: &Fitted| -> f64 {
-            f.parts.iter().map(|p| self.library[p.candidate.mechanism].complexity()).sum()
-        };
         let priority = |c: usize| self.library[open[c].mechanism].rank;
         let mut best = 0;
         for i in 1..weighed.len() {
@@ -1354,10 +1354,10 @@ impl<'a> Search<'a> {
             };
             // As good in every channel, or within what a likelihood can tell. Far above the noise each
             // parameter more must buy its share: there, any flexible law follows what another law lacks.
-            let surplus = complexity(&a.1) - complexity(&b.1);
+            let surplus = self.complexity(&a.1) - self.complexity(&b.1);
             let slack = if a.1.misfit(scale) > FAR { SHARE_PER_PARAMETER * surplus } else { 0.0 }.max(0.02);
             let simpler = surplus > 0.0 && (near(slack) || a.2.score - b.2.score < PARSIMONY);
-            let tie = complexity(&b.1) == complexity(&a.1)
+            let tie = self.complexity(&b.1) == self.complexity(&a.1)
                 && (near(0.005) || (a.2.whitened && a.2.score - b.2.score < SAME_SCORE))
                 && priority(b.0) < priority(a.0);
             if simpler || tie {
@@ -1373,7 +1373,7 @@ impl<'a> Search<'a> {
             .filter_map(|(c, f, e)| {
                 // The data cannot separate what fits as well with no more parameters, nor what the evidence
                 // leaves at odds that no one would bet on.
-                let as_good = complexity(&f) <= complexity(&fitted)
+                let as_good = self.complexity(&f) <= self.complexity(&fitted)
                     && !e.whitened
                     && f.fit.rss.iter().zip(&fitted.fit.rss).all(|(x, y)| *x < 1.005 * y);
                 let equivalent = as_good || (e.score - evidence.score).abs() < UNDECIDED;
@@ -1490,12 +1490,7 @@ pub fn raw_rss(fitted: &Fitted, scale: &[f64]) -> Vec<f64> {
 
 /// Residual RMS per channel in SI, not whitened.
 pub fn raw_rms(fitted: &Fitted, scale: &[f64]) -> Vec<f64> {
-    let rss = raw_rss(fitted, scale);
-    rss.iter()
-        .zip(&fitted.fit.count)
-        .zip(scale)
-        .map(|((r, n), s)| s * (r / (*n).max(1) as f64).sqrt())
-        .collect()
+    rms_of(&raw_rss(fitted, scale), &fitted.fit.count, scale)
 }
 
 fn calibrated_rss(calibrated: &Fitted, scale: &[f64]) -> f64 {
