@@ -126,22 +126,15 @@ impl<'a> Spectra<'a> {
             of(&residual);
         }
         // A frequency that the input itself is made of cannot be told from what the motion does.
-        values.retain(|w| !self.drives(*w));
+        let inputs = self.inputs();
+        values.retain(|w| !inputs.iter().any(|(frequency, power)| drives(frequency, power, *w)));
         distinct(values)
     }
 
-    /// Whether a good part of an input's power lies at this angular frequency.
-    fn drives(&self, w: f64) -> bool {
-        let pieces = &self.setup.data.pieces;
-        let Some(piece) = pieces.iter().max_by_key(|p| p.len) else { return false };
-        piece.inputs.iter().any(|u| {
-            let (frequency, power) = spectrum(u, piece.dt);
-            let step = frequency.get(1).copied().unwrap_or(f64::INFINITY);
-            let total: f64 = power.iter().sum();
-            let near = |f: f64| (f - w / (2.0 * std::f64::consts::PI)).abs() <= 2.5 * step;
-            let here: f64 = frequency.iter().zip(&power).filter(|(f, _)| near(**f)).map(|(_, p)| p).sum();
-            here > DRIVEN * total
-        })
+    /// Spectrum of each input on the longest piece: frequencies, Hz, and powers.
+    fn inputs(&self) -> Vec<(Vec<f64>, Vec<f64>)> {
+        let longest = self.setup.data.pieces.iter().max_by_key(|p| p.len);
+        longest.map_or_else(Vec::new, |p| p.inputs.iter().map(|u| spectrum(u, p.dt)).collect())
     }
 
     /// Residuals of the outputs, `[channel][piece][sample]`.
@@ -228,6 +221,15 @@ fn lines(power: &[f64]) -> Vec<usize> {
         }
     }
     out
+}
+
+/// Whether a good part of an input's power lies at the angular frequency `w`.
+fn drives(frequency: &[f64], power: &[f64], w: f64) -> bool {
+    let step = frequency.get(1).copied().unwrap_or(f64::INFINITY);
+    let total: f64 = power.iter().sum();
+    let near = |f: f64| (f - w / (2.0 * std::f64::consts::PI)).abs() <= 2.5 * step;
+    let here: f64 = frequency.iter().zip(power).filter(|(f, _)| near(**f)).map(|(_, p)| p).sum();
+    here > DRIVEN * total
 }
 
 fn distinct(values: Vec<f64>) -> Vec<f64> {
