@@ -2,7 +2,7 @@
 
 use std::sync::Arc;
 
-use greybox_model::{Hold, Model, System};
+use greybox_model::{Expr, Func, Hold, Model, System};
 use greybox_simulate::{Environment, Method, Seeds, integrate};
 use rayon::prelude::*;
 
@@ -199,7 +199,30 @@ impl Setup {
                 *v = hat[sample];
             }
         }
+        x.iter_mut().zip(self.gone_on(piece, sample)).for_each(|(v, moved)| *v += moved);
         x
+    }
+
+    /// How far each entry of the state has gone on since a late sensor saw it: τ times its rate.
+    fn gone_on(&self, piece: usize, sample: usize) -> Vec<f64> {
+        let mut moved = vec![0.0; self.system.nx];
+        let known = |n: &str| self.model.parameter(n).map(|i| self.model.parameters[i].value);
+        for measurement in &self.model.measurements {
+            let Expr::Call(Func::Delay, arguments) = &measurement.expr else { continue };
+            let [Expr::Var { name, .. }, tau] = &arguments[..] else { continue };
+            let (Some(j), Some(tau)) = (self.model.state(name), tau.eval(&|n, _| known(n))) else { continue };
+            let (first, order) = (self.system.offsets[j], self.model.states[j].order);
+            for i in 0..order {
+                let rate = if i + 1 < order {
+                    self.hats.states[piece][first + i + 1].as_ref()
+                } else {
+                    self.hats.highest[piece][j].as_ref()
+                };
+                moved[first + i] = rate.map_or(0.0, |r| tau * r[sample]);
+            }
+        }
+        moved.iter_mut().filter(|m| !m.is_finite()).for_each(|m| *m = 0.0);
+        moved
     }
 
     fn given_start(&self) -> Vec<f64> {
@@ -222,8 +245,9 @@ impl Setup {
         let mut prior: StartPrior = self.hats.states[piece]
             .iter()
             .zip(&self.hats.tolerance)
-            .map(|(hat, tolerance)| match hat {
-                Some(h) if h[sample].is_finite() => (h[sample], end * tolerance),
+            .zip(self.gone_on(piece, sample))
+            .map(|((hat, tolerance), moved)| match hat {
+                Some(h) if h[sample].is_finite() => (h[sample] + moved, (end * tolerance).hypot(moved)),
                 _ => (0.0, f64::INFINITY),
             })
             .collect();

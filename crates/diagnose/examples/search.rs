@@ -78,6 +78,10 @@ fn main() -> Result<(), Box<dyn std::error::Error>> {
             );
         }
     }
+    for f in [&found.calibrated, &found.improved] {
+        let s = greybox_diagnose::surface::test(&f.setup, &f.level, &found.scale, &f.fit.point);
+        println!("free shapes {:?}", s.map(|s| (s.gain, s.t)));
+    }
     println!("{:7.2} done", talk.0.elapsed().as_secs_f64());
     Ok(())
 }

@@ -11,12 +11,12 @@ use greybox_recording::Recording;
 use rayon::prelude::*;
 
 use crate::along::Along;
-use crate::evidence::{Evidence, folds};
+use crate::evidence::{Evidence, folds, kappa};
 use crate::library::{Mechanism, MechanismError, built_in};
 use crate::locate::{Location, force, locate};
 use crate::place::Place;
 use crate::screen::project;
-use crate::search::{Fitted, Found, Part, Search, raw_rms, raw_rss, rms};
+use crate::search::{Fitted, Found, Part, Search, log_likelihood_gain, raw_rms, raw_rss, rms};
 use crate::surface::{Surface, Variable};
 use crate::{Observer, Stage};
 
@@ -381,10 +381,14 @@ fn conclude(
     let mut holdout_role = role(&holdout, true)?;
 
     // Mechanisms, remainder, verdict.
-    let surface = surface(&improved, &scale);
+    // Where nothing was found, what the search's own noise model leaves white.
+    let surface = match found.improved.parts.is_empty() && found.improved.setup.noise.is_some() {
+        true => surface(&found.improved, &found.scale),
+        false => surface(&improved, &scale),
+    };
     let full: f64 = raw_rss(&improved, &found.scale).iter().sum();
     let base = search.rss_at(&calibrated, &improved, &found.scale);
-    let left = Left::of(&improved, &found.scale, surface.as_ref(), base);
+    let left = Left::of(&improved, &found, search, surface.as_ref(), base);
     let shares: Vec<f64> = (0..improved.parts.len())
         .into_par_iter()
         .map(|i| {
@@ -731,12 +735,23 @@ struct Left {
     slow: bool,
     /// Gain of free shapes on folds they were not fitted to (zero where it is not steady).
     shape: f64,
+    /// Whether free shapes are likelier than none, however little they explain.
+    hidden: bool,
+    /// They do, and the innovations are all there is to judge by.
+    innovations: bool,
     /// Share of the calibrated model's misfit beyond the noise that the mechanisms explain.
     explained: f64,
 }
 
 impl Left {
-    fn of(improved: &Fitted, scale: &[f64], surface: Option<&Surface>, base: f64) -> Left {
+    fn of(
+        improved: &Fitted,
+        found: &Found,
+        search: &Search<'_>,
+        surface: Option<&Surface>,
+        base: f64,
+    ) -> Left {
+        let scale = &found.scale;
         let sigma = &improved.setup.data.sigma;
         let rms = raw_rms(improved, scale);
         let coloured = crate::search::coloured_channels(improved, scale);
@@ -745,6 +760,7 @@ impl Left {
         let shape = surface.filter(|s| s.t > 2.5).map_or(0.0, |s| s.gain);
         // The floor is the noise where it is white, the residual itself where it passes for noise.
         let counts = &improved.fit.count;
+        let samples = counts.iter().sum::<usize>() as f64;
         let floor: f64 = (0..rms.len())
             .map(|c| {
                 let noise = if coloured[c] { rms[c] } else { sigma[c].min(rms[c]) };
@@ -752,18 +768,32 @@ impl Left {
             })
             .sum();
         let full: f64 = raw_rss(improved, scale).iter().sum();
-        let explained = 1.0 - (full - floor).max(0.0) / (base - floor).max(1e-300);
-        Left { misfit, slow, shape, explained }
+        let mut explained = 1.0 - (full - floor).max(0.0) / (base - floor).max(1e-300);
+        let whitened = found.improved.setup.noise.is_some();
+        // Free shapes' gain in log-likelihood, by what independent samples there are.
+        let kappa = kappa(&improved.setup, &improved.level, scale, &improved.fit.point);
+        let independent = samples * kappa.iter().copied().fold(1.0, f64::min);
+        let likelier = surface.filter(|s| s.t > STEADY_DOUBT && independent * s.gain > LIKELIER);
+        let hidden = likelier.is_some();
+        let steady = likelier.filter(|s| whitened && s.t > STEADY_INNOVATIONS);
+        let innovations = steady.is_some();
+        if let Some(free) = steady {
+            // What the mechanisms gain in log-likelihood beside what free shapes would gain beyond them.
+            let (before, after) = search.comparable(found);
+            let named = log_likelihood_gain(&before, &after, scale);
+            explained = named / (named - samples * (1.0 - free.gain).max(1e-9).ln()).max(1e-300);
+        }
+        Left { misfit, slow, shape, hidden, innovations, explained }
     }
 
     /// Whether something is missing beyond the mechanisms found.
     fn significant(&self, mechanisms: usize) -> bool {
         let (gain, ratio) = if mechanisms == 0 { (0.2, 1.3) } else { (0.05, 1.1) };
-        self.slow || (self.shape > gain && self.misfit > ratio)
+        self.slow || self.hidden || (self.shape > gain && self.misfit > ratio)
     }
 
     fn verdict(&self, mechanisms: usize) -> Verdict {
-        let lacks = self.slow || (self.shape > 0.2 && self.misfit > 1.3);
+        let lacks = self.slow || self.innovations || (self.shape > 0.2 && self.misfit > 1.3);
         match mechanisms {
             0 if lacks => Verdict::Unexplained,
             0 => Verdict::Consistent,
@@ -772,6 +802,13 @@ impl Left {
         }
     }
 }
+
+/// Mean over standard error of the folds' gains from which free shapes cast doubt on what was found, and from
+/// which what they predict of innovations is called missing; and their held-out gain in log-likelihood (twice):
+/// by chance fourteen columns lose fourteen, give or take five.
+const STEADY_DOUBT: f64 = 1.5;
+const STEADY_INNOVATIONS: f64 = 2.5;
+const LIKELIER: f64 = 20.0;
 
 /// Most confidence in a mechanism beside which something unexplained remains, or that may be part of another law.
 const DOUBTED: f64 = 0.8;

@@ -45,6 +45,8 @@ const PAIR_SAMPLES: usize = 500;
 const STUCK: f64 = 1.2;
 /// Residual over noise from which a model is far from the noise.
 const FAR: f64 = 2.0;
+/// Factor by which calibration may move a parameter before a model far from the noise is in doubt for it.
+const MOVED: f64 = 2.0;
 /// Ratio of sums of squares at which a whitened estimate simulates no longer what it is fitted to.
 const FORGETS: f64 = 1.5;
 /// Share of the misfit that each parameter more must buy far from the noise.
@@ -907,11 +909,31 @@ impl<'a> Search<'a> {
         self.observer.screened(&ranking);
         let least = if current.setup.noise.is_some() { 0.001 } else { 0.003 };
         let short = self.short_list(&open, &scored, least, SHORT_LIST);
-        if short.is_empty() {
+        let anchors: Vec<(Fitted, Vec<Scored>)> = self
+            .anchors(state)
+            .into_iter()
+            .map(|a| {
+                let scored = screen(&a.setup, self.library, &open, &a.level, &scale, &a.fit.point);
+                (a, scored)
+            })
+            .collect();
+        let anchored: Vec<(&Fitted, Vec<&Scored>)> =
+            anchors.iter().map(|(a, s)| (a, self.short_list(&open, s, least, SHORT_LIST))).collect();
+        if short.is_empty() && anchored.iter().all(|a| a.1.is_empty()) {
             return false;
         }
-        self.observer.stage(Stage::Fitting { candidates: short.len() });
-        let trials = self.trials(current, &open, &short, &scale);
+        let candidates = short.len() + anchored.iter().map(|a| a.1.len()).sum::<usize>();
+        self.observer.stage(Stage::Fitting { candidates });
+        let mut trials = self.trials(current, &open, &short, &scale);
+        for (anchor, short) in anchored {
+            for (c, fitted) in self.trials(anchor, &open, &short, &scale) {
+                match trials.iter_mut().find(|t| t.0 == c) {
+                    Some(known) if fitted.fit.cost < known.1.fit.cost => known.1 = fitted,
+                    Some(_) => {}
+                    None => trials.push((c, fitted)),
+                }
+            }
+        }
         let Some((winner, chosen, rivals, evidence)) =
             self.decide(calibrated, current, &open, trials, &scale)
         else {
@@ -939,6 +961,39 @@ impl<'a> Search<'a> {
         }
         self.accept(state, winner, chosen, rivals, evidence);
         true
+    }
+
+    /// Other points from which candidates are tried, where what calibration has made of the model may be the
+    /// work of what is missing:
+    ///
+    /// - with the stated holds, where others fit better: half a sample of delay may be a delay;
+    /// - at the nominal parameters, where the calibrated ones are far from them and the simulation still far
+    ///   from the recording: a strong friction is taken for an inertia and a damping many times too large, and
+    ///   no friction helps there.
+    fn anchors(&self, state: &State) -> Vec<Fitted> {
+        let current = &state.current;
+        let stated = current.setup.with_holds(self.nominal.holds.clone());
+        let mut out = Vec::new();
+        if current.setup.holds != self.nominal.holds {
+            let fitted = Fitted { setup: stated.clone(), ..current.clone() };
+            out.push(self.refit(&fitted, &state.scale, 10));
+        }
+        if current.parts.is_empty() && current.setup.noise.is_none() && state.misfit() > FAR {
+            let nominal = self.nominal.values();
+            let moved = current.setup.free.iter().any(|f| {
+                let (was, is) = (nominal[f.index], current.fit.point.parameters[f.index]);
+                !(1.0 / MOVED..=MOVED).contains(&(is / was))
+            });
+            if moved {
+                let starts = current.setup.starts(&current.level, &nominal);
+                let held = Setup { free: Vec::new(), ..stated.clone() };
+                let start = Point { parameters: nominal, starts };
+                let fit = held.fit(&current.level, &state.scale, &[start], limits(STARTS));
+                out.push(Fitted { setup: stated, fit, ..current.clone() });
+            }
+        }
+        out.retain(|f| f.fit.cost.is_finite());
+        out
     }
 
     /// Fits a short-list: all of it a little, the more promising half to the end.
@@ -1344,10 +1399,11 @@ impl<'a> Search<'a> {
         let mut best = 0;
         for i in 1..weighed.len() {
             let (a, b) = (&weighed[best], &weighed[i]);
-            // (Of innovations a per cent is much: they hold what cannot be predicted. There, the likelihood
-            // alone speaks.)
+            // (Of innovations a per cent is much: they hold what cannot be predicted. There, and where the
+            // residual is white and as small as the noise, the likelihood alone speaks.)
+            let likelihood = by_likelihood(&a.1, &a.2, scale);
             let near = |slack: f64| {
-                !a.2.whitened
+                !likelihood
                     && a.1.fit.rss.iter().zip(&b.1.fit.rss).all(|(x, y)| {
                         *y < (1.0 + slack) * x || (slack > 0.01 && (y - x) < LEAST_SHARE * total)
                     })
@@ -1358,7 +1414,7 @@ impl<'a> Search<'a> {
             let slack = if a.1.misfit(scale) > FAR { SHARE_PER_PARAMETER * surplus } else { 0.0 }.max(0.02);
             let simpler = surplus > 0.0 && (near(slack) || a.2.score - b.2.score < PARSIMONY);
             let tie = self.complexity(&b.1) == self.complexity(&a.1)
-                && (near(0.005) || (a.2.whitened && a.2.score - b.2.score < SAME_SCORE))
+                && (near(0.005) || (likelihood && a.2.score - b.2.score < SAME_SCORE))
                 && priority(b.0) < priority(a.0);
             if simpler || tie {
                 best = i;
@@ -1374,7 +1430,7 @@ impl<'a> Search<'a> {
                 // The data cannot separate what fits as well with no more parameters, nor what the evidence
                 // leaves at odds that no one would bet on.
                 let as_good = self.complexity(&f) <= self.complexity(&fitted)
-                    && !e.whitened
+                    && !by_likelihood(&fitted, &evidence, scale)
                     && f.fit.rss.iter().zip(&fitted.fit.rss).all(|(x, y)| *x < 1.005 * y);
                 let equivalent = as_good || (e.score - evidence.score).abs() < UNDECIDED;
                 let instance = f.parts.last()?.instance.clone();
@@ -1475,11 +1531,24 @@ pub fn coloured_channels(f: &Fitted, scale: &[f64]) -> Vec<bool> {
         .collect()
 }
 
+/// Whether the likelihood can be taken at its word: of innovations, and of a residual that is white and no
+/// larger than the noise. Anything else holds misfits that no likelihood knows of.
+fn by_likelihood(f: &Fitted, e: &Evidence, scale: &[f64]) -> bool {
+    e.whitened || (e.kappa > 0.8 && f.misfit(scale) < STUCK)
+}
+
 /// Sum of squared innovations per channel, each model with the noise model of its own residual.
 fn innovations(f: &Fitted, scale: &[f64]) -> Vec<f64> {
     let noise = f.setup.innovations(&f.level, scale, &f.fit.point);
     let relative = noise.iter().zip(scale).map(|(a, s)| a.variance() / (s * s));
     relative.zip(&f.fit.count).map(|(v, n)| v * *n as f64).collect()
+}
+
+/// Twice the gain in log-likelihood from one model to another, each with the noise model of its own residual.
+pub fn log_likelihood_gain(old: &Fitted, new: &Fitted, scale: &[f64]) -> f64 {
+    let (before, after) = (innovations(old, scale), innovations(new, scale));
+    let ratios = before.iter().zip(&after).filter(|(b, a)| **b > 0.0 && **a > 0.0);
+    ratios.zip(&new.fit.count).map(|((b, a), n)| *n as f64 * (b / a).ln()).sum()
 }
 
 /// Residual sum of squares per channel of a fitted model, not whitened, in units of `scale`.

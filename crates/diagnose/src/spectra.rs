@@ -24,6 +24,13 @@ const NEIGHBOURS: usize = 31;
 const MOST: usize = 3000;
 /// Share of an input's power around a frequency from which the input itself is periodic there.
 const DRIVEN: f64 = 0.15;
+/// Share of the power within ten lines that lies within two and a half where there is a line.
+const LINE: f64 = 0.6;
+/// Most periods of a ripple over the range that are tried one by one beside coloured noise, and their steps.
+const RIPPLES: f64 = 24.0;
+const RIPPLE_STEP: f64 = 0.4;
+/// Shortest period of a ripple over the noise of the sensor (1.7 steps where that is rounding).
+const SENSED: f64 = 6.0;
 /// Deviations beyond this many standard deviations are clipped.
 const CLIP: f64 = 6.0;
 
@@ -153,6 +160,16 @@ impl<'a> Spectra<'a> {
             .collect()
     }
 
+    /// Noise of the sensors that see a variable, added up; zero where none does.
+    fn noise(&self, variable: &Expr) -> f64 {
+        let measured = |name: &str| {
+            let seen = |m: &greybox_model::Measurement| matches!(&m.expr, Expr::Var { name: n, primes: 0 } if **n == *name);
+            self.setup.model.measurements.iter().position(seen)
+        };
+        let channels = variable.variables().into_iter().filter_map(|(name, _)| measured(&name));
+        channels.map(|c| self.setup.data.sigma[c]).sum()
+    }
+
     /// Lines of the force over a variable that is not evenly sampled.
     fn over(&self, equation: usize, variable: &Expr) -> Vec<f64> {
         let Some(force) = self.force(equation) else { return Vec::new() };
@@ -175,7 +192,10 @@ impl<'a> Spectra<'a> {
         let mut jumps: Vec<f64> = q.iter().flat_map(|q| q.windows(2).map(|w| (w[1] - w[0]).abs())).collect();
         jumps.sort_by(f64::total_cmp);
         let jump = jumps.get(jumps.len() * 9 / 10).copied().unwrap_or(0.0);
-        let count = ((std::f64::consts::PI / jump.max(1e-300) / step) as usize).clamp(8, MOST);
+        let finest = std::f64::consts::PI / jump.max(1e-300);
+        // Nor than the sensor does: what it rounds to makes a ripple of its own, one step long.
+        let finest = finest.min(2.0 * std::f64::consts::PI / (SENSED * self.noise(variable)).max(1e-300));
+        let count = ((finest / step) as usize).clamp(8, MOST);
         // e^{−i n q} by rotation from one n to the next.
         let turns: Vec<(f64, f64)> =
             pairs.iter().map(|(q, _)| ((step * q).cos(), -(step * q).sin())).collect();
@@ -191,7 +211,15 @@ impl<'a> Spectra<'a> {
                 re * re + im * im
             })
             .collect();
-        distinct(lines(&power).into_iter().map(|i| step * (i + 1) as f64).collect())
+        let mut values: Vec<f64> = lines(&power).into_iter().map(|i| step * (i + 1) as f64).collect();
+        if self.setup.noise.is_some() {
+            // Beside coloured noise the force is too uncertain for lines: the score test looks at every ripple
+            // of up to so many periods itself.
+            let period = 2.0 * std::f64::consts::PI / (high - low);
+            let turns = (1..).map(|i| f64::from(i) * RIPPLE_STEP).take_while(|t| *t <= RIPPLES);
+            values.extend(turns.map(|t| t * period).filter(|n| *n <= step * count as f64));
+        }
+        distinct(values)
     }
 }
 
@@ -223,13 +251,16 @@ fn lines(power: &[f64]) -> Vec<usize> {
     out
 }
 
-/// Whether a good part of an input's power lies at the angular frequency `w`.
+/// Whether the input itself has a line at the angular frequency `w`: a good part of all its power, and most of
+/// what it has thereabouts (a slow input has much power at low frequencies, and no line).
 fn drives(frequency: &[f64], power: &[f64], w: f64) -> bool {
     let step = frequency.get(1).copied().unwrap_or(f64::INFINITY);
     let total: f64 = power.iter().sum();
-    let near = |f: f64| (f - w / (2.0 * std::f64::consts::PI)).abs() <= 2.5 * step;
-    let here: f64 = frequency.iter().zip(power).filter(|(f, _)| near(**f)).map(|(_, p)| p).sum();
-    here > DRIVEN * total
+    let within = |lines: f64| -> f64 {
+        let near = |f: f64| (f - w / (2.0 * std::f64::consts::PI)).abs() <= lines * step;
+        frequency.iter().zip(power).filter(|(f, _)| near(**f)).map(|(_, p)| p).sum()
+    };
+    within(2.5) > DRIVEN * total && within(2.5) > LINE * within(10.0)
 }
 
 fn distinct(values: Vec<f64>) -> Vec<f64> {

@@ -16,6 +16,8 @@ use crate::place::{Motion, Place, places};
 use crate::screen::project;
 
 const FOLDS: usize = 10;
+/// Knots of slow time over a recording.
+const SLOW_KNOTS: usize = 14;
 /// Fewest independent samples (N κ) for a test of free shapes.
 const LEAST_INDEPENDENT: f64 = 20.0;
 
@@ -144,20 +146,19 @@ pub fn test(setup: &Setup, level: &Level, scale: &[f64], point: &Point) -> Optio
         }
         let times: Vec<Vec<f64>> =
             pieces.iter().map(|p| (0..p.len).map(|k| p.start + k as f64 * p.dt).collect()).collect();
-        let mut slow = Vec::new();
-        for shape in shapes(&times, 6) {
-            for factor in [None, d.as_ref(), v.as_ref()] {
-                slow.push(match factor {
-                    None => shape.clone(),
-                    Some(f) => shape
-                        .iter()
-                        .zip(f)
-                        .map(|(s, f)| s.iter().zip(f).map(|(a, b)| a * b).collect())
-                        .collect(),
-                });
-            }
+        // What a force of slow time, and the gains of the motion and of the inputs, would be if they changed.
+        let slow = shapes(&times, SLOW_KNOTS);
+        let mut factors: Vec<Option<Vec<Vec<f64>>>> = vec![None];
+        factors.extend([&d, &v].into_iter().flatten().cloned().map(Some));
+        factors.extend(d.iter().map(|d| Some(times_series(d, d))));
+        factors.extend((0..setup.system.nu).map(|u| Some(pieces.iter().map(|p| p.inputs[u].clone()).collect())));
+        for factor in factors {
+            let gains = slow.iter().map(|shape| match &factor {
+                None => shape.clone(),
+                Some(f) => times_series(shape, f),
+            });
+            push(Variable::Time(motion.clone()), gains.collect());
         }
-        push(Variable::Time(motion.clone()), slow);
     }
     if columns.is_empty() {
         return None;

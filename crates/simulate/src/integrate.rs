@@ -198,6 +198,8 @@ struct History {
     lanes: Vec<f64>,
     /// Ends where another stretch did; the next entry tells where this one starts.
     seam: bool,
+    /// Sensitivities of the first slope, where the expression goes straight on before its first value.
+    rate: Vec<f64>,
 }
 
 impl History {
@@ -273,12 +275,14 @@ impl History {
             slope: self.slope[from..].to_vec(),
             lanes: self.lanes[from * lanes..].to_vec(),
             seam: true,
+            rate: if from == 0 { self.rate.clone() } else { Vec::new() },
         }
     }
 
     /// The same with its lanes laid out for other seeds.
     fn with_lanes(&self, map: &LaneMap) -> History {
-        History { lanes: map.apply(&self.lanes, self.s.len()), ..self.clone() }
+        let rate = map.apply(&self.rate, usize::from(!self.rate.is_empty()));
+        History { lanes: map.apply(&self.lanes, self.s.len()), rate, ..self.clone() }
     }
 }
 
@@ -320,7 +324,6 @@ pub struct Carry {
     dx: Vec<f64>,
     reach: Vec<f64>,
     h_next: f64,
-    start_s: f64,
     /// Lanes of `dx` and of the histories: these parameters, so many initial states and signals.
     parameters: Vec<usize>,
     initial: usize,
@@ -370,7 +373,8 @@ pub struct Simulation<'a> {
 
 impl Simulation<'_> {
     /// Samples `range` from state `x0` (`system.nx` entries: the chains q, q', … in the order of the
-    /// states, SI) at the first of them. Delayed expressions hold their initial value before it.
+    /// states, SI) at the first of them. Before it, delayed expressions of the equations hold their
+    /// initial value; a state whose measurement is delayed goes straight back along its rate.
     pub fn run(&self, x0: &[f64], range: std::ops::Range<usize>) -> Trajectory {
         let s = range.start as f64 * self.environment.dt;
         Core::new(self, x0, s).run(range, false)
@@ -382,7 +386,7 @@ impl Simulation<'_> {
     /// tangents, whatever `x0` says; the other states start at `x0`. The delayed expressions remember
     /// what `before` remembers; where the state jumps (`x0` is not where the other stretch ended), they
     /// bend to the new start within the last eight steps before it. Before the first sample of all
-    /// they hold their initial value.
+    /// they do as in [`run`](Simulation::run).
     ///
     /// Sensitivities to parameters and to signals go on. Those to the initial state belong to the
     /// stretch: the initial states of earlier stretches have no lane here, and a carried state no
@@ -522,7 +526,6 @@ struct Core<'a> {
     out_d: Vec<f64>,
     out_active: Vec<bool>,
     out_history: Vec<History>,
-    start_s: f64,
     result: Trajectory,
 }
 
@@ -661,7 +664,6 @@ impl<'a> Core<'a> {
             out_d,
             out_active,
             out_history: vec![History::default(); out.delays.len()],
-            start_s: s,
             result: Trajectory::default(),
             stages,
         }
@@ -679,7 +681,6 @@ impl<'a> Core<'a> {
             *reach = reach.max(*old);
         }
         self.h_next = before.h_next;
-        self.start_s = before.start_s;
         self.rhs_history = before.rhs_history.iter().map(|h| h.with_lanes(&map)).collect();
         self.out_history = before.out_history.iter().map(|h| h.with_lanes(&map)).collect();
     }
@@ -704,7 +705,6 @@ impl<'a> Core<'a> {
             dx,
             reach: self.reach,
             h_next: self.h_next,
-            start_s: self.start_s,
             parameters: self.seeds.parameters.clone(),
             initial: self.seeds.initial.len(),
             signals: self.seeds.signals.lanes,
@@ -1620,6 +1620,18 @@ impl<'a> Core<'a> {
         if lanes > 0 {
             out.tangent(&self.out_regs, &self.out_modes, &[], lanes, &self.out_active, &mut self.out_d);
         }
+        // A state's slope is its rate; before the start it goes straight on along it.
+        let states = || out.delays.iter().map(|d| state_leaf(system, d.arg_leaf));
+        let begins = states().zip(&self.out_history).any(|(x, h)| x.is_some() && h.s.is_empty());
+        if begins || (!self.fresh && states().any(|x| x.is_some())) {
+            let inside = self.s + 1e-6 * self.env.dt;
+            self.eval(0, self.s, inside);
+            self.fresh = false;
+            if begins && lanes > 0 {
+                self.dxs.copy_from_slice(&self.dx);
+                self.tangent_stage(0);
+            }
+        }
         for (i, delay) in out.delays.iter().enumerate() {
             let arg = delay.arg as usize;
             // Slope by the flow where the argument is a state, else by the last difference.
@@ -1631,15 +1643,30 @@ impl<'a> Core<'a> {
                 Some(_) => history.slope[history.slope.len() - 1],
                 None => 0.0,
             };
-            let slope = match (delay.arg_leaf.map(|l| l as usize), self.fresh) {
-                (Some(l), true) if (System::STATES..System::STATES + system.nx).contains(&l) => {
-                    self.stages[0].f[l - System::STATES]
+            let first = history.s.is_empty();
+            let slope = match state_leaf(system, delay.arg_leaf) {
+                Some(x) => {
+                    if first {
+                        history.rate = self.dk[x * lanes..(x + 1) * lanes].to_vec();
+                    }
+                    self.stages[0].f[x]
                 }
-                _ => slope,
+                None => slope,
             };
             history.push(self.s, value, slope, &self.out_d[arg * lanes..(arg + 1) * lanes]);
             let tau = delay.tau as usize;
-            let at = (self.s - self.out_regs[tau].max(0.0)).max(self.start_s);
+            let at = self.s - self.out_regs[tau].max(0.0);
+            if at < history.s[0] && history.slope[0] != 0.0 {
+                // Straight on, before the start.
+                let back = at - history.s[0];
+                self.out_regs[delay.leaf as usize] = history.value[0] + back * history.slope[0];
+                for l in 0..lanes {
+                    let rate = history.rate.get(l).copied().unwrap_or(0.0);
+                    self.out_d[delay.leaf as usize * lanes + l] =
+                        history.lanes[l] + back * rate - history.slope[0] * self.out_d[tau * lanes + l];
+                }
+                continue;
+            }
             let (v, slope, j, w) = history.at(at);
             self.out_regs[delay.leaf as usize] = v;
             let next = (j + 1).min(history.s.len() - 1);
@@ -1663,6 +1690,12 @@ impl<'a> Core<'a> {
             column[row..].fill(0.0);
         }
     }
+}
+
+/// Entry of the state vector that a leaf is.
+fn state_leaf(system: &System, arg: Option<u32>) -> Option<usize> {
+    let leaf = arg? as usize;
+    (System::STATES..System::STATES + system.nx).contains(&leaf).then(|| leaf - System::STATES)
 }
 
 fn input_leaf(system: &System, arg: Option<u32>) -> bool {
