@@ -13,6 +13,10 @@ use crate::problem::{Fit, Free, Limits, Point, Problem, Segment, StartPrior, seg
 /// Shortest segment, samples.
 const LEAST: usize = 40;
 
+/// Samples of a recording, and stretches of it, by which a method is judged.
+const JUDGED: usize = 1500;
+const STRETCHES: usize = 8;
+
 /// A compiled model, its data, and how to integrate it.
 #[derive(Debug, Clone)]
 pub struct Setup {
@@ -85,7 +89,7 @@ impl Setup {
             noise: None,
         };
         let tolerance: Vec<f64> = setup.data.spread.iter().map(|s| 1e-3 * s).collect();
-        setup.choose_method(&tolerance);
+        setup.choose_method(&tolerance, JUDGED);
         Ok(setup)
     }
 
@@ -145,22 +149,29 @@ impl Setup {
     }
 
     /// The cheapest fixed-step method whose error stays below `tolerance` (SI, per channel; at least a
-    /// twentieth of the noise and 10⁻⁶ of the signal) over a stretch of the data, judged against
-    /// Dormand–Prince with tight tolerances.
-    pub fn choose_method(&mut self, tolerance: &[f64]) {
-        let Some((piece, data)) = self.data.pieces.iter().enumerate().max_by_key(|(_, p)| p.len.min(1500))
+    /// twentieth of the noise and 10⁻⁶ of the signal) over stretches of `length` samples of the data (those that
+    /// a fit simulates in one go), judged against Dormand–Prince with tight tolerances.
+    pub fn choose_method(&mut self, tolerance: &[f64], length: usize) {
+        let Some((piece, data)) = self.data.pieces.iter().enumerate().max_by_key(|(_, p)| p.len.min(JUDGED))
         else {
             return;
         };
-        let n = data.len.min(1500);
+        let n = length.clamp(2, JUDGED).min(data.len);
+        let count = (JUDGED / n).clamp(1, STRETCHES);
         let parameters: Vec<f64> = self.model.parameters.iter().map(|p| p.value).collect();
-        let x0 = self.start(piece, 0);
-        let run = |method| {
-            let seeds = Seeds::default();
-            integrate(&self.system, &self.environments[piece], &parameters, &x0, 0..n, method, &seeds)
+        let starts: Vec<(usize, Vec<f64>)> = (0..count)
+            .map(|i| i * (data.len - n) / count)
+            .map(|from| (from, self.start(piece, from)))
+            .collect();
+        let run = |(from, x0): &(usize, Vec<f64>), method| {
+            let (environment, seeds) = (&self.environments[piece], Seeds::default());
+            integrate(&self.system, environment, &parameters, x0, *from..from + n, method, &seeds)
         };
-        let reference = run(Method::Adaptive { rtol: 1e-9, atol: 1e-10 });
-        let good = reference.diverged.unwrap_or(n).saturating_sub(1).max(2);
+        let exact = Method::Adaptive { rtol: 1e-9, atol: 1e-10 };
+        let references: Vec<_> = starts.iter().map(|s| run(s, exact)).collect();
+        let limit: Vec<f64> = (0..self.system.ny)
+            .map(|c| tolerance[c].max(0.05 * self.data.sigma[c]).max(1e-6 * self.data.spread[c]))
+            .collect();
         let ladder = [
             Method::Rk4 { substeps: 1 },
             Method::Dp5 { substeps: 1 },
@@ -169,18 +180,17 @@ impl Setup {
             Method::Dp5 { substeps: 8 },
             Method::Dp5 { substeps: 16 },
         ];
-        self.method = Method::Dp5 { substeps: 32 };
-        for method in ladder {
-            let trial = run(method);
-            let accurate = (0..self.system.ny).all(|c| {
-                let limit = tolerance[c].max(0.05 * self.data.sigma[c]).max(1e-6 * self.data.spread[c]);
-                (0..good).all(|k| (trial.y[c * n + k] - reference.y[c * n + k]).abs() <= limit)
-            });
-            if accurate {
-                self.method = method;
-                break;
-            }
-        }
+        let accurate = |method: &Method| {
+            starts.iter().zip(&references).all(|(start, reference)| {
+                let trial = run(start, *method);
+                let good = reference.diverged.unwrap_or(n).saturating_sub(1).max(2).min(n);
+                limit.iter().enumerate().all(|(c, limit)| {
+                    (0..good).all(|k| (trial.y[c * n + k] - reference.y[c * n + k]).abs() <= *limit)
+                })
+            })
+        };
+        let method = ladder.into_iter().find(accurate);
+        self.method = method.unwrap_or(Method::Dp5 { substeps: 32 });
     }
 
     /// Parameter values of the model.

@@ -778,10 +778,12 @@ impl Left {
         let steady = likelier.filter(|s| whitened && s.t > STEADY_INNOVATIONS);
         let innovations = steady.is_some();
         if let Some(free) = steady {
-            // What the mechanisms gain in log-likelihood beside what free shapes would gain beyond them.
+            // What the mechanisms gain in log-likelihood per sample beside what free shapes would gain beyond
+            // them.
             let (before, after) = search.comparable(found);
-            let named = log_likelihood_gain(&before, &after, scale);
-            explained = named / (named - samples * (1.0 - free.gain).max(1e-9).ln()).max(1e-300);
+            let seen = after.fit.count.iter().sum::<usize>().max(1) as f64;
+            let named = log_likelihood_gain(&before, &after, scale) / seen;
+            explained = named / (named - (1.0 - free.gain).max(1e-9).ln()).max(1e-300);
         }
         Left { misfit, slow, shape, hidden, innovations, explained }
     }

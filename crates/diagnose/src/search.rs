@@ -191,6 +191,11 @@ fn lengths(setup: &Setup) -> Vec<usize> {
     out
 }
 
+/// Samples of the longest segment.
+fn longest(level: &Level) -> usize {
+    level.segments.iter().map(|s| s.range.len()).max().unwrap_or(0)
+}
+
 fn limits(iterations: usize) -> Limits {
     Limits { iterations, tolerance: 1e-5 }
 }
@@ -316,7 +321,7 @@ impl<'a> Search<'a> {
             p.value = *v;
         }
         let tolerance: Vec<f64> = scale.iter().map(|s| 0.02 * s).collect();
-        fitted.setup.choose_method(&tolerance);
+        fitted.setup.choose_method(&tolerance, longest(&fitted.level));
     }
 
     /// The model fitted at another level, from the stitched trajectory or the measurements.
@@ -480,7 +485,7 @@ impl<'a> Search<'a> {
         if !mechanism.states.is_empty() {
             // What it brings along may be faster than the machine.
             let tolerance: Vec<f64> = scale.iter().map(|s| 0.05 * s).collect();
-            setup.choose_method(&tolerance);
+            setup.choose_method(&tolerance, longest(&level));
         }
         let mut hats = setup.starts(&level, &shifted);
         // What the mechanism remembers has its own likely start.
@@ -972,13 +977,16 @@ impl<'a> Search<'a> {
     ///   no friction helps there.
     fn anchors(&self, state: &State) -> Vec<Fitted> {
         let current = &state.current;
-        let stated = current.setup.with_holds(self.nominal.holds.clone());
         let mut out = Vec::new();
+        if !current.parts.is_empty() {
+            return out; // what was found has changed the model already
+        }
+        let stated = current.setup.with_holds(self.nominal.holds.clone());
         if current.setup.holds != self.nominal.holds {
             let fitted = Fitted { setup: stated.clone(), ..current.clone() };
             out.push(self.refit(&fitted, &state.scale, 10));
         }
-        if current.parts.is_empty() && current.setup.noise.is_none() && state.misfit() > FAR {
+        if current.setup.noise.is_none() && state.misfit() > FAR {
             let nominal = self.nominal.values();
             let moved = current.setup.free.iter().any(|f| {
                 let (was, is) = (nominal[f.index], current.fit.point.parameters[f.index]);

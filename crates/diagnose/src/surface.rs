@@ -151,7 +151,8 @@ pub fn test(setup: &Setup, level: &Level, scale: &[f64], point: &Point) -> Optio
         let mut factors: Vec<Option<Vec<Vec<f64>>>> = vec![None];
         factors.extend([&d, &v].into_iter().flatten().cloned().map(Some));
         factors.extend(d.iter().map(|d| Some(times_series(d, d))));
-        factors.extend((0..setup.system.nu).map(|u| Some(pieces.iter().map(|p| p.inputs[u].clone()).collect())));
+        factors
+            .extend((0..setup.system.nu).map(|u| Some(pieces.iter().map(|p| p.inputs[u].clone()).collect())));
         for factor in factors {
             let gains = slow.iter().map(|shape| match &factor {
                 None => shape.clone(),
