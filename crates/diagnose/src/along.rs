@@ -13,9 +13,28 @@ pub struct Along<'a> {
     simulated: bool,
 }
 
+/// The segments' own trajectories, and `states` between them.
+fn trajectories(
+    setup: &Setup,
+    level: &Level,
+    scale: &[f64],
+    point: &Point,
+    mut states: Vec<Vec<Vec<f64>>>,
+) -> Vec<Vec<Vec<f64>>> {
+    let rows = setup.with_problem(level, scale, |p| p.rows(point, false, None));
+    for (segment, rows) in level.segments.iter().zip(&rows) {
+        let t = &rows.trajectory;
+        for (i, state) in states[segment.piece].iter_mut().enumerate() {
+            state[segment.range.clone()].copy_from_slice(&t.x[i * t.n..(i + 1) * t.n]);
+        }
+    }
+    states
+}
+
 impl<'a> Along<'a> {
     /// Smoothed by model and measurements together ([`crate::smoother`]): states, and the force that each
-    /// equation lacks.
+    /// equation lacks. Beside coloured noise the states are those of the fit itself: what the model still lacks
+    /// moves them less than the noise does, and noise in a candidate's variables would pass for its effect.
     pub fn observed(
         setup: &'a Setup,
         level: &Level,
@@ -66,9 +85,10 @@ impl<'a> Along<'a> {
             tolerance: &setup.hats.tolerance,
         };
         let smoothed = crate::smoother::smooth(setup, &given);
-        let along =
-            Along { setup, states: smoothed.states, parameters: point.parameters.clone(), simulated: false };
-        (along, smoothed.forces)
+        let simulated = setup.noise.is_some();
+        let states =
+            if simulated { trajectories(setup, level, scale, point, first.states) } else { smoothed.states };
+        (Along { setup, states, parameters: point.parameters.clone(), simulated }, smoothed.forces)
     }
 
     /// Smoothed measurements; unmeasured entries from the segments' trajectories.

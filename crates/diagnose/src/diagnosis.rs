@@ -711,7 +711,11 @@ fn is_rivalled(search: &Search<'_>, found: &Found, library: &[Mechanism]) -> boo
         part.instance.expression.walk(&mut |e| delayed |= matches!(e, Expr::Call(Func::Delay, _)));
         delayed || !library[part.candidate.mechanism].states.is_empty()
     });
-    free.gain > named * if remembers { RIVALS_MEMORY } else { RIVALS_LAW }
+    // Where nothing but white noise is left, what a memory explains is explained.
+    let white = improved.setup.noise.is_none()
+        && improved.misfit(&found.scale) < AT_NOISE
+        && kappa(&improved.setup, &improved.level, &found.scale, &improved.fit.point).iter().all(|k| *k > WHITE);
+    free.gain > named * if remembers && !white { RIVALS_MEMORY } else { RIVALS_LAW }
 }
 
 /// Mean over standard error of the folds' gains from which free shapes are taken seriously.
@@ -720,6 +724,9 @@ const STEADY_SHAPE: f64 = 2.0;
 /// mechanisms with a memory or a delay (which no shape of the state should come near).
 const RIVALS_LAW: f64 = 1.1;
 const RIVALS_MEMORY: f64 = 0.97;
+/// Residual over noise, and information per sample, of what is no more than white noise.
+const AT_NOISE: f64 = 1.2;
+const WHITE: f64 = 0.8;
 
 /// Share of the calibrated model's misfit up to which a mechanism counts as a small correction.
 const CORRECTION: f64 = 0.02;
@@ -760,7 +767,6 @@ impl Left {
         let shape = surface.filter(|s| s.t > 2.5).map_or(0.0, |s| s.gain);
         // The floor is the noise where it is white, the residual itself where it passes for noise.
         let counts = &improved.fit.count;
-        let samples = counts.iter().sum::<usize>() as f64;
         let floor: f64 = (0..rms.len())
             .map(|c| {
                 let noise = if coloured[c] { rms[c] } else { sigma[c].min(rms[c]) };
@@ -772,8 +778,9 @@ impl Left {
         let whitened = found.improved.setup.noise.is_some();
         // Free shapes' gain in log-likelihood, by what independent samples there are.
         let kappa = kappa(&improved.setup, &improved.level, scale, &improved.fit.point);
-        let independent = samples * kappa.iter().copied().fold(1.0, f64::min);
-        let likelier = surface.filter(|s| s.t > STEADY_DOUBT && independent * s.gain > LIKELIER);
+        let kappa = kappa.iter().copied().fold(1.0, f64::min);
+        let likelier =
+            surface.filter(|s| s.t > STEADY_DOUBT && s.samples as f64 * kappa * s.gain > LIKELIER);
         let hidden = likelier.is_some();
         let steady = likelier.filter(|s| whitened && s.t > STEADY_INNOVATIONS);
         let innovations = steady.is_some();

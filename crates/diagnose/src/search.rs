@@ -107,7 +107,7 @@ impl Fitted {
     }
 
     /// Largest residual RMS over the noise.
-    fn misfit(&self, scale: &[f64]) -> f64 {
+    pub fn misfit(&self, scale: &[f64]) -> f64 {
         rms(&self.fit, scale).iter().zip(&self.setup.data.sigma).map(|(r, s)| r / s).fold(0.0, f64::max)
     }
 }
@@ -730,6 +730,18 @@ impl<'a> Search<'a> {
             self.observer.stage(Stage::Whitening);
             let plain = (calibrated.clone(), state.clone());
             self.whitened(&mut calibrated, &mut state);
+            if !plain.1.current.parts.is_empty() {
+                // What was taken for physics before the noise had a model may stand in the way of what is:
+                // from the bare model again, and the likelier of the two.
+                let mut bare = (plain.0.clone(), State { accepted: Vec::new(), ..plain.1.clone() });
+                bare.1.current = plain.0.clone();
+                self.whitened(&mut bare.0, &mut bare.1);
+                let same = bare.1.candidates() == state.candidates();
+                if !same && self.weigh(&state.current, &bare.1.current, &state.scale).score > 0.0 {
+                    (calibrated, state) = bare;
+                }
+            }
+            self.reconsider(&calibrated, &mut state);
             // An estimate that takes noise for noise simulates as well as one that does not. One that takes
             // a misfit for noise predicts the next sample and forgets the simulation.
             let before = raw_rss(&plain.1.current, &plain.1.scale);
@@ -872,7 +884,6 @@ impl<'a> Search<'a> {
             self.prune(state);
             self.level(calibrated, state);
         }
-        self.reconsider(calibrated, state);
     }
 
     /// One level: rounds until nothing more is believable.

@@ -286,4 +286,19 @@ mod tests {
         assert!(lines(&power).contains(&300));
         assert!(!lines(&power)[..LINES].contains(&300));
     }
+    #[test]
+    fn an_input_has_a_line_where_it_is_a_sine_and_none_where_it_is_slow() {
+        use std::f64::consts::TAU;
+        let frequency: Vec<f64> = (0..500).map(|i| f64::from(i) * 0.05).collect();
+        // Noise through a lag of 1 Hz: most of its power lies below, in no line.
+        let slow: Vec<f64> = frequency.iter().map(|f| 1.0 / (1.0 + f * f)).collect();
+        assert!(!drives(&frequency, &slow, TAU * 0.5));
+        // The same with a sine of 0.5 Hz, as wide as a window makes it.
+        let mut line = slow.clone();
+        for (i, share) in [(9, 0.5), (10, 1.0), (11, 0.5)] {
+            line[i] += 100.0 * share;
+        }
+        assert!(drives(&frequency, &line, TAU * 0.5));
+        assert!(!drives(&frequency, &line, TAU * 3.0));
+    }
 }

@@ -16,6 +16,9 @@ use crate::place::{Motion, Place, places};
 use crate::screen::project;
 
 const FOLDS: usize = 10;
+/// Samples that tell enough, and fewest segments that are kept.
+const MOST_SAMPLES: usize = 20_000;
+const LEAST_SEGMENTS: usize = 4;
 /// Knots of slow time over a recording.
 const SLOW_KNOTS: usize = 14;
 /// Fewest independent samples (N κ) for a test of free shapes.
@@ -30,6 +33,8 @@ pub struct Surface {
     pub t: f64,
     /// The variable whose functions alone explain most, and what they gain.
     pub variable: Option<(Variable, f64)>,
+    /// Samples that were looked at, over all channels.
+    pub samples: usize,
 }
 
 /// A variable of the free shapes.
@@ -67,8 +72,27 @@ fn hat(knots: &[f64], i: usize, v: f64) -> f64 {
     (1.0 - ((v - knots[i]) / h).abs()).max(0.0)
 }
 
+/// Every so many-th segment, where there are more samples than the test needs (and no memory goes on from one
+/// segment to the next).
+fn thinned(setup: &Setup, level: &Level, point: &Point) -> (Level, Point) {
+    let total: usize = level.segments.iter().map(|s| s.range.len()).sum();
+    let step = if setup.carried.is_empty() { total.div_ceil(MOST_SAMPLES) } else { 1 };
+    // Few long segments are as many blocks as they hold.
+    let step = step.min(level.segments.len() / LEAST_SEGMENTS).max(1);
+    let keep = |i: usize| i % step == 0;
+    let kept = (0..level.segments.len()).filter(|&i| keep(i));
+    let (mut segments, mut priors, mut starts) = (Vec::new(), Vec::new(), Vec::new());
+    for i in kept {
+        segments.push(level.segments[i].clone());
+        priors.push(level.priors[i].clone());
+        starts.push(point.starts[i].clone());
+    }
+    (Level { segments, priors }, Point { parameters: point.parameters.clone(), starts })
+}
+
 /// Tests a fitted model against free shapes.
 pub fn test(setup: &Setup, level: &Level, scale: &[f64], point: &Point) -> Option<Surface> {
+    let (level, point) = &thinned(setup, level, point);
     let along = Along::smoothed(setup, level, scale, point);
     let motions: Vec<Motion> = places(&setup.model)
         .into_iter()
@@ -301,5 +325,5 @@ pub fn test(setup: &Setup, level: &Level, scale: &[f64], point: &Point) -> Optio
     }
     // All functions together may overfit where one family does not: the better of the two counts.
     let (gain, t) = if single.0 > gain { single } else { (gain, t) };
-    Some(Surface { gain, t, variable: best })
+    Some(Surface { gain, t, variable: best, samples: total * ny })
 }

@@ -96,6 +96,30 @@ fn bouncing_end_stop() {
     }
 }
 
+/// A late sensor on an oscillator in the middle of its motion: before the start the state goes straight back
+/// along its rate (error at most ẍ τ²/2, in the first sample alone), between samples it is a cubic.
+#[test]
+fn a_late_sensor_sees_the_motion_before_the_start() {
+    let parameters = [("w", 3.0), ("tau", 0.004)];
+    let m = model(&[], &[("x", 2)], &parameters, &["x'' + w^2*x = 0"], &["delay(x, tau)"]);
+    let (x0, v0, w, tau) = (0.3, 1.2, 3.0, 0.004);
+    for method in [Method::Rk4 { substeps: 1 }, Method::Dp5 { substeps: 1 }, FINE] {
+        let y = run(&m, &free(300, 0.01), &[x0, v0], method).y;
+        let exact = |k: usize| {
+            let t = k as f64 * 0.01 - tau;
+            x0 * (w * t).cos() + v0 / w * (w * t).sin()
+        };
+        assert!((y[0] - (x0 - tau * v0)).abs() < 1e-12, "{method:?}: {}", y[0] - (x0 - tau * v0));
+        assert!((y[0] - exact(0)).abs() < w * w * x0 * tau * tau / 2.0 * 1.1);
+        for k in 1..300 {
+            assert!((y[k] - exact(k)).abs() < 1e-6, "{method:?} {k}: {}", y[k] - exact(k));
+        }
+        // Sensitivities are linear between samples.
+        let error = sensitivity_error(&m, &free(100, 0.01), &[x0, v0], method, 1e-6);
+        assert!(error < 2e-3, "{method:?}: {error:.1e}");
+    }
+}
+
 /// q' = −q(t − 1), q = 1 before the start: polynomial by the method of steps.
 #[test]
 fn a_delayed_state_follows_the_method_of_steps() {
