@@ -714,7 +714,9 @@ fn is_rivalled(search: &Search<'_>, found: &Found, library: &[Mechanism]) -> boo
     // Where nothing but white noise is left, what a memory explains is explained.
     let white = improved.setup.noise.is_none()
         && improved.misfit(&found.scale) < AT_NOISE
-        && kappa(&improved.setup, &improved.level, &found.scale, &improved.fit.point).iter().all(|k| *k > WHITE);
+        && kappa(&improved.setup, &improved.level, &found.scale, &improved.fit.point)
+            .iter()
+            .all(|k| *k > WHITE);
     free.gain > named * if remembers && !white { RIVALS_MEMORY } else { RIVALS_LAW }
 }
 
@@ -779,8 +781,7 @@ impl Left {
         // Free shapes' gain in log-likelihood, by what independent samples there are.
         let kappa = kappa(&improved.setup, &improved.level, scale, &improved.fit.point);
         let kappa = kappa.iter().copied().fold(1.0, f64::min);
-        let likelier =
-            surface.filter(|s| s.t > STEADY_DOUBT && s.samples as f64 * kappa * s.gain > LIKELIER);
+        let likelier = surface.filter(|s| s.t > STEADY_DOUBT && s.samples as f64 * kappa * s.gain > LIKELIER);
         let hidden = likelier.is_some();
         let steady = likelier.filter(|s| whitened && s.t > STEADY_INNOVATIONS);
         let innovations = steady.is_some();
