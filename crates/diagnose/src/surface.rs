@@ -79,10 +79,8 @@ fn thinned(setup: &Setup, level: &Level, point: &Point) -> (Level, Point) {
     let step = if setup.carried.is_empty() { total.div_ceil(MOST_SAMPLES) } else { 1 };
     // Few long segments are as many blocks as they hold.
     let step = step.min(level.segments.len() / LEAST_SEGMENTS).max(1);
-    let keep = |i: usize| i % step == 0;
-    let kept = (0..level.segments.len()).filter(|&i| keep(i));
     let (mut segments, mut priors, mut starts) = (Vec::new(), Vec::new(), Vec::new());
-    for i in kept {
+    for i in (0..level.segments.len()).step_by(step) {
         segments.push(level.segments[i].clone());
         priors.push(level.priors[i].clone());
         starts.push(point.starts[i].clone());
