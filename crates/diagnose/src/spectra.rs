@@ -290,9 +290,11 @@ mod tests {
     fn an_input_has_a_line_where_it_is_a_sine_and_none_where_it_is_slow() {
         use std::f64::consts::TAU;
         let frequency: Vec<f64> = (0..500).map(|i| f64::from(i) * 0.05).collect();
-        // Noise through a lag of 1 Hz: most of its power lies below, in no line.
-        let slow: Vec<f64> = frequency.iter().map(|f| 1.0 / (1.0 + f * f)).collect();
-        assert!(!drives(&frequency, &slow, TAU * 0.5));
+        // Noise through a lag of 0.3 Hz: a good part of its power lies around 0.2 Hz, in no line.
+        let slow: Vec<f64> = frequency.iter().map(|f| 1.0 / (1.0 + (f / 0.3).powi(2))).collect();
+        let here: f64 = slow[2..=6].iter().sum();
+        assert!(here > 2.0 * DRIVEN * slow.iter().sum::<f64>());
+        assert!(!drives(&frequency, &slow, TAU * 0.2));
         // The same with a sine of 0.5 Hz, as wide as a window makes it.
         let mut line = slow.clone();
         for (i, share) in [(9, 0.5), (10, 1.0), (11, 0.5)] {
