@@ -730,23 +730,30 @@ impl<'a> Search<'a> {
             self.observer.stage(Stage::Whitening);
             let plain = (calibrated.clone(), state.clone());
             self.whitened(&mut calibrated, &mut state);
-            if !plain.1.current.parts.is_empty() {
+            // An estimate that takes noise for noise simulates as well as one that does not. One that takes
+            // a misfit for noise predicts the next sample and forgets the simulation.
+            let before = raw_rss(&plain.1.current, &plain.1.scale);
+            let remembers = |f: &Fitted| {
+                let after = raw_rss(f, &plain.1.scale);
+                !after.iter().zip(&before).any(|(a, b)| *a > FORGETS * b)
+            };
+            settled = remembers(&state.current);
+            if settled && !plain.1.current.parts.is_empty() {
                 // What was taken for physics before the noise had a model may stand in the way of what is:
                 // from the bare model again, and the likelier of the two.
                 let mut bare = (plain.0.clone(), State { accepted: Vec::new(), ..plain.1.clone() });
                 bare.1.current = plain.0.clone();
                 self.whitened(&mut bare.0, &mut bare.1);
                 let same = bare.1.candidates() == state.candidates();
-                if !same && self.weigh(&state.current, &bare.1.current, &state.scale).score > 0.0 {
+                let likelier = || self.weigh(&state.current, &bare.1.current, &state.scale).score > 0.0;
+                if !same && remembers(&bare.1.current) && likelier() {
                     (calibrated, state) = bare;
                 }
             }
-            self.reconsider(&calibrated, &mut state);
-            // An estimate that takes noise for noise simulates as well as one that does not. One that takes
-            // a misfit for noise predicts the next sample and forgets the simulation.
-            let before = raw_rss(&plain.1.current, &plain.1.scale);
-            let after = raw_rss(&state.current, &plain.1.scale);
-            settled = !after.iter().zip(&before).any(|(a, b)| *a > FORGETS * b);
+            if settled {
+                self.reconsider(&calibrated, &mut state);
+                settled = remembers(&state.current);
+            }
             if !settled {
                 (calibrated, state) = plain;
             }
