@@ -738,18 +738,6 @@ impl<'a> Search<'a> {
                 !after.iter().zip(&before).any(|(a, b)| *a > FORGETS * b)
             };
             settled = remembers(&state.current);
-            if settled && !plain.1.current.parts.is_empty() {
-                // What was taken for physics before the noise had a model may stand in the way of what is:
-                // from the bare model again, and the likelier of the two.
-                let mut bare = (plain.0.clone(), State { accepted: Vec::new(), ..plain.1.clone() });
-                bare.1.current = plain.0.clone();
-                self.whitened(&mut bare.0, &mut bare.1);
-                let same = bare.1.candidates() == state.candidates();
-                let likelier = || self.weigh(&state.current, &bare.1.current, &state.scale).score > 0.0;
-                if !same && remembers(&bare.1.current) && likelier() {
-                    (calibrated, state) = bare;
-                }
-            }
             if settled {
                 self.reconsider(&calibrated, &mut state);
                 settled = remembers(&state.current);
