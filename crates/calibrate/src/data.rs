@@ -3,7 +3,7 @@
 use std::ops::Range;
 use std::sync::OnceLock;
 
-use greybox_model::{Expr, Hold, Model};
+use greybox_model::{Hold, Model};
 use greybox_recording::{Recording, smooth::Smoothed};
 use greybox_simulate::{Environment, FINE, Signal};
 
@@ -361,11 +361,7 @@ impl Hats {
         let mut sources: Vec<Option<(usize, usize)>> = Vec::new(); // (channel, derivative)
         let mut highest = Vec::new();
         for state in &model.states {
-            let channel = |primes: u8| {
-                model.measurements.iter().position(|m| {
-                    matches!(&m.expr, Expr::Var { name, primes: p } if **name == *state.name && *p == primes)
-                })
-            };
+            let channel = |primes| model.measurement_of(&state.name, primes);
             let (position, rate) = (channel(0), channel(1));
             for i in 0..state.order {
                 sources.push(match i {

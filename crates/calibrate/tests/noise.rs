@@ -8,20 +8,6 @@ use common::*;
 use greybox_calibrate::{Autoregression, Level, Limits, Point, Setup, qr};
 use greybox_model::Model;
 
-const OSCILLATOR: &str = r#"
-name = "Damped oscillator"
-[inputs]
-f = { unit = "N" }
-[states]
-x = { unit = "m" }
-[parameters]
-m = { value = 1.0, unit = "kg" }
-c = { value = 1.5, unit = "N s/m" }
-k = { value = 20.0, unit = "N/m" }
-[equations]
-mass = "m*x'' + c*x' + k*x = f"
-"#;
-
 const DT: f64 = 0.02;
 const N: usize = 2000;
 

@@ -5,28 +5,15 @@ mod common;
 use common::*;
 use greybox_model::Model;
 
-const PROMPT: &str = r#"
-name = "Oscillator"
-[inputs]
-f = { unit = "N" }
-[states]
-x = { unit = "m" }
-[parameters]
-m = { value = 1.0, unit = "kg" }
-c = { value = 1.5, unit = "N s/m" }
-k = { value = 20.0, unit = "N/m" }
-tau = { value = 0.03, unit = "s" }
-[equations]
-mass = "m*x'' + c*x' + k*x = f"
-"#;
-
 /// A sensor that is late by τ shows where the machine was: its state has gone on by τ times its rate, and the
 /// prior of a start allows for that much.
 #[test]
 fn a_late_sensor_shows_where_the_machine_was() {
     let (n, dt) = (600, 0.01);
     let f = force(7, n, dt, 1.0, 5.0);
-    let prompt = Model::from_toml(PROMPT, "prompt.toml").unwrap();
+    let with_delay = "k = { value = 20.0, unit = \"N/m\" }\ntau = { value = 0.03, unit = \"s\" }";
+    let prompt = OSCILLATOR.replace("k = { value = 20.0, unit = \"N/m\" }", with_delay);
+    let prompt = Model::from_toml(&prompt, "prompt.toml").unwrap();
     let measured = measure(&prompt, &f, dt, &[0.0, 0.0]);
     // The sensor: three samples late.
     let late: Vec<f64> = (0..n).map(|k| measured[0][k.saturating_sub(3)]).collect();
@@ -44,6 +31,6 @@ fn a_late_sensor_shows_where_the_machine_was() {
         assert!((mean - after.start(0, k)[0]).abs() < 1e-15);
         assert!((std - plain.hypot(moved)).abs() < 1e-15);
     }
-    // The rate times τ misses ẍ τ²/2: a tenth of the whole for ω τ = 0.13.
+    // The rate times τ misses ẍ τ²/2: a fifteenth of the whole for ωτ = 0.13.
     assert!(mended < 0.05 * off, "{mended} {off}");
 }

@@ -13,22 +13,22 @@ pub struct Along<'a> {
     simulated: bool,
 }
 
-/// The segments' own trajectories, and `states` between them.
-fn trajectories(
+/// Writes the segments' own trajectories over the entries of `states[piece][entry][sample]` that `entry` picks.
+fn follow(
+    states: &mut [Vec<Vec<f64>>],
     setup: &Setup,
     level: &Level,
     scale: &[f64],
     point: &Point,
-    mut states: Vec<Vec<Vec<f64>>>,
-) -> Vec<Vec<Vec<f64>>> {
+    entry: impl Fn(usize) -> bool,
+) {
     let rows = setup.with_problem(level, scale, |p| p.rows(point, false, None));
     for (segment, rows) in level.segments.iter().zip(&rows) {
         let t = &rows.trajectory;
-        for (i, state) in states[segment.piece].iter_mut().enumerate() {
-            state[segment.range.clone()].copy_from_slice(&t.x[i * t.n..(i + 1) * t.n]);
+        for i in (0..setup.system.nx).filter(|i| entry(*i)) {
+            states[segment.piece][i][segment.range.clone()].copy_from_slice(&t.x[i * t.n..(i + 1) * t.n]);
         }
     }
-    states
 }
 
 impl<'a> Along<'a> {
@@ -86,8 +86,10 @@ impl<'a> Along<'a> {
         };
         let smoothed = crate::smoother::smooth(setup, &given);
         let simulated = setup.noise.is_some();
-        let states =
-            if simulated { trajectories(setup, level, scale, point, first.states) } else { smoothed.states };
+        let mut states = if simulated { first.states } else { smoothed.states };
+        if simulated {
+            follow(&mut states, setup, level, scale, point, |_| true);
+        }
         (Along { setup, states, parameters: point.parameters.clone(), simulated }, smoothed.forces)
     }
 
@@ -104,16 +106,7 @@ impl<'a> Along<'a> {
             })
             .collect();
         if unmeasured {
-            let rows = setup.with_problem(level, scale, |p| p.rows(point, false, None));
-            for (segment, rows) in level.segments.iter().zip(&rows) {
-                let t = &rows.trajectory;
-                for i in 0..setup.system.nx {
-                    if setup.hats.tolerance[i].is_infinite() {
-                        states[segment.piece][i][segment.range.clone()]
-                            .copy_from_slice(&t.x[i * t.n..(i + 1) * t.n]);
-                    }
-                }
-            }
+            follow(&mut states, setup, level, scale, point, |i| setup.hats.tolerance[i].is_infinite());
         }
         Along { setup, states, parameters: point.parameters.clone(), simulated: false }
     }

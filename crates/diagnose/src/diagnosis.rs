@@ -1,5 +1,7 @@
 //! From recordings and a nominal model to the finished diagnosis.
 
+use std::cell::LazyCell;
+use std::ops::Deref;
 use std::sync::Arc;
 
 use greybox_calibrate::{
@@ -11,7 +13,7 @@ use greybox_recording::Recording;
 use rayon::prelude::*;
 
 use crate::along::Along;
-use crate::evidence::{Evidence, folds, kappa};
+use crate::evidence::{Evidence, folds, least_kappa};
 use crate::library::{Mechanism, MechanismError, built_in};
 use crate::locate::{Location, force, locate};
 use crate::place::Place;
@@ -382,13 +384,16 @@ fn conclude(
 
     // Mechanisms, remainder, verdict.
     // Where nothing was found, what the search's own noise model leaves white.
-    let surface = match found.improved.parts.is_empty() && found.improved.setup.noise.is_some() {
-        true => surface(&found.improved, &found.scale),
-        false => surface(&improved, &scale),
+    let surface = if found.improved.parts.is_empty() && found.improved.setup.noise.is_some() {
+        surface(&found.improved, &found.scale)
+    } else {
+        surface(&improved, &scale)
     };
+    // Two refits, for those tests that need them.
+    let comparable = LazyCell::new(|| search.comparable(&found));
     let full: f64 = raw_rss(&improved, &found.scale).iter().sum();
     let base = search.rss_at(&calibrated, &improved, &found.scale);
-    let left = Left::of(&improved, &found, search, surface.as_ref(), base);
+    let left = Left::of(&improved, &found, &comparable, surface.as_ref(), base);
     let shares: Vec<f64> = (0..improved.parts.len())
         .into_par_iter()
         .map(|i| {
@@ -398,7 +403,7 @@ fn conclude(
         .collect();
     let verdict = match left.verdict(improved.parts.len()) {
         Verdict::MissingPhysics
-            if is_patchwork(&improved, &shares) || is_rivalled(search, &found, library) =>
+            if is_patchwork(&improved, &shares) || is_rivalled(&comparable, &found.scale, library) =>
         {
             Verdict::Unexplained
         }
@@ -701,23 +706,18 @@ fn is_shared(improved: &Fitted, shares: &[f64], index: usize) -> bool {
 /// Whether forces of free shape beat the mechanisms: held out by folds, they explain clearly more of the
 /// calibrated model's residual, or as much where the mechanisms need a memory and the shapes need none. A law
 /// of the library is at least as good as a free shape of its variables; what imitates another law is not.
-fn is_rivalled(search: &Search<'_>, found: &Found, library: &[Mechanism]) -> bool {
-    let (base, improved) = search.comparable(found);
-    let Some(free) = surface(&base, &found.scale).filter(|s| s.t > STEADY_SHAPE) else { return false };
-    let held_out = |f: &Fitted| folds(&f.setup, &f.level, &found.scale, &f.fit.point).sse.iter().sum::<f64>();
-    let named = 1.0 - held_out(&improved) / held_out(&base).max(1e-300);
+fn is_rivalled((base, improved): &(Fitted, Fitted), scale: &[f64], library: &[Mechanism]) -> bool {
+    let Some(free) = surface(base, scale).filter(|s| s.t > STEADY_SHAPE) else { return false };
+    let held_out = |f: &Fitted| folds(&f.setup, &f.level, scale, &f.fit.point).sse.iter().sum::<f64>();
+    let named = 1.0 - held_out(improved) / held_out(base).max(1e-300);
     let remembers = improved.parts.iter().all(|part| {
         let mut delayed = false;
         part.instance.expression.walk(&mut |e| delayed |= matches!(e, Expr::Call(Func::Delay, _)));
         delayed || !library[part.candidate.mechanism].states.is_empty()
     });
     // Where nothing but white noise is left, what a memory explains is explained.
-    let white = improved.setup.noise.is_none()
-        && improved.misfit(&found.scale) < AT_NOISE
-        && kappa(&improved.setup, &improved.level, &found.scale, &improved.fit.point)
-            .iter()
-            .all(|k| *k > WHITE);
-    free.gain > named * if remembers && !white { RIVALS_MEMORY } else { RIVALS_LAW }
+    let doubtful = remembers && !improved.leaves_white_noise(scale);
+    free.gain > named * if doubtful { RIVALS_MEMORY } else { RIVALS_LAW }
 }
 
 /// Mean over standard error of the folds' gains from which free shapes are taken seriously.
@@ -726,9 +726,6 @@ const STEADY_SHAPE: f64 = 2.0;
 /// mechanisms with a memory or a delay (which no shape of the state should come near).
 const RIVALS_LAW: f64 = 1.1;
 const RIVALS_MEMORY: f64 = 0.97;
-/// Residual over noise, and information per sample, of what is no more than white noise.
-const AT_NOISE: f64 = 1.2;
-const WHITE: f64 = 0.8;
 
 /// Share of the calibrated model's misfit up to which a mechanism counts as a small correction.
 const CORRECTION: f64 = 0.02;
@@ -756,7 +753,7 @@ impl Left {
     fn of(
         improved: &Fitted,
         found: &Found,
-        search: &Search<'_>,
+        comparable: &impl Deref<Target = (Fitted, Fitted)>,
         surface: Option<&Surface>,
         base: f64,
     ) -> Left {
@@ -779,8 +776,7 @@ impl Left {
         let mut explained = 1.0 - (full - floor).max(0.0) / (base - floor).max(1e-300);
         let whitened = found.improved.setup.noise.is_some();
         // Free shapes' gain in log-likelihood, by what independent samples there are.
-        let kappa = kappa(&improved.setup, &improved.level, scale, &improved.fit.point);
-        let kappa = kappa.iter().copied().fold(1.0, f64::min);
+        let kappa = least_kappa(&improved.setup, &improved.level, scale, &improved.fit.point);
         let likelier = surface.filter(|s| s.t > STEADY_DOUBT && s.samples as f64 * kappa * s.gain > LIKELIER);
         let hidden = likelier.is_some();
         let steady = likelier.filter(|s| whitened && s.t > STEADY_INNOVATIONS);
@@ -788,9 +784,9 @@ impl Left {
         if let Some(free) = steady {
             // What the mechanisms gain in log-likelihood per sample beside what free shapes would gain beyond
             // them.
-            let (before, after) = search.comparable(found);
+            let (before, after) = &**comparable;
             let seen = after.fit.count.iter().sum::<usize>().max(1) as f64;
-            let named = log_likelihood_gain(&before, &after, scale) / seen;
+            let named = log_likelihood_gain(before, after, scale) / seen;
             explained = named / (named - (1.0 - free.gain).max(1e-9).ln()).max(1e-300);
         }
         Left { misfit, slow, shape, hidden, innovations, explained }

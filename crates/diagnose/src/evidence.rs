@@ -96,6 +96,11 @@ pub fn kappa(setup: &Setup, level: &Level, scale: &[f64], point: &Point) -> Vec<
         .collect()
 }
 
+/// The smallest κ over the channels.
+pub fn least_kappa(setup: &Setup, level: &Level, scale: &[f64], point: &Point) -> f64 {
+    kappa(setup, level, scale, point).into_iter().fold(1.0, f64::min)
+}
+
 /// Held-out errors by fold at the optimum of a fit.
 pub fn folds(setup: &Setup, level: &Level, scale: &[f64], point: &Point) -> Folds {
     let (nx, ny, np) = (setup.system.nx, setup.system.ny, setup.free.len());

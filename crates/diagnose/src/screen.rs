@@ -1,8 +1,8 @@
 //! The score test: what every candidate would explain, to first order, at the cost of one lane of the
 //! sensitivity integration each.
 //!
-//! A candidate force c·φ(x̂(t)) is evaluated along the smoothed measured states and injected as an
-//! exogenous force; its output response g, the residual r and the sensitivities J of the parameters
+//! A candidate force c·φ(x̂(t)) is evaluated along the smoothed states (beside coloured noise, along
+//! the fit's own trajectory) and injected as an exogenous force; its output response g, the residual r and the sensitivities J of the parameters
 //! already in the model are projected off the segments' free initial states. With everything else
 //! refitted to first order,
 //!

@@ -10,7 +10,7 @@ use rayon::prelude::*;
 
 use crate::along::Along;
 use crate::candidate::{Candidate, Instance, candidates};
-use crate::evidence::{Evidence, Side, folds, kappa, weigh};
+use crate::evidence::{Evidence, Side, folds, kappa, least_kappa, weigh};
 use crate::library::Mechanism;
 use crate::place::{Place, places};
 use crate::screen::{Pair, Scored, first_states, screen, screen_pairs};
@@ -43,6 +43,8 @@ const PAIR_MISFIT: f64 = 1.1;
 const PAIR_SAMPLES: usize = 500;
 /// Residual over noise from which a fit may be stuck.
 const STUCK: f64 = 1.2;
+/// Information per sample from which a residual counts as white.
+const WHITE: f64 = 0.8;
 /// Residual over noise from which a model is far from the noise.
 const FAR: f64 = 2.0;
 /// Factor by which calibration may move a parameter before a model far from the noise is in doubt for it.
@@ -107,8 +109,19 @@ impl Fitted {
     }
 
     /// Largest residual RMS over the noise.
-    pub fn misfit(&self, scale: &[f64]) -> f64 {
+    fn misfit(&self, scale: &[f64]) -> f64 {
         rms(&self.fit, scale).iter().zip(&self.setup.data.sigma).map(|(r, s)| r / s).fold(0.0, f64::max)
+    }
+
+    /// Whether a residual with information `kappa` per sample is white, and no larger than the noise.
+    fn is_white(&self, kappa: f64, scale: &[f64]) -> bool {
+        kappa > WHITE && self.misfit(scale) < STUCK
+    }
+
+    /// Whether nothing is left over but white noise, for which no noise model had to stand in.
+    pub fn leaves_white_noise(&self, scale: &[f64]) -> bool {
+        self.setup.noise.is_none()
+            && self.is_white(least_kappa(&self.setup, &self.level, scale, &self.fit.point), scale)
     }
 }
 
@@ -626,7 +639,7 @@ impl<'a> Search<'a> {
         // An effect that acts rarely is seen in few folds: it must pay much where it acts and cost nothing
         // elsewhere, and the baseline must have shown a misfit while its segments were short.
         // (Where the residual is white, the likelihood can be taken at its word.)
-        let (times, focus) = if e.kappa > 0.8 && !e.whitened { (2.0, 0.7) } else { (4.0, 0.85) };
+        let (times, focus) = if e.kappa > WHITE && !e.whitened { (2.0, 0.7) } else { (4.0, 0.85) };
         let rare = mechanism.rare
             && loose
             && e.score > times * threshold.max(15.0)
@@ -643,7 +656,7 @@ impl<'a> Search<'a> {
                 && e.improving >= 0.6;
         }
         let enough = (e.drop > 0.02 && e.held_out > 0.01)
-            || (e.kappa > 0.8 && e.drop > 0.005 && e.held_out > 0.004 && e.t > 2.5);
+            || (e.kappa > WHITE && e.drop > 0.005 && e.held_out > 0.004 && e.t > 2.5);
         // Of a force that never rests, each fold brings its share of the score, with a spread near its
         // square root: where the score is beyond doubt, so is t.
         if mechanism.steady && (e.t < STEADY || e.improving < 0.8) {
@@ -851,7 +864,7 @@ impl<'a> Search<'a> {
 
     fn is_coloured(&self, state: &State, below: f64) -> bool {
         let f = &state.current;
-        kappa(&f.setup, &f.level, &state.scale, &f.fit.point).iter().any(|k| *k < below)
+        least_kappa(&f.setup, &f.level, &state.scale, &f.fit.point) < below
     }
 
     /// The second pass: the noise has a model of its own (an autoregression per channel), residuals,
@@ -885,7 +898,8 @@ impl<'a> Search<'a> {
     fn level(&self, calibrated: &mut Fitted, state: &mut State) {
         let mut seen: Vec<Vec<Candidate>> = Vec::new();
         while state.current.parts.len() < MOST_MECHANISMS {
-            if state.misfit() < 1.03 && !self.is_coloured(state, 0.8) && state.current.setup.noise.is_none() {
+            if state.misfit() < 1.03 && !self.is_coloured(state, WHITE) && state.current.setup.noise.is_none()
+            {
                 break;
             }
             let before = state.candidates();
@@ -1466,7 +1480,7 @@ impl<'a> Search<'a> {
             };
             let e = self.weigh(&smaller, &state.current, &state.scale);
             // A little less than what it takes to be accepted, or rounds would go in circles.
-            let least = match (e.whitened, e.kappa > 0.8) {
+            let least = match (e.whitened, e.kappa > WHITE) {
                 (true, _) => 0.0025,
                 (false, true) => 0.004,
                 (false, false) => 0.01,
@@ -1548,7 +1562,7 @@ pub fn coloured_channels(f: &Fitted, scale: &[f64]) -> Vec<bool> {
 /// Whether the likelihood can be taken at its word: of innovations, and of a residual that is white and no
 /// larger than the noise. Anything else holds misfits that no likelihood knows of.
 fn by_likelihood(f: &Fitted, e: &Evidence, scale: &[f64]) -> bool {
-    e.whitened || (e.kappa > 0.8 && f.misfit(scale) < STUCK)
+    e.whitened || f.is_white(e.kappa, scale)
 }
 
 /// Sum of squared innovations per channel, each model with the noise model of its own residual.

@@ -160,11 +160,8 @@ impl<'a> Spectra<'a> {
 
     /// Noise of the sensors that see a variable, added up; zero where none does.
     fn noise(&self, variable: &Expr) -> f64 {
-        let measured = |name: &str| {
-            let seen = |m: &greybox_model::Measurement| matches!(&m.expr, Expr::Var { name: n, primes: 0 } if **n == *name);
-            self.setup.model.measurements.iter().position(seen)
-        };
-        let channels = variable.variables().into_iter().filter_map(|(name, _)| measured(&name));
+        let channel = |name: &str| self.setup.model.measurement_of(name, 0);
+        let channels = variable.variables().into_iter().filter_map(|(name, _)| channel(&name));
         channels.map(|c| self.setup.data.sigma[c]).sum()
     }
 

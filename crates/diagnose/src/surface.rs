@@ -2,8 +2,9 @@
 //!
 //! Piecewise linear functions of the motion d (7 knots), of d' (7), of both (5 × 5), of their product (15),
 //! of its product with another motion (9), of each input (7) and its products with d and d' (7), and of slow
-//! time (6 knots × \[1, d, d'\]) are injected like any candidate. What they explain on folds
-//! they were not fitted to is force that acts on the machine and has a shape; noise gains nothing.
+//! time (14 knots, alone and as a gain of d, d', d² and each input) are injected like any candidate. What they
+//! explain on folds they were not fitted to is force that acts on the machine and has a shape; noise gains
+//! nothing.
 
 use std::sync::Arc;
 
@@ -88,7 +89,8 @@ fn thinned(setup: &Setup, level: &Level, point: &Point) -> (Level, Point) {
     (Level { segments, priors }, Point { parameters: point.parameters.clone(), starts })
 }
 
-/// Tests a fitted model against free shapes.
+/// Tests a fitted model against free shapes: `scale` is one per channel, SI, `point` an optimum at `level`. `None`
+/// where no motion has a shape, or where there is too little independent data.
 pub fn test(setup: &Setup, level: &Level, scale: &[f64], point: &Point) -> Option<Surface> {
     let (level, point) = &thinned(setup, level, point);
     let along = Along::smoothed(setup, level, scale, point);
@@ -209,7 +211,7 @@ pub fn test(setup: &Setup, level: &Level, scale: &[f64], point: &Point) -> Optio
     let rows = setup.with_problem(level, scale, |p| p.rows(point, true, Some(&signals)));
     let total: usize = level.segments.iter().map(|s| s.range.len()).sum();
     // Blocks no shorter than the residual's correlation: neighbours must not predict each other.
-    let kappa = crate::evidence::kappa(setup, level, scale, point).into_iter().fold(1.0, f64::min);
+    let kappa = crate::evidence::least_kappa(setup, level, scale, point);
     if (total as f64) * kappa < LEAST_INDEPENDENT {
         return None; // too little independent data to call anything systematic
     }

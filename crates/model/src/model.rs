@@ -129,4 +129,11 @@ impl Model {
     pub fn equation(&self, name: &str) -> Option<usize> {
         self.equations.iter().position(|s| s.name == name)
     }
+
+    /// Index of the measurement of the state called `state` (`primes` 0) or of its derivative, and of nothing else.
+    pub fn measurement_of(&self, state: &str, primes: u8) -> Option<usize> {
+        self.measurements.iter().position(
+            |m| matches!(&m.expr, Expr::Var { name, primes: p } if **name == *state && *p == primes),
+        )
+    }
 }

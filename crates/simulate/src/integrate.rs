@@ -1656,7 +1656,7 @@ impl<'a> Core<'a> {
             history.push(self.s, value, slope, &self.out_d[arg * lanes..(arg + 1) * lanes]);
             let tau = delay.tau as usize;
             let at = self.s - self.out_regs[tau].max(0.0);
-            if at < history.s[0] && history.slope[0] != 0.0 {
+            if at < history.s[0] {
                 // Straight on, before the start.
                 let back = at - history.s[0];
                 self.out_regs[delay.leaf as usize] = history.value[0] + back * history.slope[0];

@@ -11,6 +11,20 @@ use rand::SeedableRng;
 use rand_distr::{Distribution, StandardNormal};
 use rand_pcg::Pcg64Mcg;
 
+pub const OSCILLATOR: &str = r#"
+name = "Damped oscillator"
+[inputs]
+f = { unit = "N" }
+[states]
+x = { unit = "m" }
+[parameters]
+m = { value = 1.0, unit = "kg" }
+c = { value = 1.5, unit = "N s/m" }
+k = { value = 20.0, unit = "N/m" }
+[equations]
+mass = "m*x'' + c*x' + k*x = f"
+"#;
+
 pub fn normal(seed: u64, n: usize) -> Vec<f64> {
     let mut rng = Pcg64Mcg::seed_from_u64(seed);
     (0..n).map(|_| StandardNormal.sample(&mut rng)).collect()
