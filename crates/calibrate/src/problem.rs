@@ -31,7 +31,9 @@ use std::ops::Range;
 use std::sync::Arc;
 
 use greybox_model::System;
-use greybox_simulate::{Carry, Environment, Method, Seeds, SignalLanes, Simulation, Trajectory, has_history};
+use greybox_simulate::{
+    Carry, Environment, Method, Seeds, SignalLanes, Simulation, Trajectory, delayed_states, has_history,
+};
 use rayon::prelude::*;
 
 use crate::noise_model::Autoregression;
@@ -86,6 +88,9 @@ pub struct Problem<'a> {
     pub scale: &'a [f64],
     /// Entries of the state vector that a segment takes over from the one that ends where it starts.
     pub carried: &'a [usize],
+    /// What the measurements say of the states, `past[piece][entry][sample]`: before a segment that goes on from no
+    /// other, delayed states were there.
+    pub past: &'a [Vec<Option<Vec<f64>>>],
     /// Noise per channel by which the rows of the measurements are whitened; `None`: as they are.
     pub noise: Option<&'a [Autoregression]>,
 }
@@ -240,6 +245,24 @@ impl Problem<'_> {
         }
     }
 
+    /// The measured past of a segment that begins within its piece, where an equation delays a state.
+    fn remembered(&self, segment: &Segment) -> Option<Carry> {
+        let start = segment.range.start;
+        let past = self.past.get(segment.piece)?;
+        let delayed = delayed_states(self.system);
+        if start == 0 || !delayed.iter().any(|&e| past[e].is_some()) {
+            return None;
+        }
+        // As long as the segment itself: a longer delay is seen in none of its samples.
+        let from = start.saturating_sub(segment.range.len());
+        let states: Vec<Option<&[f64]>> = past
+            .iter()
+            .map(|s| s.as_ref()?.get(from..=start).filter(|s| s.iter().all(|v| v.is_finite())))
+            .collect();
+        let dt = self.environments[segment.piece].dt;
+        Some(Carry::remembered(self.system, start, dt, &states))
+    }
+
     /// Rows of segment `i`, and where it ended if the next one may have to know.
     fn segment_rows(
         &self,
@@ -274,7 +297,12 @@ impl Problem<'_> {
         let (mut trajectory, carry) = if self.carried.is_empty() && !has_history(self.system) {
             (simulation.run(start, range), None)
         } else {
-            let (trajectory, carry) = simulation.run_on(start, range, before, self.carried);
+            let past = if before.is_none() { self.remembered(segment) } else { None };
+            let (before, carried) = match &past {
+                Some(past) => (Some(past), &[][..]),
+                None => (before, self.carried),
+            };
+            let (trajectory, carry) = simulation.run_on(start, range, before, carried);
             (trajectory, Some(carry))
         };
         let missing: Vec<Vec<bool>> = match self.noise {

@@ -361,6 +361,7 @@ impl Setup {
             free: &self.free,
             scale,
             carried: &self.carried,
+            past: &self.hats.states,
             noise: self.noise.as_ref().map(|noise| noise.as_slice()),
         })
     }

@@ -114,7 +114,7 @@ fn delayed_feedback_keeps_its_past_in_short_segments() {
     for seed in 0..seeds {
         let s = setup(&off(&truth, &[1.2, 0.9, 0.8, 1.2]), &f, DT, &noisy(&clean, sigma, 20 + seed));
         let level = s.level(60);
-        // One sample short of the next: nothing goes on there.
+        // One sample short of the next: nothing goes on there, and what was before is read off the measurement.
         let cut = Level {
             segments: level
                 .segments
@@ -130,10 +130,10 @@ fn delayed_feedback_keeps_its_past_in_short_segments() {
             }
         }
     }
-    // Measured: 8, 2, 9 and 3 % going on (a third of every segment hangs on the one before; these are
-    // what 30 iterations leave), 90, 14, 42 and 78 % when every segment forgets.
-    for (on, cut) in bias[0].iter().zip(&bias[1]) {
-        assert!(on.abs() < 0.1 && on.abs() < 0.3 * cut.abs(), "{bias:?}");
+    // Measured: 8, 2, 9 and 3 % going on (a third of every segment hangs on the one before; these are what 30
+    // iterations leave), 6, 2, 6 and 2 % from the measured past; 90, 14, 42 and 78 % when every segment forgets.
+    for bias in bias.iter().flatten() {
+        assert!(bias.abs() < 0.1, "{bias:?}");
     }
     // From there longer segments are as good as the noise allows.
     let s = setup(&off(&truth, &[1.2, 0.9, 0.8, 1.2]), &f, DT, &noisy(&clean, sigma, 20));

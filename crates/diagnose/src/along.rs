@@ -85,12 +85,24 @@ impl<'a> Along<'a> {
             tolerance: &setup.hats.tolerance,
         };
         let smoothed = crate::smoother::smooth(setup, &given);
-        let simulated = setup.noise.is_some();
-        let mut states = if simulated { first.states } else { smoothed.states };
-        if simulated {
-            follow(&mut states, setup, level, scale, point, |_| true);
-        }
-        (Along { setup, states, parameters: point.parameters.clone(), simulated }, smoothed.forces)
+        let along = if setup.noise.is_some() {
+            first.fitted(level, scale, point)
+        } else {
+            Along { states: smoothed.states, ..first }
+        };
+        (along, smoothed.forces)
+    }
+
+    /// Smoothed measurements, or beside coloured noise the fit's own trajectories.
+    pub fn undisturbed(setup: &'a Setup, level: &Level, scale: &[f64], point: &Point) -> Along<'a> {
+        let smoothed = Along::smoothed(setup, level, scale, point);
+        if setup.noise.is_some() { smoothed.fitted(level, scale, point) } else { smoothed }
+    }
+
+    /// On the segments of `level` their own trajectories.
+    fn fitted(mut self, level: &Level, scale: &[f64], point: &Point) -> Along<'a> {
+        follow(&mut self.states, self.setup, level, scale, point, |_| true);
+        Along { simulated: true, ..self }
     }
 
     /// Smoothed measurements; unmeasured entries from the segments' trajectories.

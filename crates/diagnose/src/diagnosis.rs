@@ -13,13 +13,13 @@ use greybox_recording::Recording;
 use rayon::prelude::*;
 
 use crate::along::Along;
-use crate::evidence::{Evidence, folds, least_kappa};
+use crate::evidence::{Evidence, kappa, least_kappa};
 use crate::library::{Mechanism, MechanismError, built_in};
 use crate::locate::{Location, force, locate};
-use crate::place::Place;
+use crate::place::{Motion, Place};
 use crate::screen::project;
 use crate::search::{Fitted, Found, Part, Search, log_likelihood_gain, raw_rms, raw_rss, rms};
-use crate::surface::{Surface, Variable};
+use crate::surface::{Surface, Variable, fall, held_out};
 use crate::{Observer, Stage};
 
 /// Share of each recording held out when no recording is.
@@ -384,16 +384,18 @@ fn conclude(
 
     // Mechanisms, remainder, verdict.
     // Where nothing was found, what the search's own noise model leaves white.
-    let surface = if found.improved.parts.is_empty() && found.improved.setup.noise.is_some() {
-        surface(&found.improved, &found.scale)
+    let judged = if found.improved.parts.is_empty() && found.improved.setup.noise.is_some() {
+        (&found.improved, &found.scale)
     } else {
-        surface(&improved, &scale)
+        (&improved, &scale)
     };
+    let surface = surface(judged.0, judged.1);
+    let information = least_kappa(&judged.0.setup, &judged.0.level, judged.1, &judged.0.fit.point);
     // Two refits, for those tests that need them.
     let comparable = LazyCell::new(|| search.comparable(&found));
     let full: f64 = raw_rss(&improved, &found.scale).iter().sum();
     let base = search.rss_at(&calibrated, &improved, &found.scale);
-    let left = Left::of(&improved, &found, &comparable, surface.as_ref(), base);
+    let left = Left::of(&improved, &found, &comparable, surface.as_ref().map(|s| (s, information)), base);
     let shares: Vec<f64> = (0..improved.parts.len())
         .into_par_iter()
         .map(|i| {
@@ -403,7 +405,8 @@ fn conclude(
         .collect();
     let verdict = match left.verdict(improved.parts.len()) {
         Verdict::MissingPhysics
-            if is_patchwork(&improved, &shares) || is_rivalled(&comparable, &found.scale, library) =>
+            if is_patchwork(&improved, &shares, library, left.steady)
+                || is_rivalled(&comparable, &found.scale, library) =>
         {
             Verdict::Unexplained
         }
@@ -417,7 +420,10 @@ fn conclude(
     };
     for (i, m) in mechanisms.iter_mut().enumerate() {
         // What is still missing may be what was taken for this.
-        if significant || is_shared(&improved, &shares, i) {
+        if significant
+            || is_shared(&improved, &shares, i)
+            || is_crowded(&improved, &shares, i, &nominal.model)
+        {
             m.confidence = m.confidence.min(DOUBTED);
         }
     }
@@ -659,21 +665,22 @@ fn figure(
     Some(Estimate { value: v, ci95: Some((v - w, v + w)) })
 }
 
-/// Three or more forces on one and the same motion, each a considerable part of what is missing: a list
-/// that describes some other law piece by piece. (Beside a law that explains nearly everything, small
-/// corrections are what a real machine has.)
-fn is_patchwork(improved: &Fitted, shares: &[f64]) -> bool {
-    let motions: Vec<_> = improved
+/// A list that describes some other law piece by piece: three or more forces on one and the same motion, or two
+/// of one family beside which forces of free shape still explain something (`remains`), each a considerable part
+/// of what is missing. (Beside a law that explains nearly everything, small corrections are what a real machine
+/// has.)
+fn is_patchwork(improved: &Fitted, shares: &[f64], library: &[Mechanism], remains: bool) -> bool {
+    let forces: Vec<(&Motion, &str)> = improved
         .parts
         .iter()
         .zip(shares)
         .filter(|(_, share)| **share > CORRECTION)
-        .filter_map(|(p, _)| match &p.candidate.place {
-            Place::Motion(m) => Some(m),
-            _ => None,
-        })
+        .filter_map(|(p, _)| Some((p.candidate.motion()?, &*library[p.candidate.mechanism].family)))
         .collect();
-    motions.iter().any(|m| motions.iter().filter(|o| o.coefficients == m.coefficients).count() >= PATCHES)
+    forces.iter().any(|(motion, family)| {
+        let here = || forces.iter().filter(|(m, _)| m.coefficients == motion.coefficients);
+        here().count() >= PATCHES || (remains && here().filter(|(_, f)| f == family).count() >= RELATIVES)
+    })
 }
 
 /// Whether a law stands beside another one of the same variables on the same motion: two shapes of a
@@ -703,13 +710,30 @@ fn is_shared(improved: &Fitted, shares: &[f64], index: usize) -> bool {
         })
 }
 
+/// Whether a mechanism is one of three or more in one equation, each a considerable part of what is missing: so
+/// many together follow nearly anything.
+fn is_crowded(improved: &Fitted, shares: &[f64], index: usize, nominal: &Model) -> bool {
+    let equations = |part: &Part| part.candidate.place.equations(nominal);
+    let considerable = || improved.parts.iter().zip(shares).filter(|(_, share)| **share > CORRECTION);
+    shares[index] > CORRECTION
+        && equations(&improved.parts[index])
+            .iter()
+            .any(|e| considerable().filter(|(part, _)| equations(part).contains(e)).count() >= PATCHES)
+}
+
 /// Whether forces of free shape beat the mechanisms: held out by folds, they explain clearly more of the
-/// calibrated model's residual, or as much where the mechanisms need a memory and the shapes need none. A law
+/// calibrated model's residual, and steadily so, or as much where the mechanisms need a memory and the shapes need
+/// none. A law
 /// of the library is at least as good as a free shape of its variables; what imitates another law is not.
 fn is_rivalled((base, improved): &(Fitted, Fitted), scale: &[f64], library: &[Mechanism]) -> bool {
     let Some(free) = surface(base, scale).filter(|s| s.t > STEADY_SHAPE) else { return false };
-    let held_out = |f: &Fitted| folds(&f.setup, &f.level, scale, &f.fit.point).sse.iter().sum::<f64>();
-    let named = 1.0 - held_out(improved) / held_out(base).max(1e-300);
+    // On the same folds as the free shapes: how much blocks tell of each other depends on where they are cut.
+    let point = &improved.fit.point;
+    let Some(errors) = held_out(&improved.setup, &improved.level, scale, point, free.block) else {
+        return false;
+    };
+    let named = 1.0 - errors.iter().sum::<f64>() / free.without.max(1e-300);
+    let (_, t) = fall(&errors, &free.errors);
     let remembers = improved.parts.iter().all(|part| {
         let mut delayed = false;
         part.instance.expression.walk(&mut |e| delayed |= matches!(e, Expr::Call(Func::Delay, _)));
@@ -717,7 +741,11 @@ fn is_rivalled((base, improved): &(Fitted, Fitted), scale: &[f64], library: &[Me
     });
     // Where nothing but white noise is left, what a memory explains is explained.
     let doubtful = remembers && !improved.leaves_white_noise(scale);
-    free.gain > named * if doubtful { RIVALS_MEMORY } else { RIVALS_LAW }
+    if doubtful {
+        free.gain > RIVALS_MEMORY * named
+    } else {
+        free.gain > RIVALS_LAW * named && t > STEADY_SHAPE
+    }
 }
 
 /// Mean over standard error of the folds' gains from which free shapes are taken seriously.
@@ -730,8 +758,10 @@ const RIVALS_MEMORY: f64 = 0.97;
 /// Share of the calibrated model's misfit up to which a mechanism counts as a small correction.
 const CORRECTION: f64 = 0.02;
 
-/// Forces on one motion that make a patchwork.
+/// Forces on one motion that make a patchwork (and mechanisms in one equation that cast doubt on each other); of
+/// one family, where something remains.
 const PATCHES: usize = 3;
+const RELATIVES: usize = 2;
 
 /// What the improved model leaves over.
 struct Left {
@@ -743,7 +773,9 @@ struct Left {
     shape: f64,
     /// Whether free shapes are likelier than none, however little they explain.
     hidden: bool,
-    /// They do, and the innovations are all there is to judge by.
+    /// They are, and explain about as much in every fold.
+    steady: bool,
+    /// They are, and the innovations are all there is to judge by.
     innovations: bool,
     /// Share of the calibrated model's misfit beyond the noise that the mechanisms explain.
     explained: f64,
@@ -754,7 +786,7 @@ impl Left {
         improved: &Fitted,
         found: &Found,
         comparable: &impl Deref<Target = (Fitted, Fitted)>,
-        surface: Option<&Surface>,
+        surface: Option<(&Surface, f64)>,
         base: f64,
     ) -> Left {
         let scale = &found.scale;
@@ -762,8 +794,12 @@ impl Left {
         let rms = raw_rms(improved, scale);
         let coloured = crate::search::coloured_channels(improved, scale);
         let misfit = rms.iter().zip(sigma).map(|(r, s)| r / s).fold(0.0, f64::max);
-        let slow = rms.iter().zip(sigma).zip(&coloured).any(|((r, s), c)| r / s > MISFIT && !c);
-        let shape = surface.filter(|s| s.t > 2.5).map_or(0.0, |s| s.gain);
+        let kappas = kappa(&improved.setup, &improved.level, scale, &improved.fit.point);
+        let slow = (0..rms.len()).any(|c| {
+            let over = rms[c] / sigma[c];
+            !coloured[c] && (over > MISFIT || (over > SLOW_MISFIT && kappas[c] < SLOW))
+        });
+        let shape = surface.filter(|(s, _)| s.t > 2.5).map_or(0.0, |(s, _)| s.gain);
         // The floor is the noise where it is white, the residual itself where it passes for noise.
         let counts = &improved.fit.count;
         let floor: f64 = (0..rms.len())
@@ -776,12 +812,14 @@ impl Left {
         let mut explained = 1.0 - (full - floor).max(0.0) / (base - floor).max(1e-300);
         let whitened = found.improved.setup.noise.is_some();
         // Free shapes' gain in log-likelihood, by what independent samples there are.
-        let kappa = least_kappa(&improved.setup, &improved.level, scale, &improved.fit.point);
-        let likelier = surface.filter(|s| s.t > STEADY_DOUBT && s.samples as f64 * kappa * s.gain > LIKELIER);
+        let likelier = surface
+            .filter(|(s, kappa)| s.t > STEADY_DOUBT && s.samples as f64 * kappa * s.gain > LIKELIER)
+            .map(|(s, _)| s);
         let hidden = likelier.is_some();
-        let steady = likelier.filter(|s| whitened && s.t > STEADY_INNOVATIONS);
-        let innovations = steady.is_some();
-        if let Some(free) = steady {
+        let steady = likelier.is_some_and(|s| s.t > STEADY_SHAPE);
+        let predictable = likelier.filter(|s| whitened && s.t > STEADY_INNOVATIONS);
+        let innovations = predictable.is_some();
+        if let Some(free) = predictable {
             // What the mechanisms gain in log-likelihood per sample beside what free shapes would gain beyond
             // them.
             let (before, after) = &**comparable;
@@ -789,7 +827,7 @@ impl Left {
             let named = log_likelihood_gain(before, after, scale) / seen;
             explained = named / (named - (1.0 - free.gain).max(1e-9).ln()).max(1e-300);
         }
-        Left { misfit, slow, shape, hidden, innovations, explained }
+        Left { misfit, slow, shape, hidden, steady, innovations, explained }
     }
 
     /// Whether something is missing beyond the mechanisms found.
@@ -819,8 +857,11 @@ const LIKELIER: f64 = 20.0;
 /// Most confidence in a mechanism beside which something unexplained remains, or that may be part of another law.
 const DOUBTED: f64 = 0.8;
 
-/// Residual over noise from which a slow residual is a misfit.
+/// Residual over noise from which a residual is a misfit, whatever its colour; and from which it is one where
+/// samples hold so little information each that it must be slow.
 const MISFIT: f64 = 1.5;
+const SLOW_MISFIT: f64 = 1.2;
+const SLOW: f64 = 0.05;
 
 fn surface(fitted: &Fitted, scale: &[f64]) -> Option<Surface> {
     crate::surface::test(&fitted.setup, &fitted.level, scale, &fitted.fit.point)

@@ -32,6 +32,8 @@ pub struct Folds {
 pub struct Evidence {
     /// Log-likelihood gain less the price of complexity.
     pub score: f64,
+    /// The same at Akaike's price, two for each parameter.
+    pub akaike: f64,
     /// Relative drop of the residual sum of squares.
     pub drop: f64,
     /// Relative drop of the held-out sum of squares.
@@ -53,6 +55,7 @@ impl Evidence {
     /// No evidence.
     pub const NONE: Evidence = Evidence {
         score: 0.0,
+        akaike: 0.0,
         drop: 0.0,
         held_out: 0.0,
         t: 0.0,
@@ -200,12 +203,10 @@ fn price(k: f64, information: f64) -> f64 {
 /// Weighs the richer model (`new`) against the simpler (`old`), both fitted with the same scale.
 pub fn weigh(old: &Side<'_>, new: &Side<'_>, count: &[usize], kappa: &[f64], whitened: bool) -> Evidence {
     let effective: f64 = count.iter().zip(kappa).map(|(n, k)| *n as f64 * k).sum();
-    let mut score = price(old.parameters, effective)
-        - price(new.parameters, effective)
-        - 2.0 * (new.surcharge - old.surcharge);
+    let mut gain = -2.0 * (new.surcharge - old.surcharge);
     for c in 0..count.len() {
         if new.rss[c] > 0.0 && old.rss[c] > 0.0 {
-            score += count[c] as f64 * kappa[c] * (old.rss[c] / new.rss[c]).ln();
+            gain += count[c] as f64 * kappa[c] * (old.rss[c] / new.rss[c]).ln();
         }
     }
     let (before, after): (f64, f64) = (old.rss.iter().sum(), new.rss.iter().sum());
@@ -216,7 +217,8 @@ pub fn weigh(old: &Side<'_>, new: &Side<'_>, count: &[usize], kappa: &[f64], whi
     let changes = || old.folds.blocks.iter().zip(&new.folds.blocks).map(|(a, b)| a - b);
     let all: f64 = changes().map(f64::abs).sum();
     Evidence {
-        score,
+        score: gain + price(old.parameters, effective) - price(new.parameters, effective),
+        akaike: gain + 2.0 * (old.parameters - new.parameters),
         drop: 1.0 - after / before.max(1e-300),
         held_out: differences.iter().sum::<f64>() / old.folds.sse.iter().sum::<f64>().max(1e-300),
         t: mean / (variance / k).sqrt().max(1e-300),
@@ -229,7 +231,21 @@ pub fn weigh(old: &Side<'_>, new: &Side<'_>, count: &[usize], kappa: &[f64], whi
 
 #[cfg(test)]
 mod tests {
-    use super::price;
+    use super::{Folds, Side, price, weigh};
+
+    #[test]
+    fn the_criteria_differ_by_their_price_alone() {
+        let n = 1000;
+        let folds = |rss: f64| Folds { sse: vec![rss / 10.0; 10], blocks: vec![rss / 20.0; 20] };
+        let (simple, rich) = (folds(1010.0), folds(1000.0));
+        let side = |folds, rss, parameters| Side { rss, folds, parameters, surcharge: 0.0 };
+        let e = weigh(&side(&simple, &[1010.0], 1.0), &side(&rich, &[1000.0], 3.0), &[n], &[1.0], false);
+        let gain = 1000.0 * 1.01_f64.ln();
+        assert!((e.akaike - (gain - 4.0)).abs() < 1e-9, "{}", e.akaike);
+        assert!((e.score - (gain - price(3.0, 1000.0) + price(1.0, 1000.0))).abs() < 1e-9, "{}", e.score);
+        // Two parameters for a gain of ten: BIC refuses what Akaike accepts.
+        assert!(e.score < 0.0 && e.akaike > 0.0);
+    }
 
     #[test]
     fn parameters_cost_as_bic_says_and_more_where_little_is_known() {

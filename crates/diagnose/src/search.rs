@@ -34,6 +34,9 @@ const MOST_SAMPLES: usize = 5000;
 const MOST_MECHANISMS: usize = 4;
 /// Most candidates that are fitted per round.
 const SHORT_LIST: usize = 9;
+/// Share of the best gain from which one more of every other kind is fitted, and how many.
+const NEARLY: f64 = 0.5;
+const MORE: usize = 5;
 /// Most candidates that a mechanism is held against once more, beside its relatives.
 const RIVALS: usize = 6;
 /// Pairs that are fitted when no single candidate pays, and the residual over noise that calls for them.
@@ -63,7 +66,10 @@ const UNDECIDED: f64 = 3.0;
 const SAME_SCORE: f64 = 1.0;
 /// Candidates of a short-list that are fitted to the end, and the steps that decide which.
 const FINALISTS: usize = 5;
+const BEST: usize = 2;
 const FIRST_STEPS: usize = 6;
+const MORE_STEPS: usize = 12;
+const LAST_STEPS: usize = 40;
 /// Steps that bring the starts of new segments to given parameters.
 const STARTS: usize = 6;
 /// Residual on all data over that of the windows from which a model holds for the windows alone.
@@ -752,7 +758,7 @@ impl<'a> Search<'a> {
             };
             settled = remembers(&state.current);
             if settled {
-                self.reconsider(&calibrated, &mut state);
+                self.think_again(&mut calibrated, &mut state);
                 settled = remembers(&state.current);
             }
             if !settled {
@@ -760,7 +766,7 @@ impl<'a> Search<'a> {
             }
         }
         if !settled {
-            self.reconsider(&calibrated, &mut state);
+            self.think_again(&mut calibrated, &mut state);
         }
         // What was searched through windows is fitted to all data in the end.
         let length = self.lengths.last().copied().unwrap_or(SHORTEST);
@@ -933,31 +939,11 @@ impl<'a> Search<'a> {
             scored.iter().map(|s| (&*self.library[open[s.candidate].mechanism].kind, s.gain)).collect();
         self.observer.screened(&ranking);
         let least = if current.setup.noise.is_some() { 0.001 } else { 0.003 };
-        let short = self.short_list(&open, &scored, least, SHORT_LIST);
-        let anchors: Vec<(Fitted, Vec<Scored>)> = self
-            .anchors(state)
-            .into_iter()
-            .map(|a| {
-                let scored = screen(&a.setup, self.library, &open, &a.level, &scale, &a.fit.point);
-                (a, scored)
-            })
-            .collect();
-        let anchored: Vec<(&Fitted, Vec<&Scored>)> =
-            anchors.iter().map(|(a, s)| (a, self.short_list(&open, s, least, SHORT_LIST))).collect();
-        if short.is_empty() && anchored.iter().all(|a| a.1.is_empty()) {
+        let fine = current.setup.noise.is_some() || state.misfit() < FAR;
+        let short = self.short_list(&open, &scored, least, SHORT_LIST, fine);
+        let trials = self.all_trials(current, state, &open, &short, least);
+        if trials.is_empty() {
             return false;
-        }
-        let candidates = short.len() + anchored.iter().map(|a| a.1.len()).sum::<usize>();
-        self.observer.stage(Stage::Fitting { candidates });
-        let mut trials = self.trials(current, &open, &short, &scale);
-        for (anchor, short) in anchored {
-            for (c, fitted) in self.trials(anchor, &open, &short, &scale) {
-                match trials.iter_mut().find(|t| t.0 == c) {
-                    Some(known) if fitted.fit.cost < known.1.fit.cost => known.1 = fitted,
-                    Some(_) => {}
-                    None => trials.push((c, fitted)),
-                }
-            }
         }
         let Some((winner, chosen, rivals, evidence)) =
             self.decide(calibrated, current, &open, trials, &scale)
@@ -995,8 +981,7 @@ impl<'a> Search<'a> {
     /// - at the nominal parameters, where the calibrated ones are far from them and the simulation still far
     ///   from the recording: a strong friction is taken for an inertia and a damping many times too large, and
     ///   no friction helps there.
-    fn anchors(&self, state: &State) -> Vec<Fitted> {
-        let current = &state.current;
+    fn anchors(&self, current: &Fitted, state: &State) -> Vec<Fitted> {
         let mut out = Vec::new();
         if !current.parts.is_empty() {
             return out; // what was found has changed the model already
@@ -1006,7 +991,7 @@ impl<'a> Search<'a> {
             let fitted = Fitted { setup: stated.clone(), ..current.clone() };
             out.push(self.refit(&fitted, &state.scale, 10));
         }
-        if current.setup.noise.is_none() && state.misfit() > FAR {
+        if current.setup.noise.is_none() && current.misfit(&state.scale) > FAR {
             let nominal = self.nominal.values();
             let moved = current.setup.free.iter().any(|f| {
                 let (was, is) = (nominal[f.index], current.fit.point.parameters[f.index]);
@@ -1024,7 +1009,44 @@ impl<'a> Search<'a> {
         out
     }
 
-    /// Fits a short-list: all of it a little, the more promising half to the end.
+    /// Fits a short-list from `base`, and what ranks high at its anchors from these: of each candidate the better.
+    fn all_trials(
+        &self,
+        base: &Fitted,
+        state: &State,
+        open: &[Candidate],
+        short: &[&Scored],
+        least: f64,
+    ) -> Vec<(usize, Fitted)> {
+        let scale = &state.scale;
+        let anchors: Vec<(Fitted, Vec<Scored>)> = self
+            .anchors(base, state)
+            .into_iter()
+            .map(|a| {
+                let scored = screen(&a.setup, self.library, open, &a.level, scale, &a.fit.point);
+                (a, scored)
+            })
+            .collect();
+        let anchored: Vec<(&Fitted, Vec<&Scored>)> =
+            anchors.iter().map(|(a, s)| (a, self.short_list(open, s, least, SHORT_LIST, false))).collect();
+        let candidates = short.len() + anchored.iter().map(|a| a.1.len()).sum::<usize>();
+        if candidates > 0 {
+            self.observer.stage(Stage::Fitting { candidates });
+        }
+        let mut trials = self.trials(base, open, short, scale);
+        for (anchor, short) in anchored {
+            for (c, fitted) in self.trials(anchor, open, &short, scale) {
+                match trials.iter_mut().find(|t| t.0 == c) {
+                    Some(known) if fitted.fit.cost < known.1.fit.cost => known.1 = fitted,
+                    Some(_) => {}
+                    None => trials.push((c, fitted)),
+                }
+            }
+        }
+        trials
+    }
+
+    /// Fits a short-list: all of it a little, the more promising half further, the best to the end.
     fn trials(
         &self,
         base: &Fitted,
@@ -1038,14 +1060,21 @@ impl<'a> Search<'a> {
             .collect();
         trials.sort_by(|a, b| a.1.rss().total_cmp(&b.1.rss()).then(a.0.cmp(&b.0)));
         let rest = trials.split_off(trials.len().min(FINALISTS));
-        let mut finished: Vec<(usize, Fitted)> = trials
-            .into_par_iter()
-            .map(|(c, f)| {
-                let f = if f.fit.ending == Ending::Limit { self.refit(&f, scale, 12) } else { f };
-                (c, f)
-            })
-            .filter(|(_, f)| self.admissible(f))
-            .collect();
+        let go_on = |trials: Vec<(usize, Fitted)>, steps: usize| -> Vec<(usize, Fitted)> {
+            trials
+                .into_par_iter()
+                .map(|(c, f)| {
+                    (c, if f.fit.ending == Ending::Limit { self.refit(&f, scale, steps) } else { f })
+                })
+                .filter(|(_, f)| self.admissible(f))
+                .collect()
+        };
+        let mut finished = go_on(trials, MORE_STEPS);
+        // The best of these to the very end, or the one that started better would win.
+        finished.sort_by(|a, b| a.1.rss().total_cmp(&b.1.rss()).then(a.0.cmp(&b.0)));
+        let others = finished.split_off(finished.len().min(BEST));
+        finished = go_on(finished, LAST_STEPS);
+        finished.extend(others);
         finished.extend(rest);
         finished
     }
@@ -1057,13 +1086,16 @@ impl<'a> Search<'a> {
         scored: &'s [Scored],
         least: f64,
         most: usize,
+        fine: bool,
     ) -> Vec<&'s Scored> {
         let mut short: Vec<&Scored> = Vec::new();
         for s in scored {
             let kind = &self.library[open[s.candidate].mechanism].kind;
             let of_kind =
                 short.iter().filter(|o| self.library[open[o.candidate].mechanism].kind == *kind).count();
-            if s.gain > least && of_kind < 2 && short.len() < most {
+            // A test of first order ranks no finer than this: of every kind at least one.
+            let near = of_kind == 0 && fine && s.gain > NEARLY * scored[0].gain && short.len() < most + MORE;
+            if s.gain > least && of_kind < 2 && (near || short.len() < most) {
                 short.push(s);
             }
         }
@@ -1150,6 +1182,22 @@ impl<'a> Search<'a> {
         self.prune(state);
     }
 
+    /// Second thoughts; where they change the model, whether it lacks something still.
+    fn think_again(&self, calibrated: &mut Fitted, state: &mut State) {
+        for _ in 0..MOST_MECHANISMS {
+            let before = state.candidates();
+            self.reconsider(calibrated, state);
+            if state.candidates() == before {
+                break;
+            }
+            let after = state.candidates();
+            self.level(calibrated, state);
+            if state.candidates() == after {
+                break;
+            }
+        }
+    }
+
     /// Every mechanism again, with all others in place and the segments at their longest: what else could
     /// stand in its stead? The better (or the simpler of equals) takes its place; the others are the
     /// alternatives of the report.
@@ -1167,7 +1215,8 @@ impl<'a> Search<'a> {
             self.observer.stage(Stage::Screening { candidates: open.len(), found: base.parts.len() });
             let scored = screen(&base.setup, self.library, &open, &base.level, &state.scale, &base.fit.point);
             let relatives = &self.library[part.candidate.mechanism].about.confused_with;
-            let mut short = self.short_list(&open, &scored, 0.003, RIVALS);
+            let fine = base.setup.noise.is_some() || state.misfit() < FAR;
+            let mut short = self.short_list(&open, &scored, 0.003, RIVALS, fine);
             // Those it is confused with at the same place, even where the score test ranks them low.
             for s in &scored {
                 let c = &open[s.candidate];
@@ -1178,9 +1227,9 @@ impl<'a> Search<'a> {
                     short.push(s);
                 }
             }
-            self.observer.stage(Stage::Fitting { candidates: short.len() });
             short.retain(|s| open[s.candidate] != part.candidate);
-            let mut trials = self.trials(&base, &open, &short, &state.scale);
+            let mut trials = self.all_trials(&base, state, &open, &short, 0.003);
+            trials.retain(|(c, _)| open[*c] != part.candidate);
             if let Some(own) = open.iter().position(|c| *c == part.candidate) {
                 // The fit that stands, its part at the end like that of the others.
                 let mut standing = state.current.clone();
@@ -1456,11 +1505,14 @@ impl<'a> Search<'a> {
             .into_iter()
             .filter_map(|(c, f, e)| {
                 // The data cannot separate what fits as well with no more parameters, nor what the evidence
-                // leaves at odds that no one would bet on.
+                // leaves at odds that no one would bet on: close scores, or criteria that contradict each other
+                // (BIC asks for certainty, Akaike's for a better prediction).
+                let likelihood = by_likelihood(&fitted, &evidence, scale);
                 let as_good = self.complexity(&f) <= self.complexity(&fitted)
-                    && !by_likelihood(&fitted, &evidence, scale)
+                    && !likelihood
                     && f.fit.rss.iter().zip(&fitted.fit.rss).all(|(x, y)| *x < 1.005 * y);
-                let equivalent = as_good || (e.score - evidence.score).abs() < UNDECIDED;
+                let disputed = likelihood && (e.score < evidence.score) != (e.akaike < evidence.akaike);
+                let equivalent = as_good || disputed || (e.score - evidence.score).abs() < UNDECIDED;
                 let instance = f.parts.last()?.instance.clone();
                 Some(Rival { candidate: open[c].clone(), instance, evidence: e, equivalent })
             })

@@ -25,8 +25,9 @@ const MARGIN: usize = 80;
 /// Intensities of the unknown force that are tried, as powers of ten of its variance per sample over the
 /// square of the equation's forces.
 const INTENSITIES: [f64; 6] = [-7.0, -5.5, -4.0, -3.0, -2.0, -1.0];
-/// Samples of each chunk that choose the intensity.
+/// Samples of a chunk, and chunks, that choose the intensity.
 const TRIED: usize = 400;
+const CHOOSING: usize = 12;
 
 /// Smoothed states and forces.
 #[derive(Debug, Clone)]
@@ -64,9 +65,11 @@ pub fn smooth(setup: &Setup, given: &Assumptions<'_>) -> Smoothed {
             (0..parts).map(move |i| (p, i * piece.len / parts..(i + 1) * piece.len / parts))
         })
         .collect();
-    // The intensity that makes the innovations likeliest, on the head of every chunk.
+    // The intensity that makes the innovations likeliest, on the head of every chunk or of some spread evenly.
+    let step = chunks.len().div_ceil(CHOOSING).max(1);
+    let choosing: Vec<_> = chunks.iter().step_by(step).collect();
     let likelihood = |power: f64| -> f64 {
-        let parts: Vec<f64> = chunks
+        let parts: Vec<f64> = choosing
             .par_iter()
             .map(|(p, range)| {
                 let head = range.start..range.end.min(range.start + TRIED);

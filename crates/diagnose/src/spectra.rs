@@ -24,6 +24,10 @@ const NEIGHBOURS: usize = 31;
 const MOST: usize = 3000;
 /// Share of an input's power around a frequency from which the input itself is periodic there.
 const DRIVEN: f64 = 0.15;
+/// Share of the power within ten lines that lies within two and a half where there is a line.
+const LINE: f64 = 0.6;
+/// Residual over the noise from which a model is far off.
+const OFF: f64 = 20.0;
 /// Most periods of a ripple over the range that are tried one by one beside coloured noise, and their steps.
 const RIPPLES: f64 = 24.0;
 const RIPPLE_STEP: f64 = 0.4;
@@ -131,8 +135,11 @@ impl<'a> Spectra<'a> {
             of(&residual);
         }
         // A frequency that the input itself is made of cannot be told from what the motion does.
+        // A model far off answers wrongly wherever it is moved, line or not.
+        let off = self.scale.iter().zip(&self.setup.data.sigma).any(|(r, s)| *r > OFF * s);
+        let taken = if off { moves } else { drives };
         let inputs = self.inputs();
-        values.retain(|w| !inputs.iter().any(|(frequency, power)| drives(frequency, power, *w)));
+        values.retain(|w| !inputs.iter().any(|(frequency, power)| taken(frequency, power, *w)));
         distinct(values)
     }
 
@@ -246,13 +253,23 @@ fn lines(power: &[f64]) -> Vec<usize> {
     out
 }
 
-/// Whether a good part of an input's power lies at the angular frequency `w`.
-fn drives(frequency: &[f64], power: &[f64], w: f64) -> bool {
+/// Power of a spectrum within so many lines of the angular frequency `w`.
+fn power_near(frequency: &[f64], power: &[f64], w: f64, lines: f64) -> f64 {
     let step = frequency.get(1).copied().unwrap_or(f64::INFINITY);
-    let total: f64 = power.iter().sum();
-    let near = |f: f64| (f - w / (2.0 * std::f64::consts::PI)).abs() <= 2.5 * step;
-    let here: f64 = frequency.iter().zip(power).filter(|(f, _)| near(**f)).map(|(_, p)| p).sum();
-    here > DRIVEN * total
+    let near = |f: f64| (f - w / (2.0 * std::f64::consts::PI)).abs() <= lines * step;
+    frequency.iter().zip(power).filter(|(f, _)| near(**f)).map(|(_, p)| p).sum()
+}
+
+/// Whether a good part of an input's power lies at the angular frequency `w`.
+fn moves(frequency: &[f64], power: &[f64], w: f64) -> bool {
+    power_near(frequency, power, w, 2.5) > DRIVEN * power.iter().sum::<f64>()
+}
+
+/// Whether it does and the input has a line there: most of its power thereabouts (a slow input has much power at
+/// low frequencies, and no line).
+fn drives(frequency: &[f64], power: &[f64], w: f64) -> bool {
+    moves(frequency, power, w)
+        && power_near(frequency, power, w, 2.5) > LINE * power_near(frequency, power, w, 10.0)
 }
 
 fn distinct(values: Vec<f64>) -> Vec<f64> {
@@ -277,5 +294,22 @@ mod tests {
         power[300] += 1.0;
         assert!(lines(&power).contains(&300));
         assert!(!lines(&power)[..LINES].contains(&300));
+    }
+    #[test]
+    fn an_input_has_a_line_where_it_is_a_sine_and_none_where_it_is_slow() {
+        use std::f64::consts::TAU;
+        let frequency: Vec<f64> = (0..500).map(|i| f64::from(i) * 0.05).collect();
+        // Noise through a lag of 0.3 Hz: a good part of its power lies around 0.2 Hz, in no line.
+        let slow: Vec<f64> = frequency.iter().map(|f| 1.0 / (1.0 + (f / 0.3).powi(2))).collect();
+        let here: f64 = slow[2..=6].iter().sum();
+        assert!(here > 2.0 * DRIVEN * slow.iter().sum::<f64>());
+        assert!(!drives(&frequency, &slow, TAU * 0.2));
+        // The same with a sine of 0.5 Hz, as wide as a window makes it.
+        let mut line = slow.clone();
+        for (i, share) in [(9, 0.5), (10, 1.0), (11, 0.5)] {
+            line[i] += 100.0 * share;
+        }
+        assert!(drives(&frequency, &line, TAU * 0.5));
+        assert!(!drives(&frequency, &line, TAU * 3.0));
     }
 }

@@ -36,6 +36,12 @@ pub struct Surface {
     pub variable: Option<(Variable, f64)>,
     /// Samples that were looked at, over all channels.
     pub samples: usize,
+    /// Held-out errors by fold, with the shapes.
+    pub errors: Vec<f64>,
+    /// Held-out error of the model without them, over all folds.
+    pub without: f64,
+    /// Samples of a block; every tenth block is a fold.
+    pub block: usize,
 }
 
 /// A variable of the free shapes.
@@ -93,7 +99,7 @@ fn thinned(setup: &Setup, level: &Level, point: &Point) -> (Level, Point) {
 /// where no motion has a shape, or where there is too little independent data.
 pub fn test(setup: &Setup, level: &Level, scale: &[f64], point: &Point) -> Option<Surface> {
     let (level, point) = &thinned(setup, level, point);
-    let along = Along::smoothed(setup, level, scale, point);
+    let along = Along::undisturbed(setup, level, scale, point);
     let motions: Vec<Motion> = places(&setup.model)
         .into_iter()
         .filter_map(|p| match p {
@@ -206,67 +212,156 @@ pub fn test(setup: &Setup, level: &Level, scale: &[f64], point: &Point) -> Optio
             Arc::new(SignalLanes { lanes, weights, force, ..SignalLanes::default() })
         })
         .collect();
-    let (nx, ny, np) = (setup.system.nx, setup.system.ny, setup.free.len());
-    let width = np + lanes + 1;
-    let rows = setup.with_problem(level, scale, |p| p.rows(point, true, Some(&signals)));
     let total: usize = level.segments.iter().map(|s| s.range.len()).sum();
     // Blocks no shorter than the residual's correlation: neighbours must not predict each other.
     let kappa = crate::evidence::least_kappa(setup, level, scale, point);
     if (total as f64) * kappa < LEAST_INDEPENDENT {
         return None; // too little independent data to call anything systematic
     }
-    let length = (total / 40).max((1.0 / kappa).ceil() as usize).max(1);
-    // Gram matrix of [J | G | r] per block.
-    let jobs: Vec<_> = rows.into_iter().zip(&level.segments).collect();
-    let per_segment: Vec<Vec<Vec<f64>>> = jobs
-        .into_par_iter()
-        .map(|(rows, segment)| {
-            let p = project(rows, nx);
-            let (n, m) = (segment.range.len(), p.rows);
-            let parts = (n as f64 / length as f64).round().max(1.0) as usize;
-            let column = |i: usize| -> &[f64] {
-                if i < np {
-                    &p.jp[i * m..(i + 1) * m]
-                } else if i < np + lanes {
-                    &p.g[(i - np) * m..(i - np + 1) * m]
-                } else {
-                    &p.r
-                }
-            };
-            (0..parts)
-                .map(|b| {
-                    let (from, to) = (b * n / parts, (b + 1) * n / parts);
-                    let mut gram = vec![0.0; width * width];
-                    for i in 0..width {
-                        for j in 0..=i {
-                            let mut sum = 0.0;
-                            for c in 0..ny {
-                                let r = c * n + from..c * n + to;
-                                sum += qr::dot(&column(i)[r.clone()], &column(j)[r]);
-                            }
-                            gram[i * width + j] = sum;
-                            gram[j * width + i] = sum;
-                        }
-                    }
-                    gram
-                })
-                .collect()
-        })
-        .collect();
-    let blocks: Vec<Vec<f64>> = per_segment.into_iter().flatten().collect();
-    let count = FOLDS.min(blocks.len());
-    if count < 4 {
-        return None;
-    }
-    let mut whole = vec![0.0; width * width];
-    let mut folds = vec![vec![0.0; width * width]; count];
-    for (b, gram) in blocks.iter().enumerate() {
-        for (i, v) in gram.iter().enumerate() {
-            whole[i] += v;
-            folds[b % count][i] += v;
+    let block = (total / 40).max((1.0 / kappa).ceil() as usize).max(1);
+    let data = Folded::new(setup, level, scale, point, &signals, block)?;
+    let np = setup.free.len();
+    let parameters: Vec<usize> = (0..np).collect();
+    let base = data.errors(&parameters);
+    let base_sum: f64 = base.iter().sum();
+    let with = |range: std::ops::Range<usize>| {
+        let mut chosen = parameters.clone();
+        chosen.extend(range.map(|l| np + l));
+        let errors = data.errors(&chosen);
+        let (total, t) = fall(&base, &errors);
+        (total / base_sum.max(1e-300), t, errors)
+    };
+    let mut all = with(0..lanes);
+    let mut best: Option<(Variable, f64)> = None;
+    let mut single = (0.0, 0.0, Vec::new());
+    for (variable, range) in &groups {
+        let one = with(range.clone());
+        if best.as_ref().is_none_or(|b| one.0 > b.1) {
+            best = Some((variable.clone(), one.0));
+            single = one;
         }
     }
-    let errors = |chosen: &[usize]| -> Vec<f64> {
+    // All functions together may overfit where one family does not: the better of the two counts.
+    if single.0 > all.0 {
+        all = single;
+    }
+    let (gain, t, errors) = all;
+    Some(Surface {
+        gain,
+        t,
+        variable: best,
+        samples: total * setup.system.ny,
+        errors,
+        without: base_sum,
+        block,
+    })
+}
+
+/// Held-out errors by fold of a model without free shapes, on the folds of a [`Surface`] of the same level with
+/// blocks of `block` samples.
+pub fn held_out(
+    setup: &Setup,
+    level: &Level,
+    scale: &[f64],
+    point: &Point,
+    block: usize,
+) -> Option<Vec<f64>> {
+    let (level, point) = &thinned(setup, level, point);
+    let none: Vec<Arc<SignalLanes>> =
+        setup.data.pieces.iter().map(|_| Arc::new(SignalLanes::default())).collect();
+    let data = Folded::new(setup, level, scale, point, &none, block)?;
+    Some(data.errors(&(0..setup.free.len()).collect::<Vec<_>>()))
+}
+
+/// Sum over the folds by which held-out errors fall, and its mean over standard error.
+pub fn fall(from: &[f64], to: &[f64]) -> (f64, f64) {
+    let differences: Vec<f64> = from.iter().zip(to).map(|(a, b)| a - b).collect();
+    let k = differences.len() as f64;
+    let mean = differences.iter().sum::<f64>() / k;
+    let variance = differences.iter().map(|d| (d - mean).powi(2)).sum::<f64>() / (k - 1.0);
+    (mean * k, mean / (variance / k).sqrt().max(1e-300))
+}
+
+/// Gram matrices of [J | G | r], the starts projected off: of all data and fold by fold.
+struct Folded {
+    /// Columns of J.
+    parameters: usize,
+    width: usize,
+    whole: Vec<f64>,
+    folds: Vec<Vec<f64>>,
+}
+
+impl Folded {
+    /// Every tenth block of `block` samples is a fold; `None` where there are less than four blocks.
+    fn new(
+        setup: &Setup,
+        level: &Level,
+        scale: &[f64],
+        point: &Point,
+        signals: &[Arc<SignalLanes>],
+        block: usize,
+    ) -> Option<Folded> {
+        let (nx, ny, np) = (setup.system.nx, setup.system.ny, setup.free.len());
+        let lanes = signals.first().map_or(0, |s| s.lanes);
+        let width = np + lanes + 1;
+        let signals = (lanes > 0).then_some(signals);
+        let rows = setup.with_problem(level, scale, |p| p.rows(point, true, signals));
+        let jobs: Vec<_> = rows.into_iter().zip(&level.segments).collect();
+        let per_segment: Vec<Vec<Vec<f64>>> = jobs
+            .into_par_iter()
+            .map(|(rows, segment)| {
+                let p = project(rows, nx);
+                let (n, m) = (segment.range.len(), p.rows);
+                let parts = (n as f64 / block as f64).round().max(1.0) as usize;
+                let column = |i: usize| -> &[f64] {
+                    if i < np {
+                        &p.jp[i * m..(i + 1) * m]
+                    } else if i < np + lanes {
+                        &p.g[(i - np) * m..(i - np + 1) * m]
+                    } else {
+                        &p.r
+                    }
+                };
+                (0..parts)
+                    .map(|b| {
+                        let (from, to) = (b * n / parts, (b + 1) * n / parts);
+                        let mut gram = vec![0.0; width * width];
+                        for i in 0..width {
+                            for j in 0..=i {
+                                let mut sum = 0.0;
+                                for c in 0..ny {
+                                    let r = c * n + from..c * n + to;
+                                    sum += qr::dot(&column(i)[r.clone()], &column(j)[r]);
+                                }
+                                gram[i * width + j] = sum;
+                                gram[j * width + i] = sum;
+                            }
+                        }
+                        gram
+                    })
+                    .collect()
+            })
+            .collect();
+        let blocks: Vec<Vec<f64>> = per_segment.into_iter().flatten().collect();
+        let count = FOLDS.min(blocks.len());
+        if count < 4 {
+            return None;
+        }
+        let mut whole = vec![0.0; width * width];
+        let mut folds = vec![vec![0.0; width * width]; count];
+        for (b, gram) in blocks.iter().enumerate() {
+            for (i, v) in gram.iter().enumerate() {
+                whole[i] += v;
+                folds[b % count][i] += v;
+            }
+        }
+        Some(Folded { parameters: np, width, whole, folds })
+    }
+
+    /// Held-out errors by fold of a regression on the chosen columns.
+    fn errors(&self, chosen: &[usize]) -> Vec<f64> {
+        let Folded { parameters, width, whole, folds } = self;
+        let (np, width) = (*parameters, *width);
         let n = chosen.len();
         let r = width - 1;
         folds
@@ -299,31 +394,5 @@ pub fn test(setup: &Setup, level: &Level, scale: &[f64], point: &Point) -> Optio
                 sse
             })
             .collect()
-    };
-    let parameters: Vec<usize> = (0..np).collect();
-    let base = errors(&parameters);
-    let base_sum: f64 = base.iter().sum();
-    let gain_of = |lanes: &mut dyn Iterator<Item = usize>| {
-        let mut chosen = parameters.clone();
-        chosen.extend(lanes.map(|l| np + l));
-        let e = errors(&chosen);
-        let differences: Vec<f64> = base.iter().zip(&e).map(|(a, b)| a - b).collect();
-        let k = differences.len() as f64;
-        let mean = differences.iter().sum::<f64>() / k;
-        let variance = differences.iter().map(|d| (d - mean).powi(2)).sum::<f64>() / (k - 1.0);
-        (mean * k / base_sum.max(1e-300), mean / (variance / k).sqrt().max(1e-300))
-    };
-    let (gain, t) = gain_of(&mut (0..lanes));
-    let mut best: Option<(Variable, f64)> = None;
-    let mut single = (0.0, 0.0);
-    for (variable, range) in &groups {
-        let (g, s) = gain_of(&mut range.clone());
-        if best.as_ref().is_none_or(|b| g > b.1) {
-            best = Some((variable.clone(), g));
-            single = (g, s);
-        }
     }
-    // All functions together may overfit where one family does not: the better of the two counts.
-    let (gain, t) = if single.0 > gain { single } else { (gain, t) };
-    Some(Surface { gain, t, variable: best, samples: total * ny })
 }

@@ -347,6 +347,47 @@ impl Carry {
     pub fn tangents(&self) -> &[f64] {
         &self.dx
     }
+
+    /// What a stretch that starts at `sample` remembers of `states[entry][k]`, samples `dt` apart of which the last
+    /// is that of the start; `None` where an entry's past is not known. Delayed expressions of the equations that
+    /// are such an entry, and nothing more, read it there; the others hold their initial value, and those of the
+    /// measurements do what they do at a start of their own. Nothing is carried.
+    pub fn remembered(system: &System, sample: usize, dt: f64, states: &[Option<&[f64]>]) -> Carry {
+        let history = |entry: Option<usize>| {
+            let Some(values) = entry.and_then(|e| states.get(e).copied().flatten()) else {
+                return History::default();
+            };
+            let n = values.len();
+            let slope = |k: usize| {
+                let (a, b) = (k.saturating_sub(1), (k + 1).min(n - 1));
+                if b > a { (values[b] - values[a]) / ((b - a) as f64 * dt) } else { 0.0 }
+            };
+            History {
+                s: (0..n).map(|k| (sample + 1 + k - n) as f64 * dt).collect(),
+                value: values.to_vec(),
+                slope: (0..n).map(slope).collect(),
+                seam: true,
+                ..History::default()
+            }
+        };
+        Carry {
+            sample,
+            x: vec![0.0; system.nx],
+            dx: Vec::new(),
+            reach: Vec::new(),
+            h_next: dt,
+            parameters: Vec::new(),
+            initial: 0,
+            signals: 0,
+            rhs_history: system.rhs.delays.iter().map(|d| history(state_leaf(system, d.arg_leaf))).collect(),
+            out_history: vec![History::default(); system.output.delays.len()],
+        }
+    }
+}
+
+/// Entries of the state vector that an equation delays as they are.
+pub fn delayed_states(system: &System) -> Vec<usize> {
+    system.rhs.delays.iter().filter_map(|d| state_leaf(system, d.arg_leaf)).collect()
 }
 
 /// Whether a stretch depends on what was before it by more than its initial state: an equation

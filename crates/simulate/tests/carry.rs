@@ -4,7 +4,9 @@
 mod common;
 use common::*;
 use greybox_model::{Hold, Model, System};
-use greybox_simulate::{Carry, Environment, Method, Seeds, SignalLanes, Simulation, has_history};
+use greybox_simulate::{
+    Carry, Environment, Method, Seeds, SignalLanes, Simulation, delayed_states, has_history,
+};
 
 struct Case {
     name: &'static str,
@@ -299,6 +301,45 @@ fn a_stretch_that_diverges_leaves_its_last_good_state() {
     // An empty stretch hands on where it stands.
     let (t, carry) = simulation.run_on(&[0.5], 7..7, None, &[]);
     assert_eq!((t.n, carry.sample(), carry.state()), (0, 7, &[0.5][..]));
+}
+
+/// A stretch that is told where a delayed state was goes on as if it had never been cut; told nothing, it believes
+/// that the state had always been where it starts.
+#[test]
+fn a_remembered_past_stands_in_for_the_stretch_before() {
+    let case = cases().into_iter().find(|c| c.name == "delayed feedback").unwrap();
+    let system = System::compile(&case.model).unwrap();
+    assert_eq!(delayed_states(&system), [0]);
+    let environment = environment();
+    let parameters: Vec<f64> = case.model.parameters.iter().map(|p| p.value).collect();
+    // A direction of the start, to see that the past has none.
+    let seeds = Seeds { initial: vec![0], ..Seeds::default() };
+    let simulation = Simulation {
+        system: &system,
+        environment: &environment,
+        parameters: &parameters,
+        method: case.method,
+        seeds: &seeds,
+    };
+    let whole = simulation.run(&case.x0, 0..N);
+    let (position, rate) = whole.x.split_at(N);
+    let cut = 97;
+    let x0 = [position[cut], rate[cut]];
+    let past = |values| Carry::remembered(&system, cut, DT, &[values, None]);
+    let off = |before: Option<&Carry>| {
+        let (t, _) = simulation.run_on(&x0, cut..N, before, &[]);
+        t.y.iter().zip(&whole.y[cut..]).fold(0.0f64, |m, (a, b)| m.max((a - b).abs()))
+    };
+    let size = whole.y.iter().fold(0.0f64, |m, v| m.max(v.abs()));
+    let (told, untold, unknown) =
+        (off(Some(&past(Some(&position[..=cut])))), off(None), off(Some(&past(None))));
+    // Slopes by central differences are off by dt² x‴/6.
+    assert!(told < 1e-4 * size, "{told}");
+    assert!(untold > 100.0 * told, "{untold} {told}");
+    assert_eq!(untold, unknown);
+    // A past shorter than the delay holds its first value.
+    let short = off(Some(&past(Some(&position[cut - 3..=cut]))));
+    assert!(told < short && short < untold, "{short}");
 }
 
 #[test]
