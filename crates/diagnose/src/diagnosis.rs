@@ -670,16 +670,25 @@ fn figure(
 /// of what is missing. (Beside a law that explains nearly everything, small corrections are what a real machine
 /// has.)
 fn is_patchwork(improved: &Fitted, shares: &[f64], library: &[Mechanism], remains: bool) -> bool {
-    let forces: Vec<(&Motion, &str)> = improved
+    // Laws of one motion: added, or in the stead of a spring's or a load's term.
+    let laws: Vec<(&Motion, &str, bool)> = improved
         .parts
         .iter()
         .zip(shares)
         .filter(|(_, share)| **share > CORRECTION)
-        .filter_map(|(p, _)| Some((p.candidate.motion()?, &*library[p.candidate.mechanism].family)))
+        .filter_map(|(p, _)| {
+            let family = &*library[p.candidate.mechanism].family;
+            match &p.candidate.place {
+                Place::Motion(m) => Some((m, family, true)),
+                Place::Spring { motion, .. } | Place::Load { motion, .. } => Some((motion, family, false)),
+                _ => None,
+            }
+        })
         .collect();
-    forces.iter().any(|(motion, family)| {
-        let here = || forces.iter().filter(|(m, _)| m.coefficients == motion.coefficients);
-        here().count() >= PATCHES || (remains && here().filter(|(_, f)| f == family).count() >= RELATIVES)
+    laws.iter().any(|(motion, family, _)| {
+        let here = || laws.iter().filter(|(m, ..)| m.coefficients == motion.coefficients);
+        here().filter(|(.., added)| *added).count() >= PATCHES
+            || (remains && here().filter(|(_, f, _)| f == family).count() >= RELATIVES)
     })
 }
 
