@@ -88,8 +88,8 @@ pub struct Problem<'a> {
     pub scale: &'a [f64],
     /// Entries of the state vector that a segment takes over from the one that ends where it starts.
     pub carried: &'a [usize],
-    /// What the measurements say of the states, `past[piece][entry][sample]`: before a segment that goes on from no
-    /// other, delayed states were there.
+    /// What the measurements say of the states, SI, `past[piece][entry][sample]` (`None`: no sensor). A delayed state
+    /// was there before a segment that goes on from no other.
     pub past: &'a [Vec<Option<Vec<f64>>>],
     /// Noise per channel by which the rows of the measurements are whitened; `None`: as they are.
     pub noise: Option<&'a [Autoregression]>,
@@ -255,10 +255,11 @@ impl Problem<'_> {
         }
         // As long as the segment itself: a longer delay is seen in none of its samples.
         let from = start.saturating_sub(segment.range.len());
-        let states: Vec<Option<&[f64]>> = past
-            .iter()
-            .map(|s| s.as_ref()?.get(from..=start).filter(|s| s.iter().all(|v| v.is_finite())))
-            .collect();
+        let mut states: Vec<Option<&[f64]>> = vec![None; past.len()];
+        for e in delayed {
+            let known = past[e].as_ref().and_then(|s| s.get(from..=start));
+            states[e] = known.filter(|s| s.iter().all(|v| v.is_finite()));
+        }
         let dt = self.environments[segment.piece].dt;
         Some(Carry::remembered(self.system, start, dt, &states))
     }

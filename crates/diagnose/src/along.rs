@@ -86,28 +86,27 @@ impl<'a> Along<'a> {
         };
         let smoothed = crate::smoother::smooth(setup, &given);
         let along = if setup.noise.is_some() {
-            first.fitted(level, scale, point)
+            Along::undisturbed(setup, level, scale, point)
         } else {
             Along { states: smoothed.states, ..first }
         };
         (along, smoothed.forces)
     }
 
-    /// Smoothed measurements, or beside coloured noise the fit's own trajectories.
-    pub fn undisturbed(setup: &'a Setup, level: &Level, scale: &[f64], point: &Point) -> Along<'a> {
-        let smoothed = Along::smoothed(setup, level, scale, point);
-        if setup.noise.is_some() { smoothed.fitted(level, scale, point) } else { smoothed }
-    }
-
-    /// On the segments of `level` their own trajectories.
-    fn fitted(mut self, level: &Level, scale: &[f64], point: &Point) -> Along<'a> {
-        follow(&mut self.states, self.setup, level, scale, point, |_| true);
-        Along { simulated: true, ..self }
-    }
-
     /// Smoothed measurements; unmeasured entries from the segments' trajectories.
     pub fn smoothed(setup: &'a Setup, level: &Level, scale: &[f64], point: &Point) -> Along<'a> {
-        let unmeasured = setup.hats.tolerance.iter().any(|t| t.is_infinite());
+        Along::measured(setup, level, scale, point, false)
+    }
+
+    /// Smoothed measurements, or beside coloured noise, which they hold, the segments' trajectories.
+    pub fn undisturbed(setup: &'a Setup, level: &Level, scale: &[f64], point: &Point) -> Along<'a> {
+        Along::measured(setup, level, scale, point, setup.noise.is_some())
+    }
+
+    /// Smoothed measurements; on the segments of `level` all entries (`simulated`) or the unmeasured ones from
+    /// their own trajectories.
+    fn measured(setup: &'a Setup, level: &Level, scale: &[f64], point: &Point, simulated: bool) -> Along<'a> {
+        let own = |i: usize| simulated || setup.hats.tolerance[i].is_infinite();
         let mut states: Vec<Vec<Vec<f64>>> = setup
             .data
             .pieces
@@ -117,10 +116,10 @@ impl<'a> Along<'a> {
                 hats.iter().map(|h| h.clone().unwrap_or_else(|| vec![0.0; piece.len])).collect()
             })
             .collect();
-        if unmeasured {
-            follow(&mut states, setup, level, scale, point, |i| setup.hats.tolerance[i].is_infinite());
+        if (0..setup.system.nx).any(own) {
+            follow(&mut states, setup, level, scale, point, own);
         }
-        Along { setup, states, parameters: point.parameters.clone(), simulated: false }
+        Along { setup, states, parameters: point.parameters.clone(), simulated }
     }
 
     /// Simulated states, `x[piece][i * n + k]`.

@@ -13,13 +13,13 @@ use greybox_recording::Recording;
 use rayon::prelude::*;
 
 use crate::along::Along;
-use crate::evidence::{Evidence, kappa, least_kappa};
+use crate::evidence::{Evidence, fall, kappa};
 use crate::library::{Mechanism, MechanismError, built_in};
 use crate::locate::{Location, force, locate};
 use crate::place::{Motion, Place};
 use crate::screen::project;
 use crate::search::{Fitted, Found, Part, Search, log_likelihood_gain, raw_rms, raw_rss, rms};
-use crate::surface::{Surface, Variable, fall, held_out};
+use crate::surface::{Surface, Variable, held_out};
 use crate::{Observer, Stage};
 
 /// Share of each recording held out when no recording is.
@@ -384,18 +384,16 @@ fn conclude(
 
     // Mechanisms, remainder, verdict.
     // Where nothing was found, what the search's own noise model leaves white.
-    let judged = if found.improved.parts.is_empty() && found.improved.setup.noise.is_some() {
-        (&found.improved, &found.scale)
+    let surface = if found.improved.parts.is_empty() && found.improved.setup.noise.is_some() {
+        surface(&found.improved, &found.scale)
     } else {
-        (&improved, &scale)
+        surface(&improved, &scale)
     };
-    let surface = surface(judged.0, judged.1);
-    let information = least_kappa(&judged.0.setup, &judged.0.level, judged.1, &judged.0.fit.point);
     // Two refits, for those tests that need them.
     let comparable = LazyCell::new(|| search.comparable(&found));
     let full: f64 = raw_rss(&improved, &found.scale).iter().sum();
     let base = search.rss_at(&calibrated, &improved, &found.scale);
-    let left = Left::of(&improved, &found, &comparable, surface.as_ref().map(|s| (s, information)), base);
+    let left = Left::of(&improved, &found, &comparable, surface.as_ref(), base);
     let shares: Vec<f64> = (0..improved.parts.len())
         .into_par_iter()
         .map(|i| {
@@ -795,7 +793,7 @@ impl Left {
         improved: &Fitted,
         found: &Found,
         comparable: &impl Deref<Target = (Fitted, Fitted)>,
-        surface: Option<(&Surface, f64)>,
+        surface: Option<&Surface>,
         base: f64,
     ) -> Left {
         let scale = &found.scale;
@@ -808,7 +806,7 @@ impl Left {
             let over = rms[c] / sigma[c];
             !coloured[c] && (over > MISFIT || (over > SLOW_MISFIT && kappas[c] < SLOW))
         });
-        let shape = surface.filter(|(s, _)| s.t > 2.5).map_or(0.0, |(s, _)| s.gain);
+        let shape = surface.filter(|s| s.t > 2.5).map_or(0.0, |s| s.gain);
         // The floor is the noise where it is white, the residual itself where it passes for noise.
         let counts = &improved.fit.count;
         let floor: f64 = (0..rms.len())
@@ -821,9 +819,8 @@ impl Left {
         let mut explained = 1.0 - (full - floor).max(0.0) / (base - floor).max(1e-300);
         let whitened = found.improved.setup.noise.is_some();
         // Free shapes' gain in log-likelihood, by what independent samples there are.
-        let likelier = surface
-            .filter(|(s, kappa)| s.t > STEADY_DOUBT && s.samples as f64 * kappa * s.gain > LIKELIER)
-            .map(|(s, _)| s);
+        let likelier =
+            surface.filter(|s| s.t > STEADY_DOUBT && s.samples as f64 * s.kappa * s.gain > LIKELIER);
         let hidden = likelier.is_some();
         let steady = likelier.is_some_and(|s| s.t > STEADY_SHAPE);
         let predictable = likelier.filter(|s| whitened && s.t > STEADY_INNOVATIONS);

@@ -200,6 +200,15 @@ fn price(k: f64, information: f64) -> f64 {
     k * n.ln().max(2.0) * n / (n - k - 1.0).max(n / 3.0)
 }
 
+/// Sum over the folds by which held-out errors fall, and the mean of the falls over its standard error.
+pub fn fall(from: &[f64], to: &[f64]) -> (f64, f64) {
+    let differences: Vec<f64> = from.iter().zip(to).map(|(a, b)| a - b).collect();
+    let (k, sum) = (differences.len().max(1) as f64, differences.iter().sum::<f64>());
+    let mean = sum / k;
+    let variance = differences.iter().map(|d| (d - mean).powi(2)).sum::<f64>() / (k - 1.0).max(1.0);
+    (sum, mean / (variance / k).sqrt().max(1e-300))
+}
+
 /// Weighs the richer model (`new`) against the simpler (`old`), both fitted with the same scale.
 pub fn weigh(old: &Side<'_>, new: &Side<'_>, count: &[usize], kappa: &[f64], whitened: bool) -> Evidence {
     let effective: f64 = count.iter().zip(kappa).map(|(n, k)| *n as f64 * k).sum();
@@ -210,19 +219,17 @@ pub fn weigh(old: &Side<'_>, new: &Side<'_>, count: &[usize], kappa: &[f64], whi
         }
     }
     let (before, after): (f64, f64) = (old.rss.iter().sum(), new.rss.iter().sum());
-    let differences: Vec<f64> = old.folds.sse.iter().zip(&new.folds.sse).map(|(a, b)| a - b).collect();
-    let k = differences.len().max(1) as f64;
-    let mean = differences.iter().sum::<f64>() / k;
-    let variance = differences.iter().map(|d| (d - mean).powi(2)).sum::<f64>() / (k - 1.0).max(1.0);
+    let (fallen, t) = fall(&old.folds.sse, &new.folds.sse);
+    let better = old.folds.sse.iter().zip(&new.folds.sse).filter(|(a, b)| *a - *b > 0.0).count();
     let changes = || old.folds.blocks.iter().zip(&new.folds.blocks).map(|(a, b)| a - b);
     let all: f64 = changes().map(f64::abs).sum();
     Evidence {
         score: gain + price(old.parameters, effective) - price(new.parameters, effective),
         akaike: gain + 2.0 * (old.parameters - new.parameters),
         drop: 1.0 - after / before.max(1e-300),
-        held_out: differences.iter().sum::<f64>() / old.folds.sse.iter().sum::<f64>().max(1e-300),
-        t: mean / (variance / k).sqrt().max(1e-300),
-        improving: differences.iter().filter(|d| **d > 0.0).count() as f64 / k,
+        held_out: fallen / old.folds.sse.iter().sum::<f64>().max(1e-300),
+        t,
+        improving: better as f64 / old.folds.sse.len().max(1) as f64,
         kappa: kappa.iter().copied().fold(1.0, f64::min),
         focus: changes().map(|d| d.max(0.0)).sum::<f64>() / all.max(1e-300),
         whitened,

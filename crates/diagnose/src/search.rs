@@ -64,11 +64,12 @@ const MEMORY_SAMPLES: usize = 200;
 const UNDECIDED: f64 = 3.0;
 /// Whitened scores that differ by less are the same.
 const SAME_SCORE: f64 = 1.0;
-/// Candidates of a short-list that are fitted to the end, and the steps that decide which.
-const FINALISTS: usize = 5;
-const BEST: usize = 2;
+/// Steps of a fit that decide which candidates of a short-list go on, and how many do.
 const FIRST_STEPS: usize = 6;
+const FINALISTS: usize = 5;
+/// Further steps of these, how many of them go to the end, and the steps that is.
 const MORE_STEPS: usize = 12;
+const BEST: usize = 2;
 const LAST_STEPS: usize = 40;
 /// Steps that bring the starts of new segments to given parameters.
 const STARTS: usize = 6;
@@ -939,8 +940,7 @@ impl<'a> Search<'a> {
             scored.iter().map(|s| (&*self.library[open[s.candidate].mechanism].kind, s.gain)).collect();
         self.observer.screened(&ranking);
         let least = if current.setup.noise.is_some() { 0.001 } else { 0.003 };
-        let fine = current.setup.noise.is_some() || state.misfit() < FAR;
-        let short = self.short_list(&open, &scored, least, SHORT_LIST, fine);
+        let short = self.short_list(&open, &scored, least, SHORT_LIST, state.near_equals());
         let trials = self.all_trials(current, state, &open, &short, least);
         if trials.is_empty() {
             return false;
@@ -1028,7 +1028,7 @@ impl<'a> Search<'a> {
             })
             .collect();
         let anchored: Vec<(&Fitted, Vec<&Scored>)> =
-            anchors.iter().map(|(a, s)| (a, self.short_list(open, s, least, SHORT_LIST, false))).collect();
+            anchors.iter().map(|(a, s)| (a, self.short_list(open, s, least, SHORT_LIST, 0))).collect();
         let candidates = short.len() + anchored.iter().map(|a| a.1.len()).sum::<usize>();
         if candidates > 0 {
             self.observer.stage(Stage::Fitting { candidates });
@@ -1079,14 +1079,14 @@ impl<'a> Search<'a> {
         finished
     }
 
-    /// The strongest candidates, no more than two of a kind.
+    /// The `most` strongest candidates, no more than two of a kind, and up to `more` of other kinds near the best.
     fn short_list<'s>(
         &self,
         open: &[Candidate],
         scored: &'s [Scored],
         least: f64,
         most: usize,
-        fine: bool,
+        more: usize,
     ) -> Vec<&'s Scored> {
         let mut short: Vec<&Scored> = Vec::new();
         for s in scored {
@@ -1094,7 +1094,7 @@ impl<'a> Search<'a> {
             let of_kind =
                 short.iter().filter(|o| self.library[open[o.candidate].mechanism].kind == *kind).count();
             // A test of first order ranks no finer than this: of every kind at least one.
-            let near = of_kind == 0 && fine && s.gain > NEARLY * scored[0].gain && short.len() < most + MORE;
+            let near = of_kind == 0 && s.gain > NEARLY * scored[0].gain && short.len() < most + more;
             if s.gain > least && of_kind < 2 && (near || short.len() < most) {
                 short.push(s);
             }
@@ -1215,8 +1215,7 @@ impl<'a> Search<'a> {
             self.observer.stage(Stage::Screening { candidates: open.len(), found: base.parts.len() });
             let scored = screen(&base.setup, self.library, &open, &base.level, &state.scale, &base.fit.point);
             let relatives = &self.library[part.candidate.mechanism].about.confused_with;
-            let fine = base.setup.noise.is_some() || state.misfit() < FAR;
-            let mut short = self.short_list(&open, &scored, 0.003, RIVALS, fine);
+            let mut short = self.short_list(&open, &scored, 0.003, RIVALS, state.near_equals());
             // Those it is confused with at the same place, even where the score test ranks them low.
             for s in &scored {
                 let c = &open[s.candidate];
@@ -1501,13 +1500,13 @@ impl<'a> Search<'a> {
             return None;
         }
         let (chosen, fitted, evidence) = weighed.remove(best);
+        let likelihood = by_likelihood(&fitted, &evidence, scale);
         let rivals = weighed
             .into_iter()
             .filter_map(|(c, f, e)| {
                 // The data cannot separate what fits as well with no more parameters, nor what the evidence
                 // leaves at odds that no one would bet on: close scores, or criteria that contradict each other
                 // (BIC asks for certainty, Akaike's for a better prediction).
-                let likelihood = by_likelihood(&fitted, &evidence, scale);
                 let as_good = self.complexity(&f) <= self.complexity(&fitted)
                     && !likelihood
                     && f.fit.rss.iter().zip(&fitted.fit.rss).all(|(x, y)| *x < 1.005 * y);
@@ -1571,6 +1570,12 @@ impl State {
     /// Largest residual RMS over the noise.
     fn misfit(&self) -> f64 {
         self.current.misfit(&self.scale)
+    }
+
+    /// How many near-equals of other kinds are fitted as well: none where the model is far off, and the order of
+    /// what it lacks matters more than which of two comes first.
+    fn near_equals(&self) -> usize {
+        if self.current.setup.noise.is_some() || self.misfit() < FAR { MORE } else { 0 }
     }
 
     fn rescale(&mut self) {

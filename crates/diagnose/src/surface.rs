@@ -13,6 +13,7 @@ use greybox_simulate::SignalLanes;
 use rayon::prelude::*;
 
 use crate::along::Along;
+use crate::evidence::{fall, least_kappa};
 use crate::place::{Motion, Place, places};
 use crate::screen::project;
 
@@ -36,6 +37,8 @@ pub struct Surface {
     pub variable: Option<(Variable, f64)>,
     /// Samples that were looked at, over all channels.
     pub samples: usize,
+    /// Independent samples that one of them is worth.
+    pub kappa: f64,
     /// Held-out errors by fold, with the shapes.
     pub errors: Vec<f64>,
     /// Held-out error of the model without them, over all folds.
@@ -214,7 +217,7 @@ pub fn test(setup: &Setup, level: &Level, scale: &[f64], point: &Point) -> Optio
         .collect();
     let total: usize = level.segments.iter().map(|s| s.range.len()).sum();
     // Blocks no shorter than the residual's correlation: neighbours must not predict each other.
-    let kappa = crate::evidence::least_kappa(setup, level, scale, point);
+    let kappa = least_kappa(setup, level, scale, point);
     if (total as f64) * kappa < LEAST_INDEPENDENT {
         return None; // too little independent data to call anything systematic
     }
@@ -251,6 +254,7 @@ pub fn test(setup: &Setup, level: &Level, scale: &[f64], point: &Point) -> Optio
         t,
         variable: best,
         samples: total * setup.system.ny,
+        kappa,
         errors,
         without: base_sum,
         block,
@@ -271,15 +275,6 @@ pub fn held_out(
         setup.data.pieces.iter().map(|_| Arc::new(SignalLanes::default())).collect();
     let data = Folded::new(setup, level, scale, point, &none, block)?;
     Some(data.errors(&(0..setup.free.len()).collect::<Vec<_>>()))
-}
-
-/// Sum over the folds by which held-out errors fall, and its mean over standard error.
-pub fn fall(from: &[f64], to: &[f64]) -> (f64, f64) {
-    let differences: Vec<f64> = from.iter().zip(to).map(|(a, b)| a - b).collect();
-    let k = differences.len() as f64;
-    let mean = differences.iter().sum::<f64>() / k;
-    let variance = differences.iter().map(|d| (d - mean).powi(2)).sum::<f64>() / (k - 1.0);
-    (mean * k, mean / (variance / k).sqrt().max(1e-300))
 }
 
 /// Gram matrices of [J | G | r], the starts projected off: of all data and fold by fold.

@@ -4,7 +4,8 @@
 use std::sync::Arc;
 
 use greybox_calibrate::{Data, Fit, Level, Limits, Point, Setup, free_parameters};
-use greybox_diagnose::surface::{fall, held_out, test};
+use greybox_diagnose::evidence::fall;
+use greybox_diagnose::surface::{held_out, test};
 use greybox_model::{Hold, Model, System};
 use greybox_recording::{Channel, Recording};
 use greybox_simulate::{Environment, Method, Seeds, Signal, integrate};

@@ -351,7 +351,35 @@ impl Carry {
     /// What a stretch that starts at `sample` remembers of `states[entry][k]`, samples `dt` apart of which the last
     /// is that of the start; `None` where an entry's past is not known. Delayed expressions of the equations that
     /// are such an entry, and nothing more, read it there; the others hold their initial value, and those of the
-    /// measurements do what they do at a start of their own. Nothing is carried.
+    /// measurements do what they do at a start of their own. Nothing is carried. Values are SI; between them the past
+    /// is a cubic with slopes by central differences.
+    ///
+    /// ```
+    /// # use greybox_model::{Model, System};
+    /// use greybox_simulate::{Carry, Environment, Method, Seeds, Simulation};
+    /// # let model = Model::from_toml(r#"
+    /// # [parameters]
+    /// # a = { value = 1.0, unit = "1/s" }
+    /// # tau = { value = 0.25, unit = "s" }
+    /// # [states]
+    /// # x = { unit = "m" }
+    /// # [equations]
+    /// # late = "x' + a*delay(x, tau) = 0"
+    /// # "#, "model.toml").unwrap();
+    /// # let system = System::compile(&model).unwrap();
+    /// let environment = Environment { start: 0.0, dt: 0.01, len: 100, inputs: vec![], forces: vec![] };
+    /// let simulation = Simulation {
+    ///     system: &system,
+    ///     environment: &environment,
+    ///     parameters: &[1.0, 0.25],
+    ///     method: Method::Rk4 { substeps: 1 },
+    ///     seeds: &Seeds::default(),
+    /// };
+    /// let whole = simulation.run(&[1.0], 0..100);
+    /// let past = Carry::remembered(&system, 60, 0.01, &[Some(&whole.y[..=60])]);
+    /// let (rest, _) = simulation.run_on(&[whole.y[60]], 60..100, Some(&past), &[]);
+    /// assert!((rest.y[39] - whole.y[99]).abs() < 1e-6);
+    /// ```
     pub fn remembered(system: &System, sample: usize, dt: f64, states: &[Option<&[f64]>]) -> Carry {
         let history = |entry: Option<usize>| {
             let Some(values) = entry.and_then(|e| states.get(e).copied().flatten()) else {
@@ -363,7 +391,7 @@ impl Carry {
                 if b > a { (values[b] - values[a]) / ((b - a) as f64 * dt) } else { 0.0 }
             };
             History {
-                s: (0..n).map(|k| (sample + 1 + k - n) as f64 * dt).collect(),
+                s: (0..n).map(|k| (sample as f64 + 1.0 + k as f64 - n as f64) * dt).collect(),
                 value: values.to_vec(),
                 slope: (0..n).map(slope).collect(),
                 seam: true,
