@@ -8,6 +8,7 @@
 mod algorithm2;
 mod chapter2;
 mod chapter3;
+mod chapter4;
 mod delayed;
 mod delayed_joint;
 mod duffing;
@@ -16,6 +17,8 @@ mod fixture;
 mod index;
 mod joint;
 mod link;
+mod optimal;
+mod sliding;
 
 use std::path::{Path, PathBuf};
 
@@ -164,6 +167,7 @@ impl Entry {
 fn registry() -> Vec<Entry> {
     let mut entries = chapter2::entries();
     entries.extend(chapter3::entries());
+    entries.extend(chapter4::entries());
     entries
 }
 
@@ -187,7 +191,7 @@ pub(crate) fn run(root: &Path, arguments: &Arguments) -> Result<Ending> {
     if let Some(unknown) = arguments.only.iter().find(|id| !known(id)) {
         let all: Vec<&str> = registry.iter().map(|entry| entry.id).collect();
         eprintln!(
-            "error: `{unknown}` is no table or figure of chapters 2 and 3; there are {}",
+            "error: `{unknown}` is no table or figure of chapters 2 to 4; there are {}",
             all.join(", ")
         );
         return Ok(Ending::Refused);

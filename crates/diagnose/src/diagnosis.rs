@@ -18,7 +18,7 @@ use crate::library::{Mechanism, MechanismError, built_in};
 use crate::locate::{Location, force, locate};
 use crate::place::{Motion, Place};
 use crate::screen::project;
-use crate::search::{Fitted, Found, Part, Search, log_likelihood_gain, raw_rms, raw_rss, rms};
+use crate::search::{Fitted, Found, Part, Search, UNDECIDED, log_likelihood_gain, raw_rms, raw_rss, rms};
 use crate::surface::{Surface, Variable, held_out};
 use crate::{Observer, Stage};
 
@@ -401,9 +401,24 @@ fn conclude(
             ((without - full) / base.max(1e-300)).clamp(0.0, 1.0)
         })
         .collect();
+    // Two laws that share one work lose little each when the other takes over, and all together.
+    let redundant = |a: usize, b: usize| {
+        let both = search.rss_without_both(&improved, a, b, &found.scale).unwrap_or(base);
+        (both - full) / base.max(1e-300) > REDUNDANT * (shares[a] + shares[b])
+    };
+    // A law that another one, which the library has no name for, stands in for.
+    let doubts: Vec<Option<f64>> = (0..improved.parts.len())
+        .into_par_iter()
+        .map(|i| search.doubt(&found.improved, i, &found.scale))
+        .collect();
+    let beaten = |i: usize| doubts[i].is_some_and(|d| d > UNDECIDED);
+    let is_imitation = (0..doubts.len()).any(|i| {
+        beaten(i) && (shares[i] > CORRECTION || (0..doubts.len()).any(|j| i != j && redundant(i, j)))
+    });
     let verdict = match left.verdict(improved.parts.len()) {
+        Verdict::MissingPhysics if is_imitation => Verdict::Unexplained,
         Verdict::MissingPhysics
-            if is_patchwork(&improved, &shares, library, left.steady)
+            if is_patchwork(&improved, &shares, library, left.steady, &redundant)
                 || is_rivalled(&comparable, &found.scale, library) =>
         {
             Verdict::Unexplained
@@ -419,6 +434,7 @@ fn conclude(
     for (i, m) in mechanisms.iter_mut().enumerate() {
         // What is still missing may be what was taken for this.
         if significant
+            || doubts[i].is_some_and(|d| d > -UNDECIDED)
             || is_shared(&improved, &shares, i)
             || is_crowded(&improved, &shares, i, &nominal.model)
         {
@@ -665,29 +681,42 @@ fn figure(
 
 /// A list that describes some other law piece by piece: three or more forces on one and the same motion, or two
 /// of one family beside which forces of free shape still explain something (`remains`), each a considerable part
-/// of what is missing. (Beside a law that explains nearly everything, small corrections are what a real machine
-/// has.)
-fn is_patchwork(improved: &Fitted, shares: &[f64], library: &[Mechanism], remains: bool) -> bool {
+/// of what is missing, or the two `redundant`: nearly superfluous beside each other. (Beside a law that explains
+/// nearly everything, small corrections are what a real machine has.)
+fn is_patchwork(
+    improved: &Fitted,
+    shares: &[f64],
+    library: &[Mechanism],
+    remains: bool,
+    redundant: impl Fn(usize, usize) -> bool,
+) -> bool {
     // Laws of one motion: added, or in the stead of a spring's or a load's term.
-    let laws: Vec<(&Motion, &str, bool)> = improved
+    let laws: Vec<(usize, &Motion, &str, bool)> = improved
         .parts
         .iter()
-        .zip(shares)
-        .filter(|(_, share)| **share > CORRECTION)
-        .filter_map(|(p, _)| {
+        .enumerate()
+        .filter_map(|(i, p)| {
             let family = &*library[p.candidate.mechanism].family;
             match &p.candidate.place {
-                Place::Motion(m) => Some((m, family, true)),
-                Place::Spring { motion, .. } | Place::Load { motion, .. } => Some((motion, family, false)),
+                Place::Motion(m) => Some((i, m, family, true)),
+                Place::Spring { motion, .. } | Place::Load { motion, .. } => Some((i, motion, family, false)),
                 _ => None,
             }
         })
         .collect();
-    laws.iter().any(|(motion, family, _)| {
-        let here = || laws.iter().filter(|(m, ..)| m.coefficients == motion.coefficients);
-        here().filter(|(.., added)| *added).count() >= PATCHES
-            || (remains && here().filter(|(_, f, _)| f == family).count() >= RELATIVES)
-    })
+    let considerable = |i: usize| shares[i] > CORRECTION;
+    let relatives = |a: usize, b: usize| {
+        let ((i, m, family, _), (j, other, its, _)) = (&laws[a], &laws[b]);
+        m.coefficients == other.coefficients
+            && family == its
+            && ((considerable(*i) && considerable(*j)) || redundant(*i, *j))
+    };
+    let patches = |motion: &Motion| {
+        let here = |l: &&(usize, &Motion, &str, bool)| l.3 && l.1.coefficients == motion.coefficients;
+        laws.iter().filter(here).filter(|l| considerable(l.0)).count()
+    };
+    laws.iter().any(|l| considerable(l.0) && patches(l.1) >= PATCHES)
+        || (remains && (0..laws.len()).any(|b| (0..b).any(|a| relatives(a, b))))
 }
 
 /// Whether a law stands beside another one of the same variables on the same motion: two shapes of a
@@ -765,10 +794,11 @@ const RIVALS_MEMORY: f64 = 0.97;
 /// Share of the calibrated model's misfit up to which a mechanism counts as a small correction.
 const CORRECTION: f64 = 0.02;
 
-/// Forces on one motion that make a patchwork (and mechanisms in one equation that cast doubt on each other); of
-/// one family, where something remains.
+/// Forces on one motion that make a patchwork (and mechanisms in one equation that cast doubt on each other).
 const PATCHES: usize = 3;
-const RELATIVES: usize = 2;
+
+/// What two laws explain together over the sum of what each adds to the other, from which they do one work.
+const REDUNDANT: f64 = 4.0;
 
 /// What the improved model leaves over.
 struct Left {

@@ -256,6 +256,8 @@ pub struct Mechanism {
     pub mirror: bool,
     /// Kinds of which this one is a refinement: at the same place it replaces them.
     pub refines: Vec<String>,
+    /// Kinds that this one casts doubt on where it explains as much; it is no candidate and never named itself.
+    pub doubts: Vec<String>,
     /// Expressions in the parameters that must not be negative (fs − fc of Stribeck friction).
     pub require: Vec<Expr>,
     /// Extra complexity beyond the number of parameters.
@@ -351,6 +353,8 @@ struct File {
     mirror: bool,
     #[serde(default)]
     refines: Vec<String>,
+    #[serde(default)]
+    doubts: Vec<String>,
     #[serde(default)]
     require: Vec<String>,
     #[serde(default)]
@@ -483,6 +487,7 @@ impl Mechanism {
             reversals: raw.reversals,
             mirror: raw.mirror,
             refines: raw.refines,
+            doubts: raw.doubts,
             require: raw.require.iter().map(|t| expression(t, "", "require")).collect::<Result<_, _>>()?,
             surcharge: raw.surcharge,
             region: raw.location.map(region).transpose()?,
@@ -813,13 +818,12 @@ impl Mechanism {
     where
         I: Iterator<Item = &'a Mechanism>,
     {
-        for kind in &self.refines {
-            if !all().any(|m| m.kind == *kind) {
-                return Err(Fault::new(
-                    "",
-                    "refines",
-                    format!("`refines` names `{kind}`, a kind that the library does not have"),
-                ));
+        for (key, kinds) in [("refines", &self.refines), ("doubts", &self.doubts)] {
+            for kind in kinds {
+                if !all().any(|m| m.kind == *kind) {
+                    let message = format!("`{key}` names `{kind}`, a kind that the library does not have");
+                    return Err(Fault::new("", key, message));
+                }
             }
         }
         for (kind, parameter, _) in &self.equals {
@@ -1269,6 +1273,7 @@ mod tests {
                 6,
                 "`refines` names `coulomb`, a kind that the library does not have",
             ),
+            ("doubts = [\"coulomb\"]", 6, "`doubts` names `coulomb`, a kind that the library does not have"),
             ("[equals]\ncoulomb = { fc = \"fc\" }", 7, "[equals] names `coulomb`"),
             ("[equals]\ncoulomb_friction = { fs = \"fc\" }", 7, "it has no parameter `fs`"),
         ] {

@@ -61,7 +61,7 @@ const STEADY: f64 = 2.5;
 /// Fewest samples from which a mechanism with states of its own is looked for.
 const MEMORY_SAMPLES: usize = 200;
 /// Two explanations whose scores differ by less stay undecided.
-const UNDECIDED: f64 = 3.0;
+pub const UNDECIDED: f64 = 3.0;
 /// Whitened scores that differ by less are the same.
 const SAME_SCORE: f64 = 1.0;
 /// Steps of a fit that decide which candidates of a short-list go on, and how many do.
@@ -180,6 +180,8 @@ pub struct Search<'a> {
     pub keep_holds: bool,
     nominal: Setup,
     all: Vec<Candidate>,
+    /// Laws that only cast doubt on others.
+    doubts: Vec<Candidate>,
     /// Lengths of the segments, samples, level by level.
     lengths: Vec<usize>,
 }
@@ -277,8 +279,9 @@ impl<'a> Search<'a> {
         let mut all = candidates(&nominal.model, library, &places);
         let samples: usize = nominal.data.lengths().iter().sum();
         all.retain(|c| samples >= MEMORY_SAMPLES || library[c.mechanism].states.is_empty());
+        let (all, doubts) = all.into_iter().partition(|c| library[c.mechanism].doubts.is_empty());
         let lengths = lengths(&nominal);
-        Search { library, observer, keep_holds: false, nominal, all, lengths }
+        Search { library, observer, keep_holds: false, nominal, all, doubts, lengths }
     }
 
     /// The candidates it considers.
@@ -710,6 +713,37 @@ impl<'a> Search<'a> {
     /// Residual sum of squares of a model without its part `index`, refitted.
     pub fn rss_without(&self, fitted: &Fitted, index: usize, scale: &[f64]) -> Option<f64> {
         Some(raw_rss(&self.without(fitted, index, scale, 10)?, scale).iter().sum())
+    }
+
+    /// How far the score of the law that casts doubt on part `index` is above its own; `None` where none does.
+    pub fn doubt(&self, fitted: &Fitted, index: usize, scale: &[f64]) -> Option<f64> {
+        let part = &fitted.parts[index].candidate;
+        let kind = &self.library[part.mechanism].kind;
+        let doubts = |c: &&Candidate| {
+            c.place == part.place && !c.mirrored && self.library[c.mechanism].doubts.contains(kind)
+        };
+        let doubt = self.doubts.iter().find(doubts)?;
+        let base = self.without(fitted, index, scale, 12)?;
+        let scored = screen(
+            &base.setup,
+            self.library,
+            std::slice::from_ref(doubt),
+            &base.level,
+            scale,
+            &base.fit.point,
+        );
+        let rival = self.extend(&base, doubt, scored.first()?, scale, LAST_STEPS)?;
+        // One information per sample for both: that of the residual which fits better.
+        let best = if rival.rss() < fitted.rss() { &rival } else { fitted };
+        let kappa = kappa(&best.setup, &best.level, scale, &best.fit.point);
+        let score = |f: &Fitted| self.weigh_with(&base, f, scale, &kappa).score;
+        Some(score(&rival) - score(fitted))
+    }
+
+    /// Residual sum of squares of a model without two of its parts, refitted.
+    pub fn rss_without_both(&self, fitted: &Fitted, a: usize, b: usize, scale: &[f64]) -> Option<f64> {
+        let one = self.without(fitted, a.max(b), scale, 10)?;
+        Some(raw_rss(&self.without(&one, a.min(b), scale, 10)?, scale).iter().sum())
     }
 
     /// Runs all levels; again on whitened residuals where what is left over is coloured.

@@ -235,6 +235,20 @@ impl RotaryFlexibleLink {
         samples: usize,
         mut command: impl FnMut(usize, [f64; 2]) -> f64,
     ) -> Result<LinkRun, RigError> {
+        self.run_with_state(sampling, start, samples, |k, [theta, alpha, ..]| command(k, [theta, alpha]))
+    }
+
+    /// Like [`run`](Self::run), with a command that gets the whole true state (θ, α, θ̇, α̇).
+    ///
+    /// # Errors
+    /// As [`run`](Self::run).
+    pub fn run_with_state(
+        &self,
+        sampling: Sampling,
+        start: [f64; 4],
+        samples: usize,
+        mut command: impl FnMut(usize, [f64; 4]) -> f64,
+    ) -> Result<LinkRun, RigError> {
         let h = sampling.substep()?;
         let mut run = LinkRun { voltages: Vec::with_capacity(samples), states: Vec::with_capacity(samples) };
         let mut x = start;
@@ -246,7 +260,7 @@ impl RotaryFlexibleLink {
                 let limit = self.theta_limit;
                 return Err(RigError::OutOfRange { coordinate: "hub angle", time, value: x[0], limit });
             }
-            let voltage = command(k, [x[0], x[1]]);
+            let voltage = command(k, x);
             if !voltage.is_finite() {
                 return Err(RigError::Command { time, value: voltage });
             }

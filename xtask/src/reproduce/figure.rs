@@ -343,6 +343,91 @@ fn draw(out: &mut String, series: &Series, colour: &str, x: &Mapped, y: &Mapped)
     }
 }
 
+/// A map of values over two variables, `values[row][column]` with the first row at the bottom, with its scale: from
+/// white to blue where no value is negative, else from blue over white at zero to red.
+pub(crate) fn surface_map(
+    alt: &str,
+    (x, x_ends): (&str, (f64, f64)),
+    (y, y_ends): (&str, (f64, f64)),
+    values: &[Vec<f64>],
+) -> String {
+    const SIDE: f64 = 300.0;
+    let largest = values.iter().flatten().map(|v| v.abs()).fold(0.0, f64::max);
+    let signed = values.iter().flatten().any(|v| *v < 0.0);
+    let colour = |value: f64| {
+        let part = if largest > 0.0 { (value.abs() / largest).min(1.0) } else { 0.0 };
+        let [r, g, b] = if value < 0.0 || !signed { [0.0, 114.0, 178.0] } else { [213.0, 94.0, 0.0] };
+        let mix = |c: f64| (255.0 + part * (c - 255.0)).round();
+        format!("rgb({},{},{})", mix(r), mix(g), mix(b))
+    };
+    let mut out = open(SIDE + LEFT + 150.0, SIDE + TOP + BOTTOM, alt);
+    let (rows, columns) = (values.len().max(1) as f64, values.first().map_or(1, Vec::len).max(1) as f64);
+    let (width, height) = (SIDE / columns, SIDE / rows);
+    for (j, row) in values.iter().enumerate() {
+        for (i, value) in row.iter().enumerate() {
+            let _ = write!(
+                out,
+                "<rect x=\"{:.1}\" y=\"{:.1}\" width=\"{:.1}\" height=\"{:.1}\" fill=\"{}\"/>",
+                LEFT + i as f64 * width,
+                TOP + SIDE - (j + 1) as f64 * height,
+                width + 0.3,
+                height + 0.3,
+                colour(*value)
+            );
+        }
+    }
+    for k in 0..=4 {
+        let part = f64::from(k) / 4.0;
+        let label = |ends: (f64, f64)| number(ends.0 + part * (ends.1 - ends.0), 1);
+        let _ = write!(
+            out,
+            "<text x=\"{:.1}\" y=\"{:.1}\" text-anchor=\"middle\">{}</text>\
+             <text x=\"{:.1}\" y=\"{:.1}\" text-anchor=\"end\">{}</text>",
+            LEFT + part * SIDE,
+            TOP + SIDE + 18.0,
+            label(x_ends),
+            LEFT - 7.0,
+            TOP + SIDE * (1.0 - part) + 4.5,
+            label(y_ends)
+        );
+    }
+    // The scale.
+    let (low, steps) = (if signed { -largest } else { 0.0 }, 24);
+    for k in 0..steps {
+        let value = low + (largest - low) * (f64::from(k) + 0.5) / f64::from(steps);
+        let tall = SIDE / f64::from(steps);
+        let _ = write!(
+            out,
+            "<rect x=\"{:.1}\" y=\"{:.1}\" width=\"18\" height=\"{:.1}\" fill=\"{}\"/>",
+            LEFT + SIDE + 24.0,
+            TOP + SIDE - f64::from(k + 1) * tall,
+            tall + 0.3,
+            colour(value)
+        );
+    }
+    for (value, place) in [(low, TOP + SIDE), (0.5 * (low + largest), TOP + 0.5 * SIDE), (largest, TOP + 9.0)]
+    {
+        let text = if value == 0.0 || (1e-2..1e4).contains(&value.abs()) {
+            number(value, 2)
+        } else {
+            format!("{value:.1e}").replace('-', "−")
+        };
+        let _ = write!(out, "<text x=\"{:.1}\" y=\"{place:.1}\">{text}</text>", LEFT + SIDE + 48.0);
+    }
+    let _ = write!(
+        out,
+        "<path class=\"frame\" d=\"M{LEFT} {TOP}h{SIDE}v{SIDE}h-{SIDE}z\"/>\
+         <text class=\"axis\" x=\"{:.1}\" y=\"{:.1}\" text-anchor=\"middle\">{}</text>\
+         <text class=\"axis\" transform=\"translate(17 {:.1}) rotate(-90)\" text-anchor=\"middle\">{}</text></svg>",
+        LEFT + 0.5 * SIDE,
+        TOP + SIDE + 42.0,
+        escape(x),
+        TOP + 0.5 * SIDE,
+        escape(y)
+    );
+    out
+}
+
 #[cfg(test)]
 mod tests {
     use super::*;
@@ -382,5 +467,16 @@ mod tests {
             y.split('"').next().unwrap().parse().unwrap()
         };
         assert!((height("one") - height("two")).abs() >= LINE - 0.11);
+    }
+
+    #[test]
+    fn a_map_shows_the_sign_and_its_scale() {
+        let map = |values: &[Vec<f64>]| surface_map("m", ("x1", (0.0, 1.0)), ("x2", (0.0, 1.0)), values);
+        let positive = map(&[vec![0.0, 1.0], vec![2.0, 4.0]]);
+        assert!(positive.contains("rgb(0,114,178)") && !positive.contains("rgb(213"), "{positive}");
+        assert!(positive.contains(">4.00<") && positive.contains(">2.00<"));
+        let signed = map(&[vec![-1.0, 1.0]]);
+        assert!(signed.contains("rgb(0,114,178)") && signed.contains("rgb(213,94,0)"));
+        assert!(!map(&[vec![0.0]]).contains("NaN") && !map(&[]).contains("NaN"));
     }
 }
