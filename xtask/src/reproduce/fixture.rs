@@ -61,7 +61,9 @@ impl Bound {
 
 impl fmt::Display for Bound {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
-        match (self.min, self.max) {
+        // Not a row of zeros.
+        let short = |v: f64| if v != 0.0 && v.abs() < 1e-3 { format!("{v:e}") } else { v.to_string() };
+        match (self.min.map(short), self.max.map(short)) {
             (Some(min), Some(max)) => write!(f, "{min} … {max}"),
             (Some(min), None) => write!(f, "≥ {min}"),
             (None, Some(max)) => write!(f, "≤ {max}"),
