@@ -1,0 +1,210 @@
+//! The code compiles without a warning and gives what the expressions give.
+#![allow(missing_docs, clippy::unwrap_used)]
+
+use std::fmt::Write as _;
+use std::path::Path;
+use std::process::Command;
+
+use greybox_export::{Constant, ExportError, Function, Group, Language, Member, Vector};
+use greybox_model::parse;
+use rand::{RngExt, SeedableRng};
+use rand_pcg::Pcg64Mcg;
+
+fn function(outputs: &[&str]) -> Function {
+    Function {
+        name: "law".into(),
+        summary: vec!["A law. */ // ends no comment".into()],
+        arguments: vec![
+            Group {
+                name: "x".into(),
+                members: vec![
+                    Member::new("q", 0, "rad"),
+                    Member::new("q", 1, "rad/s"),
+                    Member::new("z", 0, ""),
+                ],
+            },
+            Group { name: "r".into(), members: vec![Member::new("target", 0, "rad")] },
+        ],
+        constants: vec![
+            Constant::new("k", 3.25, "N m/rad"),
+            Constant::new("double", 1e-7, ""),
+            Constant::new("φ", -2.0, "1"),
+            Constant::new("x", 0.5, "named like an argument"),
+            Constant::new("t0", 7.0, "named like a part"),
+            Constant::new("unused", 9.0, ""),
+        ],
+        outputs: outputs.iter().map(|o| ("u, V".to_owned(), parse(o).unwrap().expr)).collect(),
+    }
+}
+
+/// Everything that the language has, products and quotients in every nesting.
+const OUTPUTS: [&str; 9] = [
+    "saturate(k*(target - q) - q'/(1 + q^2) - (q - (z - q')), 4)",
+    "sin(q)*cos(q') + tan(0.1*z) - exp(-q^2)*ln(2 + z^2)/sqrt(1 + q'^2)",
+    "tanh(q'/0.05) + abs(q) + sign(q') + min(q, z) - max(q', z) + deadzone(q, 0.2)",
+    "q - (q' - (z - target)) - q/((q' + 5)/(2 + z^2))",
+    "-q^2 + (-q)^2 + (-q)^3 - 2^q + (3 + q)^-2 + (5 + q)^0.5 + q^0",
+    "φ*double + x*t0 + pi",
+    "-(-q) - -3*q' + (-2)*z - -(q*z)",
+    "sin(q)*sin(q) + (target - q)*(target - q)*k",
+    "q*(q'*z)/(k*(target + 10)) + k^5 + q^13",
+];
+
+fn vectors(function: &Function) -> Vec<Vector> {
+    let mut generator = Pcg64Mcg::seed_from_u64(7);
+    let mut points: Vec<Vec<f64>> =
+        (0..200).map(|_| (0..4).map(|_| generator.random_range(-2.0..2.0)).collect()).collect();
+    points.push(vec![0.0; 4]);
+    points.push(vec![0.2, -0.0, 0.2, -1.0]);
+    function.vectors(&points).unwrap()
+}
+
+/// Lines of numbers from the compiled program, compared with the vectors.
+fn compare(program: &Path, vectors: &[Vector]) {
+    let run = Command::new(program).output().unwrap();
+    assert!(run.status.success());
+    let text = String::from_utf8(run.stdout).unwrap();
+    let lines: Vec<Vec<f64>> =
+        text.lines().map(|l| l.split_whitespace().map(|v| v.parse().unwrap()).collect()).collect();
+    assert_eq!(lines.len(), vectors.len());
+    for (line, vector) in lines.iter().zip(vectors) {
+        assert_eq!(line.len(), vector.outputs.len());
+        for (k, (a, b)) in line.iter().zip(&vector.outputs).enumerate() {
+            assert!(
+                (a - b).abs() <= 1e-12 * (1.0 + b.abs()),
+                "output {k} of {:?}: {a} and not {b}",
+                vector.arguments
+            );
+        }
+    }
+}
+
+fn rows(vectors: &[Vector], open: &str, close: &str) -> String {
+    vectors.iter().fold(String::new(), |mut text, v| {
+        let numbers: Vec<String> = v.arguments.iter().map(|a| format!("{a:?}")).collect();
+        let _ = writeln!(text, "{open}{}{close},", numbers.join(", "));
+        text
+    })
+}
+
+#[test]
+fn c_compiles_freestanding_and_agrees() {
+    if Command::new("gcc").arg("--version").output().is_err() {
+        println!("skipped: no C compiler here");
+        return;
+    }
+    let function = function(&OUTPUTS);
+    let (code, vectors) = (function.code(Language::C99).unwrap(), vectors(&function));
+    let folder = tempfile::tempdir().unwrap();
+    let path = |name: &str| folder.path().join(name);
+    std::fs::write(path("law.c"), &code).unwrap();
+    let main = format!(
+        "#include <stdio.h>\nvoid law(const double x[3], const double r[1], double out[9]);\n\
+         static const double in[{n}][4] = {{\n{}}};\n\
+         int main(void) {{\n for (int i = 0; i < {n}; i++) {{\n  double out[9];\n  law(in[i], in[i] + 3, out);\n\
+         for (int k = 0; k < 9; k++) printf(\"%.17g \", out[k]);\n  printf(\"\\n\");\n }}\n return 0;\n}}\n",
+        rows(&vectors, "{", "}"),
+        n = vectors.len()
+    );
+    std::fs::write(path("main.c"), main).unwrap();
+    let strict =
+        ["-std=c99", "-O2", "-ffreestanding", "-Wall", "-Wextra", "-Wpedantic", "-Wconversion", "-Werror"];
+    let object =
+        Command::new("gcc").args(strict).arg("-c").arg(path("law.c")).arg("-o").arg(path("law.o")).output();
+    let object = object.unwrap();
+    assert!(object.status.success(), "{}\n{code}", String::from_utf8_lossy(&object.stderr));
+    let files = ["main.c", "law.o"].map(path);
+    let linked = Command::new("gcc").args(files).args(["-lm", "-o"]).arg(path("run")).output().unwrap();
+    assert!(linked.status.success(), "{}", String::from_utf8_lossy(&linked.stderr));
+    compare(&path("run"), &vectors);
+}
+
+#[test]
+fn rust_compiles_without_the_standard_library_and_agrees() {
+    let function = function(&OUTPUTS);
+    let (code, vectors) = (function.code(Language::Rust).unwrap(), vectors(&function));
+    let folder = tempfile::tempdir().unwrap();
+    let path = |name: &str| folder.path().join(name);
+    std::fs::write(path("law.rs"), &code).unwrap();
+    let rustc = std::env::var_os("RUSTC").unwrap_or_else(|| "rustc".into());
+    // The names of `libm` that the code may call; without the standard library they are only declared.
+    let names = ["sin", "cos", "tan", "exp", "log", "sqrt", "tanh", "fabs"];
+    let standard = |n: &str| match n {
+        "log" => "ln".to_owned(),
+        "fabs" => "abs".to_owned(),
+        n => n.to_owned(),
+    };
+    let library = |body: &dyn Fn(&str) -> String| {
+        let mut text = names.iter().fold(String::from("#[allow(dead_code)]\nmod libm {\n"), |mut text, n| {
+            let _ = writeln!(text, "pub fn {n}(x: f64) -> f64 {{ {} }}", body(n));
+            text
+        });
+        let _ = writeln!(text, "pub fn pow(x: f64, y: f64) -> f64 {{ {} }}\n}}", body("pow"));
+        text
+    };
+    let bare =
+        format!("#![no_std]\n{}{code}", library(&|n| if n == "pow" { "x + y".into() } else { "x".into() }));
+    std::fs::write(path("bare.rs"), bare).unwrap();
+    let compiled = Command::new(&rustc)
+        .args(["--edition", "2024", "--crate-type", "lib", "-D", "warnings", "--emit", "metadata", "-o"])
+        .arg(path("bare.rmeta"))
+        .arg(path("bare.rs"))
+        .output()
+        .unwrap();
+    assert!(compiled.status.success(), "{}\n{code}", String::from_utf8_lossy(&compiled.stderr));
+    let whole = format!(
+        "{}{code}\nconst IN: [([f64; 3], [f64; 1]); {}] = [\n{}];\n\
+         fn main() {{\n for (x, r) in &IN {{\n  let out = law(x, r);\n  println!(\"{{}}\", out.map(|v| format!(\"{{v:?}}\")).join(\" \"));\n }}\n}}\n",
+        library(&|n| if n == "pow" { "x.powf(y)".into() } else { format!("x.{}()", standard(n)) }),
+        vectors.len(),
+        vectors.iter().fold(String::new(), |mut text, v| {
+            let a = &v.arguments;
+            let _ = writeln!(text, "([{:?}, {:?}, {:?}], [{:?}]),", a[0], a[1], a[2], a[3]);
+            text
+        })
+    );
+    std::fs::write(path("main.rs"), whole).unwrap();
+    let compiled = Command::new(&rustc)
+        .args(["--edition", "2024", "-O", "-o"])
+        .arg(path("run"))
+        .arg(path("main.rs"))
+        .output()
+        .unwrap();
+    assert!(compiled.status.success(), "{}", String::from_utf8_lossy(&compiled.stderr));
+    compare(&path("run"), &vectors);
+}
+
+#[test]
+fn what_occurs_twice_is_computed_once() {
+    let code = function(&["sin(q)*sin(q) + sin(q)"]).code(Language::C99).unwrap();
+    assert_eq!(code.matches("sin(").count(), 1, "{code}");
+    assert!(
+        code.contains("const double t0 = sin(x[0]);") && code.contains("out[0] = t0 * t0 + t0;"),
+        "{code}"
+    );
+    // Constants that nobody uses are not written; names that the languages have are.
+    assert!(!code.contains("unused"), "{code}");
+    let code = function(&["double*q"]).code(Language::Rust).unwrap();
+    assert!(code.contains("let p_double: f64 = 1e-7; // double"), "{code}");
+}
+
+#[test]
+fn what_cannot_be_written_is_refused() {
+    let refused = |f: Function| f.code(Language::C99).unwrap_err();
+    let error = refused(function(&["q + q''"]));
+    assert!(error.to_string().contains("`q''`, which is neither"), "{error}");
+    assert!(matches!(refused(function(&["delay(q, 0.1)"])), ExportError::Time { function: "delay", .. }));
+    assert!(matches!(refused(function(&["step(q, 0.1)"])), ExportError::Time { function: "step", .. }));
+    let named = |name: &str| refused(Function { name: name.into(), ..function(&["q"]) });
+    for name in ["", "9x", "a b", "double", "fn", "t3", "größe", "out"] {
+        assert_eq!(named(name), ExportError::Name { name: name.into() });
+    }
+    let mut twice = function(&["q"]);
+    twice.constants.push(Constant::new("k", 1.0, ""));
+    assert_eq!(refused(twice), ExportError::Twice { name: "k".into() });
+    let mut infinite = function(&["q"]);
+    infinite.constants.push(Constant::new("big", f64::INFINITY, ""));
+    assert!(matches!(refused(infinite), ExportError::NotFinite { .. }));
+    assert!(function(&["q"]).vectors(&[vec![1.0, 2.0]]).is_err());
+    assert!(function(&["q"]).vectors(&[vec![1.0, f64::NAN, 0.0, 0.0]]).is_err());
+}
