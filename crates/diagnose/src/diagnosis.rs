@@ -418,7 +418,7 @@ fn conclude(
     let verdict = match left.verdict(improved.parts.len()) {
         Verdict::MissingPhysics if is_imitation => Verdict::Unexplained,
         Verdict::MissingPhysics
-            if is_patchwork(&improved, &shares, library, left.steady, &redundant)
+            if is_patchwork(&improved, &shares, library, left.steady, redundant)
                 || is_rivalled(&comparable, &found.scale, library) =>
         {
             Verdict::Unexplained

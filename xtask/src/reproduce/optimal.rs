@@ -5,8 +5,8 @@ use std::sync::OnceLock;
 
 use anyhow::{Context, Result, anyhow};
 use greybox_hjb::{
-    AdamaxOptions, Affine, Domain, Feedback, Linear, Monomials, PolicyOptions, Problem, Training, adamax,
-    care, lqr, policy_iteration, verify,
+    AdamaxOptions, Affine, Domain, Feedback, Linear, Monomials, Plant, PolicyOptions, Problem, Training,
+    adamax, care, lqr, policy_iteration, verify,
 };
 use greybox_simulate::rigs::{RotaryFlexibleLink, Sampling, square_wave};
 use nalgebra::{DMatrix, dmatrix};
@@ -201,7 +201,7 @@ struct Known {
 impl Known {
     const EXACT: [f64; 3] = [0.5, 0.0, 1.0];
 
-    fn plant() -> Affine<impl Fn(&[f64], &mut [f64]), impl Fn(&[f64], &mut [f64])> {
+    fn plant() -> impl Plant {
         Affine {
             states: 2,
             inputs: 1,
