@@ -248,9 +248,6 @@ impl Plant {
         tangent(&self.frictionless, x, u)
     }
 
-    pub(crate) fn frictionless_drift(&self, x: &[f64], f: &mut [f64]) {
-        self.frictionless.eval(x, 0, f);
-    }
 
     pub(crate) fn frictionless_input(&self, x: &[f64], g: &mut [f64]) {
         self.frictionless.eval(x, self.order(), g);

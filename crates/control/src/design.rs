@@ -1,0 +1,459 @@
+//! From a plant to a controller that was checked.
+
+use greybox_hjb::{Linear, Verification};
+use greybox_model::{Expr, Func};
+use greybox_smc::check::Pole;
+use nalgebra::DMatrix;
+
+use crate::compiled::Compiled;
+use crate::equilibrium::{Equilibrium, equilibrium};
+use crate::error::ControlError;
+use crate::feedforward::FeedForward;
+use crate::plant::Plant;
+use crate::{methods, stability};
+
+/// How the law is found.
+#[derive(Debug, Clone, PartialEq)]
+pub enum Method {
+    /// The linear-quadratic regulator of the tangent at the design point, u = u_e(r) − K (x − x_e(r)).
+    Lqr,
+    /// The optimal law of a value function of this degree, fitted over a box around the design point
+    /// ([`greybox_hjb::design`]): u = u_e(r) − ½ R⁻¹ g(x)ᵀ ∇V(x − x_e(r)).
+    Hjb {
+        /// Highest degree of the value function; 2 is the linear regulator.
+        degree: u8,
+        /// Half widths of the box, one for each state; empty for the plant's sizes. It must hold the largest
+        /// deviations from the set point that occur, for beyond it a polynomial means nothing.
+        domain: Vec<f64>,
+    },
+    /// The flat-output sliding-mode law ([`greybox_smc::Law`] with [`greybox_smc::Rate::Model`]) of the tangent at
+    /// the design point: ṡ = −η sat(s/φ) holds whatever the nonlinearity.
+    Smc {
+        /// N − 1 poles on the surface are at −λ, 1/s.
+        lambda: f64,
+        /// Rate of reaching the surface, in units of the input.
+        eta: f64,
+        /// Half width of the boundary layer; the pole towards the surface is at −η/φ.
+        phi: f64,
+    },
+}
+
+impl Method {
+    /// `lqr`, `hjb` or `smc`.
+    #[must_use]
+    pub fn name(&self) -> &'static str {
+        match self {
+            Method::Lqr => "lqr",
+            Method::Hjb { .. } => "hjb",
+            Method::Smc { .. } => "smc",
+        }
+    }
+}
+
+/// The cost ∫ (Σ qᵢ xᵢ² + r u²) dt of LQR and HJB.
+#[derive(Debug, Clone, PartialEq)]
+pub struct Weights {
+    /// Diagonal of Q, in 1/(unit of the state)².
+    pub states: Vec<f64>,
+    /// R, in 1/(unit of the input)².
+    pub input: f64,
+}
+
+impl Weights {
+    /// Bryson's rule: one over the square of each size (A. E. Bryson and Y.-C. Ho, *Applied Optimal Control*, 1975,
+    /// section 5.2).
+    #[must_use]
+    pub fn bryson(plant: &Plant) -> Weights {
+        let weight = |size: f64| 1.0 / (size * size);
+        Weights {
+            states: plant.sizes().iter().map(|s| weight(*s)).collect(),
+            input: weight(plant.input_size()),
+        }
+    }
+}
+
+/// What a controller is for.
+#[derive(Debug, Clone, PartialEq)]
+pub struct DesignOptions {
+    /// The state to bring to a set point, such as `theta`.
+    pub tracked: String,
+    /// Set points that will be asked for, SI. The law is designed in the middle of their range and checked at each.
+    pub set_points: Vec<f64>,
+    /// Sample time: the command is held over it, s.
+    pub dt: f64,
+    /// The actuator gives ± this at most, beside the limits that the model states.
+    pub limit: Option<f64>,
+    /// Cost of LQR and HJB; Bryson's rule where there is none.
+    pub weights: Option<Weights>,
+    /// Near which equilibrium to look for those of the set points; the origin where there is none.
+    pub guess: Option<Equilibrium>,
+    /// Whether a sliding-mode law takes Coulomb friction, smoothed, out of the motion.
+    pub compensate_friction: bool,
+}
+
+impl DesignOptions {
+    /// A state to track through set points, with a command held over `dt` s; all else by default.
+    #[must_use]
+    pub fn new(tracked: &str, set_points: &[f64], dt: f64) -> DesignOptions {
+        DesignOptions {
+            tracked: tracked.to_owned(),
+            set_points: set_points.to_vec(),
+            dt,
+            limit: None,
+            weights: None,
+            guess: None,
+            compensate_friction: true,
+        }
+    }
+}
+
+/// The loop's tangent at a set point.
+#[derive(Debug, Clone, PartialEq)]
+pub struct Check {
+    /// The set point.
+    pub set_point: f64,
+    /// Where the plant rests there.
+    pub equilibrium: Equilibrium,
+    /// Poles of the continuous loop, 1/s, the rightmost first; friction dropped.
+    pub poles: Vec<Pole>,
+    /// Largest magnitude of a pole in z of the loop with the command held.
+    pub spectral_radius: f64,
+}
+
+/// A law that was checked.
+#[derive(Debug, Clone)]
+pub struct Controller {
+    plant: Plant,
+    method: Method,
+    tracked: usize,
+    reference: String,
+    dt: f64,
+    limits: (f64, f64),
+    weights: Weights,
+    design_point: Check,
+    checks: Vec<Check>,
+    gains: Vec<f64>,
+    feed_forward: FeedForward,
+    verification: Option<Verification>,
+    unlimited: Expr,
+    law: Vec<Expr>,
+    compiled: Compiled,
+}
+
+/// Designs a controller and checks it.
+///
+/// The design point is the equilibrium in the middle of the range of the set points. At it and at every set point the
+/// tangent of the loop, friction dropped, must have its poles in the left half plane, and with the command held over
+/// `dt` in the unit circle; the input that holds the plant there must be within the limits. That is linear and local:
+/// simulate the steps that will be made ([`ClosedLoop`](crate::ClosedLoop)).
+///
+/// ```
+/// use greybox_control::{DesignOptions, Method, Plant, PlantOptions, design};
+/// # let model = greybox_model::Model::from_toml(r#"
+/// # [inputs]
+/// # tau = { unit = "N m" }
+/// # [states]
+/// # theta = { unit = "rad" }
+/// # [parameters]
+/// # J = { value = 0.02, unit = "kg m^2" }
+/// # mgl = { value = 0.5, unit = "N m" }
+/// # [equations]
+/// # arm = "J*theta'' + mgl*sin(theta) = tau"
+/// # "#, "pendulum.toml")?;
+/// let plant = Plant::of(&model, "tau", &PlantOptions::default())?;
+/// let law = design(&plant, &Method::Lqr, &DesignOptions::new("theta", &[0.0, 1.0], 1e-3))?;
+/// // At rest at the set point the law gives what holds the arm there.
+/// assert!((law.command(&[1.0, 0.0], 1.0) - 0.5 * 1f64.sin()).abs() < 1e-6);
+/// assert!(law.checks().iter().all(|c| c.spectral_radius < 1.0));
+/// # Ok::<(), Box<dyn std::error::Error>>(())
+/// ```
+///
+/// # Errors
+/// [`ControlError`]: options that make no sense, set points without an equilibrium or beyond the actuator, a tangent
+/// that no feedback stabilises, a loop that is unstable at a set point or when sampled.
+pub fn design(plant: &Plant, method: &Method, options: &DesignOptions) -> Result<Controller, ControlError> {
+    let n = plant.order();
+    let tracked = plant.state(&options.tracked)?;
+    let option = |what: &str, value: f64, wanted| ControlError::Option { what: what.to_owned(), value, wanted };
+    if !(options.dt > 0.0 && options.dt.is_finite()) {
+        return Err(option("the sample time", options.dt, "a positive finite number of seconds"));
+    }
+    if options.set_points.is_empty() {
+        return Err(option("the number of set points", 0.0, "one or more"));
+    }
+    if let Some(bad) = options.set_points.iter().find(|r| !r.is_finite()) {
+        return Err(option("a set point", *bad, "a finite number"));
+    }
+    let (mut low, mut high) = plant.limits();
+    if let Some(limit) = options.limit {
+        if limit.is_nan() || limit <= 0.0 {
+            return Err(option("the limit of the input", limit, "a positive number"));
+        }
+        (low, high) = (low.max(-limit), high.min(limit));
+    }
+    let weights = options.weights.clone().unwrap_or_else(|| Weights::bryson(plant));
+    if weights.states.len() != n {
+        return Err(ControlError::Size { what: "the weights of the states", found: weights.states.len(), wanted: n });
+    }
+    let reference = free_name(plant);
+    let least = options.set_points.iter().copied().fold(f64::INFINITY, f64::min);
+    let most = options.set_points.iter().copied().fold(f64::NEG_INFINITY, f64::max);
+    let guess = options.guess.clone().unwrap_or_else(|| Equilibrium::origin(n));
+    let feed_forward = FeedForward::new(plant, tracked, (least, most), &guess, &reference)?;
+    let center = 0.5 * (least + most);
+    let middle = feed_forward.equilibria[feed_forward.equilibria.len() / 2].clone();
+    let design = methods::Design {
+        plant,
+        tangent: plant.frictionless_tangent(&middle.state, middle.input),
+        at: &middle,
+        set_point: center,
+        dt: options.dt,
+        weights: &weights,
+        feed_forward: &feed_forward,
+    };
+    let made = match method {
+        Method::Lqr => design.lqr()?,
+        Method::Hjb { degree, domain } => design.hjb(*degree, domain)?,
+        Method::Smc { lambda, eta, phi } => design.smc(*lambda, *eta, *phi, options.compensate_friction)?,
+    };
+    let mut variables = plant.symbols().to_vec();
+    variables.push((reference.clone(), 0));
+    let compile = |e: &Expr| Compiled::new(std::slice::from_ref(e), &variables, plant.parameters());
+    let limited = limited(&made.law, low, high);
+    let examined = Examined {
+        plant,
+        names: &options.tracked,
+        dt: options.dt,
+        limits: (low, high),
+        frictionless: compile(&made.frictionless)?,
+        smooth: (made.law != made.frictionless).then(|| compile(&made.law)).transpose()?,
+    };
+    let design_point = examined.check(center, middle)?;
+    let gains = examined.gain(&examined.frictionless, &design_point.equilibrium.state, center);
+    let mut checks = Vec::with_capacity(options.set_points.len());
+    for &r in &options.set_points {
+        let share = if most > least { (r - least) / (most - least) } else { 0.0 };
+        let near = (share * (feed_forward.equilibria.len() - 1) as f64).round() as usize;
+        let at = equilibrium(plant, tracked, r, &feed_forward.equilibria[near])?;
+        checks.push(examined.check(r, at)?);
+    }
+    Ok(Controller {
+        compiled: compile(&limited)?,
+        plant: plant.clone(),
+        method: method.clone(),
+        tracked,
+        reference,
+        dt: options.dt,
+        limits: (low, high),
+        weights,
+        design_point,
+        checks,
+        gains: gains.iter().map(|k| -k).collect(),
+        verification: made.verification,
+        unlimited: made.law,
+        law: vec![limited],
+        feed_forward,
+    })
+}
+
+/// `r`, or a name like it that the model does not use.
+fn free_name(plant: &Plant) -> String {
+    let taken = |name: &str| {
+        name == plant.input()
+            || plant.symbols().iter().any(|(n, _)| n == name)
+            || plant.parameters().iter().any(|(n, _)| n == name)
+            || plant.held().iter().any(|(n, _)| n == name)
+    };
+    let mut name = "r".to_owned();
+    while taken(&name) {
+        name.push_str("_set");
+    }
+    name
+}
+
+/// The command within its limits.
+fn limited(law: &Expr, low: f64, high: f64) -> Expr {
+    let mut u = law.clone();
+    if low.is_infinite() && high.is_infinite() {
+        return u;
+    }
+    if low == -high {
+        return Expr::call(Func::Saturate, vec![u, Expr::Num(high)]);
+    }
+    if low.is_finite() {
+        u = Expr::call(Func::Max, vec![u, Expr::Num(low)]);
+    }
+    if high.is_finite() {
+        u = Expr::call(Func::Min, vec![u, Expr::Num(high)]);
+    }
+    u
+}
+
+/// A law under examination.
+struct Examined<'a> {
+    plant: &'a Plant,
+    names: &'a str,
+    dt: f64,
+    limits: (f64, f64),
+    frictionless: Compiled,
+    /// The law with its compensation of friction, where it has one.
+    smooth: Option<Compiled>,
+}
+
+impl Examined<'_> {
+    /// ∂u/∂x, one row.
+    fn gain(&self, law: &Compiled, x: &[f64], r: f64) -> DMatrix<f64> {
+        let mut at = x.to_vec();
+        at.push(r);
+        law.jacobian(&at).columns(0, x.len()).into_owned()
+    }
+
+    fn check(&self, set_point: f64, at: Equilibrium) -> Result<Check, ControlError> {
+        let (low, high) = self.limits;
+        if !(low <= at.input && at.input <= high) {
+            let (tracked, input) = (self.names.to_owned(), at.input);
+            return Err(ControlError::Unholdable { tracked, value: set_point, input, low, high });
+        }
+        if let Some(law) = &self.smooth {
+            let plant = self.plant.tangent(&at.state, at.input);
+            self.stable(&plant, &self.gain(law, &at.state, set_point), set_point)?;
+        }
+        let plant = self.plant.frictionless_tangent(&at.state, at.input);
+        let gain = self.gain(&self.frictionless, &at.state, set_point);
+        let (poles, spectral_radius) = self.stable(&plant, &gain, set_point)?;
+        Ok(Check { set_point, equilibrium: at, poles, spectral_radius })
+    }
+
+    /// The poles and the largest magnitude in z, if stable.
+    fn stable(
+        &self,
+        plant: &Linear,
+        gain: &DMatrix<f64>,
+        set_point: f64,
+    ) -> Result<(Vec<Pole>, f64), ControlError> {
+        let sizes = self.plant.sizes();
+        let none = || ControlError::NoPoles { set_point };
+        let poles = stability::poles(&stability::closed(plant, gain), sizes).ok_or_else(none)?;
+        let size = poles.iter().fold(0.0f64, |size, p| size.max(p.magnitude()));
+        // A pole at zero is found anywhere within the rounding errors of the largest one.
+        let rounding = 16.0 * poles.len() as f64 * f64::EPSILON * size;
+        if let Some(&pole) = poles.first().filter(|p| p.re.is_nan() || p.re >= -rounding) {
+            return Err(ControlError::Unstable { set_point, pole });
+        }
+        let radius = |dt: f64| {
+            let held = stability::held(plant, dt, sizes, self.plant.input_size())?;
+            let poles = stability::poles(&stability::closed(&held, gain), sizes)?;
+            Some(poles.iter().fold(0.0f64, |radius, p| radius.max(p.magnitude())))
+        };
+        let found = radius(self.dt).ok_or_else(none)?;
+        if found < 1.0 {
+            return Ok((poles, found));
+        }
+        let shorter = (1..40).map(|k| self.dt * 0.8f64.powi(k)).find(|dt| radius(*dt).is_some_and(|r| r < 1.0));
+        let longest = shorter.map_or(String::new(), |dt| format!(", {dt:.2e} s would do"));
+        Err(ControlError::UnstableSampled { set_point, dt: self.dt, radius: found, longest })
+    }
+}
+
+impl Controller {
+    /// The plant it was designed for.
+    #[must_use]
+    pub fn plant(&self) -> &Plant {
+        &self.plant
+    }
+
+    /// How it was found.
+    #[must_use]
+    pub fn method(&self) -> &Method {
+        &self.method
+    }
+
+    /// Index of the tracked state.
+    #[must_use]
+    pub fn tracked(&self) -> usize {
+        self.tracked
+    }
+
+    /// The name of the set point in the law: `r`, unless the model has a name like that.
+    #[must_use]
+    pub fn reference(&self) -> &str {
+        &self.reference
+    }
+
+    /// Sample time, s.
+    #[must_use]
+    pub fn dt(&self) -> f64 {
+        self.dt
+    }
+
+    /// Range of the command.
+    #[must_use]
+    pub fn limits(&self) -> (f64, f64) {
+        self.limits
+    }
+
+    /// The cost of LQR and HJB.
+    #[must_use]
+    pub fn weights(&self) -> &Weights {
+        &self.weights
+    }
+
+    /// K of u = u_e − K (x − x_e), which the law is near its design point, friction dropped.
+    #[must_use]
+    pub fn gains(&self) -> &[f64] {
+        &self.gains
+    }
+
+    /// The loop in the middle of the range.
+    #[must_use]
+    pub fn design_point(&self) -> &Check {
+        &self.design_point
+    }
+
+    /// The loop at each set point, in the order given.
+    #[must_use]
+    pub fn checks(&self) -> &[Check] {
+        &self.checks
+    }
+
+    /// The equilibrium as a function of the set point, with the errors of its fit.
+    #[must_use]
+    pub fn feed_forward(&self) -> &FeedForward {
+        &self.feed_forward
+    }
+
+    /// What the value function of an HJB law was found to do; its numbers are those of states counted in half widths
+    /// of the domain.
+    #[must_use]
+    pub fn verification(&self) -> Option<&Verification> {
+        self.verification.as_ref()
+    }
+
+    /// The command, within the limits, as an expression of the states, the set point ([`reference`](Self::reference))
+    /// and the plant's parameters.
+    #[must_use]
+    pub fn law(&self) -> &[Expr] {
+        &self.law
+    }
+
+    /// The command without limits.
+    #[must_use]
+    pub fn unlimited(&self) -> &Expr {
+        &self.unlimited
+    }
+
+    /// The command, within the limits, at a state (in the plant's order) for a set point. Not a number where the
+    /// state has another length, or where the law divides by zero: the caller must then do what is safe.
+    #[must_use]
+    pub fn command(&self, x: &[f64], r: f64) -> f64 {
+        if x.len() != self.plant.order() || !x.iter().all(|x| x.is_finite()) || !r.is_finite() {
+            return f64::NAN;
+        }
+        let mut at = x.to_vec();
+        at.push(r);
+        let mut u = [f64::NAN];
+        self.compiled.eval(&at, 0, &mut u);
+        // The comparisons of a limit would make a number of what is none.
+        if u[0].is_nan() { f64::NAN } else { u[0].max(self.limits.0).min(self.limits.1) }
+    }
+}
