@@ -87,7 +87,10 @@ pub struct DesignOptions {
     pub weights: Option<Weights>,
     /// Near which equilibrium to look for those of the set points; the origin where there is none.
     pub guess: Option<Equilibrium>,
-    /// Whether a sliding-mode law takes Coulomb friction, smoothed, out of the motion.
+    /// Whether a sliding-mode law takes Coulomb friction, smoothed, out of the motion. It must then be stable with the
+    /// steep slope of the smoothed friction at rest as well, which it is where the actuator's own joint rubs and
+    /// often is not where friction is coupled into other coordinates. Without this (the default) what friction leaves
+    /// is the error at which the law asks for less than the friction holds.
     pub compensate_friction: bool,
 }
 
@@ -102,7 +105,7 @@ impl DesignOptions {
             limit: None,
             weights: None,
             guess: None,
-            compensate_friction: true,
+            compensate_friction: false,
         }
     }
 }
@@ -174,7 +177,8 @@ pub struct Controller {
 pub fn design(plant: &Plant, method: &Method, options: &DesignOptions) -> Result<Controller, ControlError> {
     let n = plant.order();
     let tracked = plant.state(&options.tracked)?;
-    let option = |what: &str, value: f64, wanted| ControlError::Option { what: what.to_owned(), value, wanted };
+    let option =
+        |what: &str, value: f64, wanted| ControlError::Option { what: what.to_owned(), value, wanted };
     if !(options.dt > 0.0 && options.dt.is_finite()) {
         return Err(option("the sample time", options.dt, "a positive finite number of seconds"));
     }
@@ -193,7 +197,11 @@ pub fn design(plant: &Plant, method: &Method, options: &DesignOptions) -> Result
     }
     let weights = options.weights.clone().unwrap_or_else(|| Weights::bryson(plant));
     if weights.states.len() != n {
-        return Err(ControlError::Size { what: "the weights of the states", found: weights.states.len(), wanted: n });
+        return Err(ControlError::Size {
+            what: "the weights of the states",
+            found: weights.states.len(),
+            wanted: n,
+        });
     }
     let reference = free_name(plant);
     let least = options.set_points.iter().copied().fold(f64::INFINITY, f64::min);
@@ -259,7 +267,7 @@ pub fn design(plant: &Plant, method: &Method, options: &DesignOptions) -> Result
 /// `r`, or a name like it that the model does not use.
 fn free_name(plant: &Plant) -> String {
     let taken = |name: &str| {
-        name == plant.input()
+        name == plant.input_name()
             || plant.symbols().iter().any(|(n, _)| n == name)
             || plant.parameters().iter().any(|(n, _)| n == name)
             || plant.held().iter().any(|(n, _)| n == name)
@@ -349,7 +357,8 @@ impl Examined<'_> {
         if found < 1.0 {
             return Ok((poles, found));
         }
-        let shorter = (1..40).map(|k| self.dt * 0.8f64.powi(k)).find(|dt| radius(*dt).is_some_and(|r| r < 1.0));
+        let shorter =
+            (1..40).map(|k| self.dt * 0.8f64.powi(k)).find(|dt| radius(*dt).is_some_and(|r| r < 1.0));
         let longest = shorter.map_or(String::new(), |dt| format!(", {dt:.2e} s would do"));
         Err(ControlError::UnstableSampled { set_point, dt: self.dt, radius: found, longest })
     }

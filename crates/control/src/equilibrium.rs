@@ -107,7 +107,9 @@ pub fn equilibrium(
         }
         let newton = Newton::of(slope).map_err(|column| {
             let by = match column {
-                Some(j) if j == tracked => format!(" (the input `{}` does not act on it)", plant.input()),
+                Some(j) if j == tracked => {
+                    format!(" (the input `{}` does not act on it)", plant.input_name())
+                }
                 Some(j) => format!(" (that of `{}` is not)", names[j]),
                 None => String::new(),
             };
@@ -116,7 +118,9 @@ pub fn equilibrium(
         let step = newton.step(&here);
         let length = relative(&step, &unknowns);
         last = length;
-        let along = |share: f64| -> Vec<f64> { unknowns.iter().zip(step.iter()).map(|(y, s)| y + share * s).collect() };
+        let along = |share: f64| -> Vec<f64> {
+            unknowns.iter().zip(step.iter()).map(|(y, s)| y + share * s).collect()
+        };
         if length <= LAST_STEP {
             return Ok(at(&along(1.0)));
         }
@@ -181,5 +185,8 @@ impl Newton {
 /// The largest entry of a step, or relative to the unknown where that is larger.
 fn relative(step: &DVector<f64>, unknowns: &[f64]) -> f64 {
     // Not `f64::max`: a step that is not a number has no length.
-    step.iter().zip(unknowns).map(|(s, y)| s.abs() / y.abs().max(1.0)).fold(0.0, |m, l| if l > m || l.is_nan() { l } else { m })
+    step.iter()
+        .zip(unknowns)
+        .map(|(s, y)| s.abs() / y.abs().max(1.0))
+        .fold(0.0, |m, l| if l > m || l.is_nan() { l } else { m })
 }

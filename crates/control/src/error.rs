@@ -35,7 +35,9 @@ pub enum ControlError {
         known: String,
     },
     /// An equation uses a name that the model does not have, or a function with the wrong number of arguments.
-    #[error("equation \"{equation}\": `{expression}` has no meaning here: load the model from its text to see why")]
+    #[error(
+        "equation \"{equation}\": `{expression}` has no meaning here: load the model from its text to see why"
+    )]
     Meaningless {
         /// Name of the equation.
         equation: String,
@@ -43,7 +45,9 @@ pub enum ControlError {
         expression: String,
     },
     /// The control input is also held at a constant.
-    #[error("the input `{name}` cannot be the command and be held at a constant at once: take it from one of the two")]
+    #[error(
+        "the input `{name}` cannot be the command and be held at a constant at once: take it from one of the two"
+    )]
     TwoRoles {
         /// The input.
         name: String,
@@ -143,7 +147,9 @@ pub enum ControlError {
         wanted: &'static str,
     },
     /// The limits of the actuator leave no room.
-    #[error("the limits of the input, {low} and {high}, leave no room around zero: check the saturation's parameters")]
+    #[error(
+        "the limits of the input, {low} and {high}, leave no room around zero: check the saturation's parameters"
+    )]
     Limits {
         /// Lower one.
         low: f64,
@@ -161,7 +167,9 @@ pub enum ControlError {
         wanted: usize,
     },
     /// The equations are not finite where they must be.
-    #[error("the plant's equations are not finite at x = {state:?}: stay away from it, or mend the model there")]
+    #[error(
+        "the plant's equations are not finite at x = {state:?}: stay away from it, or mend the model there"
+    )]
     NotFinite {
         /// The state.
         state: Vec<f64>,
@@ -234,7 +242,9 @@ pub enum ControlError {
         source: SmcError,
     },
     /// More states than a sliding-mode law is made for.
-    #[error("a sliding-mode law is made for 1 to 8 states, and the plant has {states}: freeze some, or use LQR")]
+    #[error(
+        "a sliding-mode law is made for 1 to 8 states, and the plant has {states}: freeze some, or use LQR"
+    )]
     SmcStates {
         /// Number of states.
         states: usize,
@@ -266,7 +276,9 @@ pub enum ControlError {
         longest: String,
     },
     /// The eigenvalues were not found.
-    #[error("the poles at the set point {set_point} were not found: state sizes nearer to those of the motion")]
+    #[error(
+        "the poles at the set point {set_point} were not found: state sizes nearer to those of the motion"
+    )]
     NoPoles {
         /// Where.
         set_point: f64,
@@ -278,7 +290,9 @@ pub enum ControlError {
     #[error("the law uses an {0}: this is a fault of the program")]
     Name(#[from] UnknownName),
     /// The closed loop is to be simulated on a model that lacks a state of the law.
-    #[error("the simulated model lacks `{name}`, which the law needs: simulate the model that the law was made for")]
+    #[error(
+        "the simulated model lacks `{name}`, which the law needs: simulate the model that the law was made for"
+    )]
     Foreign {
         /// State or input.
         name: String,

@@ -50,7 +50,11 @@ impl FeedForward {
         let (low, high) = range;
         if !(low.is_finite() && high.is_finite() && low <= high) {
             let what = "the width of the range of set points".to_owned();
-            return Err(ControlError::Option { what, value: high - low, wanted: "a finite number, zero or more" });
+            return Err(ControlError::Option {
+                what,
+                value: high - low,
+                wanted: "a finite number, zero or more",
+            });
         }
         let n = plant.order();
         let r = Expr::var(reference);

@@ -100,9 +100,8 @@ impl Design<'_> {
             sum(basis.exponents().zip(optimal.feedback.weights()).filter(|(e, _)| e[i] > 0).map(|(e, w)| {
                 let factors = e.iter().enumerate().map(|(k, e)| if k == i { e - 1 } else { *e });
                 let monomial = scaled.iter().zip(factors).filter(|(_, e)| *e > 0);
-                let product = monomial.fold(Expr::Num(1.0), |product, (x, e)| {
-                    product * x.clone().pow(Expr::Num(f64::from(e)))
-                });
+                let product = monomial
+                    .fold(Expr::Num(1.0), |product, (x, e)| product * x.clone().pow(Expr::Num(f64::from(e))));
                 (w * f64::from(e[i]), product)
             }))
         };
@@ -131,8 +130,7 @@ impl Design<'_> {
         let along = |e: &[Expr]| sum(row.iter().copied().zip(e.iter().cloned()));
         let deviations: Vec<Expr> = (0..states).map(|i| self.deviation(i)).collect();
         let surface = along(&deviations);
-        let reaching =
-            Expr::Num(eta / phi) * Expr::call(Func::Saturate, vec![surface, Expr::Num(phi)]);
+        let reaching = Expr::Num(eta / phi) * Expr::call(Func::Saturate, vec![surface, Expr::Num(phi)]);
         let law = |f: &[Expr], g: &[Expr]| (-((along(f) + reaching.clone()) / along(g))).simplify();
         let (still_f, still_g) = self.plant.frictionless();
         let frictionless = law(still_f, still_g);
@@ -194,7 +192,9 @@ impl greybox_hjb::Plant for Shifted<'_> {
     }
 
     fn drift(&self, x: &[f64], f: &mut [f64]) {
-        for ((f, rate), w) in f.iter_mut().zip(self.plant.frictionless_rate(&self.state(x), self.at.input)).zip(self.widths) {
+        for ((f, rate), w) in
+            f.iter_mut().zip(self.plant.frictionless_rate(&self.state(x), self.at.input)).zip(self.widths)
+        {
             *f = rate / w;
         }
     }

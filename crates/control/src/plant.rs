@@ -154,7 +154,7 @@ impl Plant {
 
     /// The command's name.
     #[must_use]
-    pub fn input(&self) -> &str {
+    pub fn input_name(&self) -> &str {
         &self.input
     }
 
@@ -248,7 +248,6 @@ impl Plant {
         tangent(&self.frictionless, x, u)
     }
 
-
     pub(crate) fn frictionless_input(&self, x: &[f64], g: &mut [f64]) {
         self.frictionless.eval(x, self.order(), g);
     }
@@ -341,16 +340,17 @@ impl<'a> Builder<'a> {
                 all.extend((0..state.order).map(|p| (j, p as u8)));
             }
         }
-        let symbols: Vec<(String, u8)> = all.iter().map(|&(j, p)| (model.states[j].name.clone(), p)).collect();
+        let symbols: Vec<(String, u8)> =
+            all.iter().map(|&(j, p)| (model.states[j].name.clone(), p)).collect();
         positive("the size of the input", options.input_size)?;
         positive("the share of the velocity over which friction changes sign", options.smoothing)?;
         let names: Vec<String> = symbols.iter().map(|(n, p)| with_primes(n, *p)).collect();
         let mut sizes = vec![1.0; names.len()];
         for (name, size) in &options.sizes {
-            let at = names.iter().position(|n| n == name).ok_or_else(|| ControlError::UnknownState {
-                name: name.clone(),
-                known: listed(&names),
-            })?;
+            let at = names
+                .iter()
+                .position(|n| n == name)
+                .ok_or_else(|| ControlError::UnknownState { name: name.clone(), known: listed(&names) })?;
             positive(&format!("the size of `{name}`"), *size)?;
             sizes[at] = *size;
         }
@@ -460,7 +460,8 @@ impl<'a> Builder<'a> {
             if let Expr::Call(Func::Delay, _) = e
                 && wrong.is_none()
             {
-                wrong = Some(ControlError::Delay { equation: equation.to_owned(), expression: e.to_string() });
+                wrong =
+                    Some(ControlError::Delay { equation: equation.to_owned(), expression: e.to_string() });
             }
         });
         wrong.map_or(Ok(()), Err)
@@ -477,7 +478,8 @@ impl<'a> Builder<'a> {
                 kept = kept + term;
                 continue;
             }
-            let moving = term.mentions(self.input) || self.model.states.iter().any(|s| term.mentions(&s.name));
+            let moving =
+                term.mentions(self.input) || self.model.states.iter().any(|s| term.mentions(&s.name));
             let (equation, text) = (equation.to_owned(), term.to_string());
             match (self.options.ignore_time_terms, moving) {
                 (false, false) => return Err(ControlError::Time { equation, term: text }),
@@ -503,7 +505,8 @@ impl<'a> Builder<'a> {
     fn size(&self, v: &Expr) -> f64 {
         let origin = vec![0.0; self.symbols.len()];
         let slope = |(name, primes): &(String, u8)| self.value(&v.derivative(name, *primes), &origin);
-        let parts = self.symbols.iter().zip(&self.sizes).map(|(s, size)| slope(s).map_or(0.0, |d| d.abs() * size));
+        let parts =
+            self.symbols.iter().zip(&self.sizes).map(|(s, size)| slope(s).map_or(0.0, |d| d.abs() * size));
         let sum: f64 = parts.sum();
         if sum > 0.0 && sum.is_finite() { sum } else { 1.0 }
     }
@@ -512,15 +515,14 @@ impl<'a> Builder<'a> {
     fn explicit(&self, residuals: &[Expr]) -> Result<(Vec<Expr>, Vec<Expr>), ControlError> {
         let states = &self.model.states;
         let highest: Vec<(&str, u8)> = states.iter().map(|s| (s.name.as_str(), s.order as u8)).collect();
-        let unknowns = |which: &[usize]| listed(which.iter().map(|&j| with_primes(highest[j].0, highest[j].1)));
+        let unknowns =
+            |which: &[usize]| listed(which.iter().map(|&j| with_primes(highest[j].0, highest[j].1)));
         let (mut mass, mut rest) = (Vec::new(), Vec::new());
         for (equation, residual) in self.model.equations.iter().zip(residuals) {
-            let not_affine = |of, symbol: String| ControlError::NotAffine {
-                equation: equation.name.clone(),
-                of,
-                symbol,
-            };
-            let every = || not_affine("the highest derivatives", unknowns(&(0..states.len()).collect::<Vec<_>>()));
+            let not_affine =
+                |of, symbol: String| ControlError::NotAffine { equation: equation.name.clone(), of, symbol };
+            let every =
+                || not_affine("the highest derivatives", unknowns(&(0..states.len()).collect::<Vec<_>>()));
             let (row, other) = residual.affine_in(&highest).ok_or_else(every)?;
             let of_input = || not_affine("the input", format!("`{}`", self.input));
             if row.iter().any(|m| m.mentions(self.input)) {
@@ -583,7 +585,11 @@ impl<'a> Builder<'a> {
             return Some(" with all states zero");
         }
         let corner = |k: usize| -> Vec<f64> {
-            self.sizes.iter().enumerate().map(|(i, s)| if (k >> (i % 3)) & 1 == 1 { *s } else { -s }).collect()
+            self.sizes
+                .iter()
+                .enumerate()
+                .map(|(i, s)| if (k >> (i % 3)) & 1 == 1 { *s } else { -s })
+                .collect()
         };
         (0..8).any(|k| at(&corner(k))).then_some(" at states of the stated sizes")
     }

@@ -90,8 +90,10 @@ mod tests {
 
     #[test]
     fn terms_with_the_time_are_multiplied_out() {
-        let found: Vec<String> =
-            terms(&expr("k*(u + a*sin(t)) - (b + c*t)/m - k*(x - y)")).iter().map(|e| e.to_string()).collect();
+        let found: Vec<String> = terms(&expr("k*(u + a*sin(t)) - (b + c*t)/m - k*(x - y)"))
+            .iter()
+            .map(|e| e.to_string())
+            .collect();
         assert_eq!(found, ["k*u", "k*a*sin(t)", "-b/m", "-c*t/m", "-k*(x - y)"]);
     }
 
