@@ -29,7 +29,7 @@ impl Reference {
     /// `value` and −`value` in turn, each for `half_period` s, `count` set points in all.
     #[must_use]
     pub fn square(value: f64, half_period: f64, count: usize) -> Reference {
-        let at = |k: usize| (k as f64 * half_period, if k % 2 == 0 { value } else { -value });
+        let at = |k: usize| (k as f64 * half_period, if k.is_multiple_of(2) { value } else { -value });
         Reference { set_points: (0..count).map(at).collect(), duration: count as f64 * half_period }
     }
 

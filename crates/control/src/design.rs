@@ -12,6 +12,9 @@ use crate::feedforward::FeedForward;
 use crate::plant::Plant;
 use crate::{methods, stability};
 
+/// The share of the input's size within which a dead zone is compensated in part only.
+const NEAR_ZERO: f64 = 1e-2;
+
 /// How the law is found.
 #[derive(Debug, Clone, PartialEq)]
 pub enum Method {
@@ -85,6 +88,9 @@ pub struct DesignOptions {
     pub limit: Option<f64>,
     /// Cost of LQR and HJB; Bryson's rule where there is none.
     pub weights: Option<Weights>,
+    /// Whether the gains of an LQR follow the set point: a regulator for each equilibrium of the range, K(r) fitted
+    /// as the feed-forward is. Without this (the default) the gains are those of the middle.
+    pub scheduled: bool,
     /// Near which equilibrium to look for those of the set points; the origin where there is none.
     pub guess: Option<Equilibrium>,
     /// Whether a sliding-mode law takes Coulomb friction, smoothed, out of the motion. It must then be stable with the
@@ -104,6 +110,7 @@ impl DesignOptions {
             dt,
             limit: None,
             weights: None,
+            scheduled: false,
             guess: None,
             compensate_friction: false,
         }
@@ -220,14 +227,14 @@ pub fn design(plant: &Plant, method: &Method, options: &DesignOptions) -> Result
         feed_forward: &feed_forward,
     };
     let made = match method {
-        Method::Lqr => design.lqr()?,
+        Method::Lqr => design.lqr(options.scheduled)?,
         Method::Hjb { degree, domain } => design.hjb(*degree, domain)?,
         Method::Smc { lambda, eta, phi } => design.smc(*lambda, *eta, *phi, options.compensate_friction)?,
     };
     let mut variables = plant.symbols().to_vec();
     variables.push((reference.clone(), 0));
     let compile = |e: &Expr| Compiled::new(std::slice::from_ref(e), &variables, plant.parameters());
-    let limited = limited(&made.law, low, high);
+    let limited = limited(&made.law, plant, low, high);
     let examined = Examined {
         plant,
         names: &options.tracked,
@@ -279,9 +286,14 @@ fn free_name(plant: &Plant) -> String {
     name
 }
 
-/// The command within its limits.
-fn limited(law: &Expr, low: f64, high: f64) -> Expr {
+/// The command within its limits, with what a dead zone swallows added. Near zero, within δ = [`NEAR_ZERO`] of the
+/// input's size, the addition is linear: it never exceeds what is swallowed, and does not chatter.
+fn limited(law: &Expr, plant: &Plant, low: f64, high: f64) -> Expr {
     let mut u = law.clone();
+    if plant.dead_zone() > 0.0 {
+        let steep = Expr::Num(plant.dead_zone() / (NEAR_ZERO * plant.input_size())) * law.clone();
+        u = u + Expr::call(Func::Saturate, vec![steep, Expr::Num(plant.dead_zone())]);
+    }
     if low.is_infinite() && high.is_infinite() {
         return u;
     }
@@ -318,8 +330,10 @@ impl Examined<'_> {
 
     fn check(&self, set_point: f64, at: Equilibrium) -> Result<Check, ControlError> {
         let (low, high) = self.limits;
-        if !(low <= at.input && at.input <= high) {
-            let (tracked, input) = (self.names.to_owned(), at.input);
+        let swallowed = self.plant.dead_zone() * if at.input == 0.0 { 0.0 } else { at.input.signum() };
+        let input = at.input + swallowed;
+        if !(low <= input && input <= high) {
+            let tracked = self.names.to_owned();
             return Err(ControlError::Unholdable { tracked, value: set_point, input, low, high });
         }
         if let Some(law) = &self.smooth {
@@ -445,7 +459,7 @@ impl Controller {
         &self.law
     }
 
-    /// The command without limits.
+    /// The command without limits, behind the dead zone.
     #[must_use]
     pub fn unlimited(&self) -> &Expr {
         &self.unlimited

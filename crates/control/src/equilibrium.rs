@@ -169,7 +169,7 @@ impl Newton {
         }
         let svd = scaled.svd(false, true);
         let (small, large) = (svd.singular_values.min(), svd.singular_values.max());
-        if !(small > LEAST_CONDITION * large) {
+        if small.is_nan() || small <= LEAST_CONDITION * large {
             let row = svd.v_t.map(|v| v.row(svd.singular_values.imin()).transpose());
             return Err(row.map(|v| v.iamax()));
         }

@@ -27,6 +27,8 @@ pub struct FeedForward {
     pub state: Vec<Expr>,
     /// u_e(r).
     pub input: Expr,
+    /// The set point within the range.
+    pub held: Expr,
     /// Largest error of each x_e(r) on the grid, in the state's unit.
     pub state_error: Vec<f64>,
     /// Largest error of u_e(r) on the grid, in the input's unit.
@@ -76,27 +78,36 @@ impl FeedForward {
         } else {
             Expr::call(Func::Min, vec![Expr::call(Func::Max, vec![r, Expr::Num(low)]), Expr::Num(high)])
         };
-        let fit = |values: &[f64], size: f64| {
-            if intervals == 0 {
-                return (Expr::Num(values[0]), 0.0);
-            }
-            let shifted = (held.clone() - Expr::Num(0.5 * (low + high))).simplify();
-            let unit = shifted / Expr::Num(0.5 * (high - low));
-            curve(values, size, &unit)
+        let mut this = FeedForward {
+            range,
+            equilibria,
+            state: Vec::with_capacity(n),
+            input: Expr::Num(0.0),
+            held,
+            state_error: Vec::with_capacity(n),
+            input_error: 0.0,
         };
-        let (mut state, mut state_error) = (Vec::new(), Vec::new());
         for i in 0..n {
-            let (e, error) = if i == tracked {
-                (held.clone(), 0.0)
-            } else {
-                fit(&equilibria.iter().map(|e| e.state[i]).collect::<Vec<_>>(), plant.sizes()[i])
-            };
-            state.push(e);
-            state_error.push(error);
+            let values: Vec<f64> = this.equilibria.iter().map(|e| e.state[i]).collect();
+            let tracks = i == tracked;
+            let (e, error) =
+                if tracks { (this.held.clone(), 0.0) } else { this.curve(&values, plant.sizes()[i]) };
+            this.state.push(e);
+            this.state_error.push(error);
         }
-        let (input, input_error) =
-            fit(&equilibria.iter().map(|e| e.input).collect::<Vec<_>>(), plant.input_size());
-        Ok(FeedForward { range, equilibria, state, input, state_error, input_error })
+        let values: Vec<f64> = this.equilibria.iter().map(|e| e.input).collect();
+        (this.input, this.input_error) = this.curve(&values, plant.input_size());
+        Ok(this)
+    }
+
+    /// An expression of the set point through values at the equilibria, and its largest error.
+    pub(crate) fn curve(&self, values: &[f64], size: f64) -> (Expr, f64) {
+        let (low, high) = self.range;
+        if values.len() < 2 {
+            return (Expr::Num(values.first().copied().unwrap_or(0.0)), 0.0);
+        }
+        let shifted = (self.held.clone() - Expr::Num(0.5 * (low + high))).simplify();
+        curve(values, size, &(shifted / Expr::Num(0.5 * (high - low))))
     }
 }
 

@@ -1,5 +1,6 @@
 #![doc = include_str!("../README.md")]
 
+mod builder;
 pub mod closed_loop;
 mod compiled;
 pub mod design;

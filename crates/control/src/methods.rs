@@ -51,19 +51,41 @@ impl Design<'_> {
         (self.state(i) - self.feed_forward.state[i].clone()).simplify()
     }
 
-    /// u = u_e(r) − K (x − x_e(r)), computed in states and input counted in their sizes.
-    pub(crate) fn lqr(&self) -> Result<Made, ControlError> {
+    /// u = u_e(r) − K (x − x_e(r)), K constant or a function of r.
+    pub(crate) fn lqr(&self, scheduled: bool) -> Result<Made, ControlError> {
+        let (n, sizes) = (self.plant.order(), self.plant.sizes());
+        let gains: Vec<Expr> = if scheduled {
+            let (low, high) = self.feed_forward.range;
+            let points = &self.feed_forward.equilibria;
+            let all = points.iter().enumerate().map(|(k, at)| {
+                let share = k as f64 / (points.len() - 1).max(1) as f64;
+                let tangent = self.plant.frictionless_tangent(&at.state, at.input);
+                self.regulator(&tangent, low + (high - low) * share)
+            });
+            let all = all.collect::<Result<Vec<_>, _>>()?;
+            let gain = |i: usize| all.iter().map(|k| k[i]).collect::<Vec<f64>>();
+            // A gain is counted in input's size per state's size.
+            let size = |i: usize| self.plant.input_size() / sizes[i];
+            (0..n).map(|i| self.feed_forward.curve(&gain(i), size(i)).0).collect()
+        } else {
+            self.regulator(&self.tangent, self.set_point)?.into_iter().map(Expr::Num).collect()
+        };
+        let parts =
+            gains.into_iter().enumerate().map(|(i, gain)| (1.0, (gain * self.deviation(i)).simplify()));
+        let law = (self.feed_forward.input.clone() - sum(parts)).simplify();
+        Ok(Made { frictionless: law.clone(), law, verification: None })
+    }
+
+    /// K, computed in states and input counted in their sizes.
+    fn regulator(&self, tangent: &Linear, set_point: f64) -> Result<Vec<f64>, ControlError> {
         let (n, sizes, unit) = (self.plant.order(), self.plant.sizes(), self.plant.input_size());
-        let Linear { a, b } = &self.tangent;
+        let Linear { a, b } = tangent;
         let a = DMatrix::from_fn(n, n, |i, j| a[(i, j)] / sizes[i] * sizes[j]);
         let b = DMatrix::from_fn(n, 1, |i, _| b[i] / sizes[i] * unit);
         let (q, r) = self.cost(sizes, unit);
-        let wrap = |source| ControlError::Linear { set_point: self.set_point, source };
+        let wrap = |source| ControlError::Linear { set_point, source };
         let regulator = greybox_hjb::lqr(&a, &b, &q, &r).map_err(wrap)?;
-        let gain = |i: usize| regulator.gain[(0, i)] * unit / sizes[i];
-        let feedback = sum((0..n).map(|i| (gain(i), self.deviation(i))));
-        let law = (self.feed_forward.input.clone() - feedback).simplify();
-        Ok(Made { frictionless: law.clone(), law, verification: None })
+        Ok((0..n).map(|i| regulator.gain[(0, i)] * unit / sizes[i]).collect())
     }
 
     /// Q and R for states and input counted in sizes.

@@ -44,7 +44,7 @@ pub(crate) fn metrics(run: &Run, reference: &Reference, dt: f64) -> Vec<Metrics>
         let (y, u) = (&y[first..=last], &run.u[first..last]);
         let step = r - y[0];
         let band = BAND * step.abs();
-        let outside = y.iter().rposition(|y| !((y - r).abs() <= band));
+        let outside = y.iter().rposition(|y| y.is_nan() || (y - r).abs() > band);
         let cut = run.diverged.is_some() && last + 1 == run.t.len();
         let settling = match outside {
             _ if cut => None,

@@ -39,23 +39,37 @@ pub(crate) fn without_signs(e: &Expr, by: &dyn Fn(&Expr) -> Expr) -> Expr {
     })
 }
 
-/// Limits of an input.
-pub(crate) type Limits = (f64, f64);
+/// What an actuator makes of the input.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub(crate) struct Range {
+    /// Lower and upper limit.
+    pub(crate) limits: (f64, f64),
+    /// Half width of the dead zone.
+    pub(crate) dead_zone: Option<f64>,
+}
 
-/// Takes `saturate`, `min` and `max` off the input: what they leave of it is its range. `None` for one whose bounds
-/// are not constant, which stays.
+impl Default for Range {
+    fn default() -> Self {
+        Self { limits: (f64::NEG_INFINITY, f64::INFINITY), dead_zone: None }
+    }
+}
+
+/// Takes `saturate`, `min`, `max` and `deadzone` off the input: what they leave of it is its range. One whose bounds
+/// are not constant stays, and so does a dead zone that is not around zero, or not the same everywhere.
 pub(crate) fn without_limits(
     e: &Expr,
     input: &str,
     value: &dyn Fn(&Expr) -> Option<f64>,
-    limits: &mut Limits,
+    range: &mut Range,
 ) -> Expr {
     e.map(&mut |e| {
-        let Expr::Call(f @ (Func::Saturate | Func::Min | Func::Max), args) = &e else { return e };
+        let Expr::Call(f @ (Func::Saturate | Func::Min | Func::Max | Func::Deadzone), args) = &e else {
+            return e;
+        };
         let [a, b] = args.as_slice() else { return e };
         let (inner, bound) = match (a.mentions(input), b.mentions(input)) {
             (true, false) => (a, b),
-            (false, true) if *f != Func::Saturate => (b, a),
+            (false, true) if matches!(f, Func::Min | Func::Max) => (b, a),
             _ => return e,
         };
         let Some((slope, rest)) = inner.affine_in(&[(input, 0)]) else { return e };
@@ -64,6 +78,15 @@ pub(crate) fn without_limits(
         };
         if !(slope != 0.0 && slope.is_finite() && rest.is_finite() && bound.is_finite()) {
             return e;
+        }
+        if *f == Func::Deadzone {
+            let gap = bound / slope.abs();
+            let same = range.dead_zone.is_none_or(|g| (g - gap).abs() <= 1e-12 * gap);
+            if rest != 0.0 || gap < 0.0 || !same {
+                return e;
+            }
+            range.dead_zone = Some(gap);
+            return inner.clone();
         }
         let at = |bound: f64| (bound - rest) / slope;
         let (mut low, mut high) = (f64::NEG_INFINITY, f64::INFINITY);
@@ -74,7 +97,9 @@ pub(crate) fn without_limits(
             _ if slope > 0.0 => low = at(bound),
             _ => high = at(bound),
         }
-        *limits = (limits.0.max(low), limits.1.min(high));
+        // Behind a dead zone: the input may be larger by what that swallows.
+        let gap = range.dead_zone.unwrap_or(0.0);
+        range.limits = (range.limits.0.max(low - gap), range.limits.1.min(high + gap));
         inner.clone()
     })
 }
@@ -100,12 +125,15 @@ mod tests {
     #[test]
     fn limits_are_told_in_the_input() {
         let value = |e: &Expr| e.eval(&|name, _| (name == "lim").then_some(6.0));
-        let mut limits = (f64::NEG_INFINITY, f64::INFINITY);
-        let free = without_limits(&expr("k*saturate(2*u - 1, lim)"), "u", &value, &mut limits);
-        assert_eq!((free, limits), (expr("k*(2*u - 1)"), (-2.5, 3.5)));
-        let free = without_limits(&expr("min(max(-u, -3), 2)"), "u", &value, &mut limits);
-        assert_eq!((free, limits), (expr("-u"), (-2.0, 3.0)));
-        let stays = expr("saturate(u, x)");
-        assert_eq!(without_limits(&stays, "u", &value, &mut limits), stays);
+        let mut range = Range::default();
+        let free = without_limits(&expr("k*saturate(2*u - 1, lim)"), "u", &value, &mut range);
+        assert_eq!((free, range.limits), (expr("k*(2*u - 1)"), (-2.5, 3.5)));
+        let free = without_limits(&expr("min(max(-u, -3), 2)"), "u", &value, &mut range);
+        assert_eq!((free, range.limits), (expr("-u"), (-2.0, 3.0)));
+        let free = without_limits(&expr("deadzone(-2*u, lim/12)"), "u", &value, &mut range);
+        assert_eq!((free, range.dead_zone), (expr("-2*u"), Some(0.25)));
+        for stays in ["saturate(u, x)", "deadzone(u, 0.3)", "deadzone(u - 1, 0.25)"] {
+            assert_eq!(without_limits(&expr(stays), "u", &value, &mut range), expr(stays));
+        }
     }
 }

@@ -91,9 +91,12 @@ fn models_without_a_control_affine_form_are_refused() {
     said(&error, &["2*sin(3*t)", "ignore_time_terms"]);
     let error = mass("m*x'' + k*(1 + 0.1*t)*x = u").unwrap_err();
     assert!(matches!(error, ControlError::Drift { .. }));
-    for equation in
-        ["m*x'' + k*x = u^2", "m*x'' + k*x = deadzone(u, 0.1)", "m*(1 + u)*x'' = u", "m*x'' = saturate(u, x)"]
-    {
+    for equation in [
+        "m*x'' + k*x = u^2",
+        "m*x'' + k*x = deadzone(u + 1, 0.1)",
+        "m*(1 + u)*x'' = u",
+        "m*x'' = saturate(u, x)",
+    ] {
         let error = mass(equation).unwrap_err();
         assert!(matches!(error, ControlError::NotAffine { of: "the input", .. }), "{equation}: {error}");
     }

@@ -50,6 +50,44 @@ fn a_pendulum_is_held_anywhere() {
 }
 
 #[test]
+fn scheduled_gains_reach_far_set_points_as_fast() {
+    let model = load(PENDULUM);
+    let plant = Plant::of(&model, "tau", &sized(&[("theta", 1.0), ("theta'", 10.0)], 1.0)).unwrap();
+    let wanted = DesignOptions::new("theta", &[-2.5, 0.0, 2.5], 2e-3);
+    let law =
+        |scheduled| design(&plant, &Method::Lqr, &DesignOptions { scheduled, ..wanted.clone() }).unwrap();
+    let (constant, scheduled) = (law(false), law(true));
+    let slowest = |c: &greybox_control::Check| c.poles[0].re;
+    // At the middle they are one.
+    for (a, b) in constant.gains().iter().zip(scheduled.gains()) {
+        assert!((a - b).abs() < 1e-3 * a, "{a} {b}");
+    }
+    assert!(slowest(&constant.checks()[2]) > -2.5 && slowest(&scheduled.checks()[2]) < -3.5);
+    let run =
+        ClosedLoop::new(&model, &scheduled, &LoopOptions::default()).unwrap().run(&Reference::step(2.5, 4.0));
+    let m = run.unwrap().metrics[0];
+    assert!(m.final_error.abs() < 2e-4 && m.settling.is_some_and(|t| t < 1.5), "{m:?}");
+}
+
+#[test]
+fn a_dead_zone_of_the_input_is_made_up_for() {
+    let text = PENDULUM
+        .replace("saturate(tau, lim)", "saturate(deadzone(tau, gap), lim)")
+        .replace("[equations]", "gap = { value = 0.2, unit = \"N m\" }\n[equations]");
+    let model = load(&text);
+    let plant = Plant::of(&model, "tau", &sized(&[("theta", 1.0), ("theta'", 10.0)], 1.0)).unwrap();
+    assert_eq!(plant.dead_zone(), 0.2);
+    for method in [Method::Lqr, Method::Smc { lambda: 10.0, eta: 4.0, phi: 0.2 }] {
+        let law = design(&plant, &method, &DesignOptions::new("theta", &[-0.5, 0.5], 2e-3)).unwrap();
+        let run = ClosedLoop::new(&model, &law, &LoopOptions::default()).unwrap();
+        let run = run.run(&Reference::square(0.5, 3.0, 3)).unwrap();
+        for m in &run.metrics {
+            assert!(m.final_error.abs() < 1e-3 && m.settling.is_some(), "{}: {m:?}", method.name());
+        }
+    }
+}
+
+#[test]
 fn a_cart_with_coulomb_friction_sticks_where_the_law_is_weaker() {
     let model = load(CART);
     let plant = Plant::of(&model, "u", &sized(&[("x", 0.5), ("x'", 1.0)], 20.0)).unwrap();

@@ -34,7 +34,8 @@ kt  = { value = 0.00768, unit = "N m/A" }
 km  = { value = 0.00768, unit = "V s/rad" }
 Rm  = { value = 2.6, unit = "ohm" }
 [equations]
-hub  = "Jeq*theta'' + Beq*theta' - ks*alpha + kc*(theta - alpha) + fc*sign(theta') + mc*alpha'' + kst*max(theta - xst, 0) = eta*Kg*kt/Rm*(v - Kg*km*theta')"
+hub  = """Jeq*theta'' + Beq*theta' - ks*alpha + kc*(theta - alpha) + fc*sign(theta') + mc*alpha'' + kst*max(theta - xst, 0) \
+          = eta*Kg*kt/Rm*(v - Kg*km*theta')"""
 link = "Jl*(theta'' + alpha'') + Bl*alpha' + ks*alpha + kc*(alpha - theta) + mc*theta'' = 0"
 "#;
 
@@ -141,6 +142,8 @@ fn the_demo_is_controlled_by_every_method() {
     let plant = Plant::of(&model, "v", &options).unwrap();
     let mut wanted = DesignOptions::new("theta", &[-0.3, 0.3], 2e-3);
     wanted.limit = Some(10.0);
+    // Here the friction is the motor's own: compensating it is stable.
+    wanted.compensate_friction = true;
     for method in [
         Method::Lqr,
         Method::Hjb { degree: 4, domain: vec![0.7, 10.0, 0.4, 10.0] },
