@@ -3,7 +3,7 @@
 use greybox_model::{Hold, Model, System};
 use greybox_simulate::{Carry, Environment, Method as Integration, Seeds, Signal, Simulation};
 
-use crate::design::Controller;
+use crate::controller::Controller;
 use crate::error::{ControlError, listed};
 use crate::metrics::{Metrics, metrics};
 

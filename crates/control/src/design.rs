@@ -1,16 +1,15 @@
 //! From a plant to a controller that was checked.
 
-use greybox_hjb::{Linear, Verification};
 use greybox_model::{Expr, Func};
-use greybox_smc::check::Pole;
-use nalgebra::DMatrix;
 
+use crate::check::Examined;
 use crate::compiled::Compiled;
+use crate::controller::Controller;
 use crate::equilibrium::{Equilibrium, equilibrium};
 use crate::error::ControlError;
 use crate::feedforward::FeedForward;
+use crate::methods;
 use crate::plant::Plant;
-use crate::{methods, stability};
 
 /// The share of the input's size within which a dead zone is compensated in part only.
 const NEAR_ZERO: f64 = 1e-2;
@@ -21,7 +20,7 @@ pub enum Method {
     /// The linear-quadratic regulator of the tangent at the design point, u = u_e(r) − K (x − x_e(r)).
     Lqr,
     /// The optimal law of a value function of this degree, fitted over a box around the design point
-    /// ([`greybox_hjb::design`]): u = u_e(r) − ½ R⁻¹ g(x)ᵀ ∇V(x − x_e(r)).
+    /// ([`greybox_hjb::design()`]): u = u_e(r) − ½ R⁻¹ g(x)ᵀ ∇V(x − x_e(r)).
     Hjb {
         /// Highest degree of the value function; 2 is the linear regulator.
         degree: u8,
@@ -115,39 +114,6 @@ impl DesignOptions {
             compensate_friction: false,
         }
     }
-}
-
-/// The loop's tangent at a set point.
-#[derive(Debug, Clone, PartialEq)]
-pub struct Check {
-    /// The set point.
-    pub set_point: f64,
-    /// Where the plant rests there.
-    pub equilibrium: Equilibrium,
-    /// Poles of the continuous loop, 1/s, the rightmost first; friction dropped.
-    pub poles: Vec<Pole>,
-    /// Largest magnitude of a pole in z of the loop with the command held.
-    pub spectral_radius: f64,
-}
-
-/// A law that was checked.
-#[derive(Debug, Clone)]
-pub struct Controller {
-    plant: Plant,
-    method: Method,
-    tracked: usize,
-    reference: String,
-    dt: f64,
-    limits: (f64, f64),
-    weights: Weights,
-    design_point: Check,
-    checks: Vec<Check>,
-    gains: Vec<f64>,
-    feed_forward: FeedForward,
-    verification: Option<Verification>,
-    unlimited: Expr,
-    law: Vec<Expr>,
-    compiled: Compiled,
 }
 
 /// Designs a controller and checks it.
@@ -307,176 +273,4 @@ fn limited(law: &Expr, plant: &Plant, low: f64, high: f64) -> Expr {
         u = Expr::call(Func::Min, vec![u, Expr::Num(high)]);
     }
     u
-}
-
-/// A law under examination.
-struct Examined<'a> {
-    plant: &'a Plant,
-    names: &'a str,
-    dt: f64,
-    limits: (f64, f64),
-    frictionless: Compiled,
-    /// The law with its compensation of friction, where it has one.
-    smooth: Option<Compiled>,
-}
-
-impl Examined<'_> {
-    /// ∂u/∂x, one row.
-    fn gain(&self, law: &Compiled, x: &[f64], r: f64) -> DMatrix<f64> {
-        let mut at = x.to_vec();
-        at.push(r);
-        law.jacobian(&at).columns(0, x.len()).into_owned()
-    }
-
-    fn check(&self, set_point: f64, at: Equilibrium) -> Result<Check, ControlError> {
-        let (low, high) = self.limits;
-        let swallowed = self.plant.dead_zone() * if at.input == 0.0 { 0.0 } else { at.input.signum() };
-        let input = at.input + swallowed;
-        if !(low <= input && input <= high) {
-            let tracked = self.names.to_owned();
-            return Err(ControlError::Unholdable { tracked, value: set_point, input, low, high });
-        }
-        if let Some(law) = &self.smooth {
-            let plant = self.plant.tangent(&at.state, at.input);
-            self.stable(&plant, &self.gain(law, &at.state, set_point), set_point)?;
-        }
-        let plant = self.plant.frictionless_tangent(&at.state, at.input);
-        let gain = self.gain(&self.frictionless, &at.state, set_point);
-        let (poles, spectral_radius) = self.stable(&plant, &gain, set_point)?;
-        Ok(Check { set_point, equilibrium: at, poles, spectral_radius })
-    }
-
-    /// The poles and the largest magnitude in z, if stable.
-    fn stable(
-        &self,
-        plant: &Linear,
-        gain: &DMatrix<f64>,
-        set_point: f64,
-    ) -> Result<(Vec<Pole>, f64), ControlError> {
-        let sizes = self.plant.sizes();
-        let none = || ControlError::NoPoles { set_point };
-        let poles = stability::poles(&stability::closed(plant, gain), sizes).ok_or_else(none)?;
-        let size = poles.iter().fold(0.0f64, |size, p| size.max(p.magnitude()));
-        // A pole at zero is found anywhere within the rounding errors of the largest one.
-        let rounding = 16.0 * poles.len() as f64 * f64::EPSILON * size;
-        if let Some(&pole) = poles.first().filter(|p| p.re.is_nan() || p.re >= -rounding) {
-            return Err(ControlError::Unstable { set_point, pole });
-        }
-        let radius = |dt: f64| {
-            let held = stability::held(plant, dt, sizes, self.plant.input_size())?;
-            let poles = stability::poles(&stability::closed(&held, gain), sizes)?;
-            Some(poles.iter().fold(0.0f64, |radius, p| radius.max(p.magnitude())))
-        };
-        let found = radius(self.dt).ok_or_else(none)?;
-        if found < 1.0 {
-            return Ok((poles, found));
-        }
-        let shorter =
-            (1..40).map(|k| self.dt * 0.8f64.powi(k)).find(|dt| radius(*dt).is_some_and(|r| r < 1.0));
-        let longest = shorter.map_or(String::new(), |dt| format!(", {dt:.2e} s would do"));
-        Err(ControlError::UnstableSampled { set_point, dt: self.dt, radius: found, longest })
-    }
-}
-
-impl Controller {
-    /// The plant it was designed for.
-    #[must_use]
-    pub fn plant(&self) -> &Plant {
-        &self.plant
-    }
-
-    /// How it was found.
-    #[must_use]
-    pub fn method(&self) -> &Method {
-        &self.method
-    }
-
-    /// Index of the tracked state.
-    #[must_use]
-    pub fn tracked(&self) -> usize {
-        self.tracked
-    }
-
-    /// The name of the set point in the law: `r`, unless the model has a name like that.
-    #[must_use]
-    pub fn reference(&self) -> &str {
-        &self.reference
-    }
-
-    /// Sample time, s.
-    #[must_use]
-    pub fn dt(&self) -> f64 {
-        self.dt
-    }
-
-    /// Range of the command.
-    #[must_use]
-    pub fn limits(&self) -> (f64, f64) {
-        self.limits
-    }
-
-    /// The cost of LQR and HJB.
-    #[must_use]
-    pub fn weights(&self) -> &Weights {
-        &self.weights
-    }
-
-    /// K of u = u_e − K (x − x_e), which the law is near its design point, friction dropped.
-    #[must_use]
-    pub fn gains(&self) -> &[f64] {
-        &self.gains
-    }
-
-    /// The loop in the middle of the range.
-    #[must_use]
-    pub fn design_point(&self) -> &Check {
-        &self.design_point
-    }
-
-    /// The loop at each set point, in the order given.
-    #[must_use]
-    pub fn checks(&self) -> &[Check] {
-        &self.checks
-    }
-
-    /// The equilibrium as a function of the set point, with the errors of its fit.
-    #[must_use]
-    pub fn feed_forward(&self) -> &FeedForward {
-        &self.feed_forward
-    }
-
-    /// What the value function of an HJB law was found to do; its numbers are those of states counted in half widths
-    /// of the domain.
-    #[must_use]
-    pub fn verification(&self) -> Option<&Verification> {
-        self.verification.as_ref()
-    }
-
-    /// The command, within the limits, as an expression of the states, the set point ([`reference`](Self::reference))
-    /// and the plant's parameters.
-    #[must_use]
-    pub fn law(&self) -> &[Expr] {
-        &self.law
-    }
-
-    /// The command without limits, behind the dead zone.
-    #[must_use]
-    pub fn unlimited(&self) -> &Expr {
-        &self.unlimited
-    }
-
-    /// The command, within the limits, at a state (in the plant's order) for a set point. Not a number where the
-    /// state has another length, or where the law divides by zero: the caller must then do what is safe.
-    #[must_use]
-    pub fn command(&self, x: &[f64], r: f64) -> f64 {
-        if x.len() != self.plant.order() || !x.iter().all(|x| x.is_finite()) || !r.is_finite() {
-            return f64::NAN;
-        }
-        let mut at = x.to_vec();
-        at.push(r);
-        let mut u = [f64::NAN];
-        self.compiled.eval(&at, 0, &mut u);
-        // The comparisons of a limit would make a number of what is none.
-        if u[0].is_nan() { f64::NAN } else { u[0].max(self.limits.0).min(self.limits.1) }
-    }
 }

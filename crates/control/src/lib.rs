@@ -1,9 +1,11 @@
 #![doc = include_str!("../README.md")]
 
 mod builder;
+mod check;
 pub mod closed_loop;
 mod compiled;
-pub mod design;
+mod controller;
+mod design;
 mod equilibrium;
 mod error;
 mod explicit;
@@ -15,8 +17,10 @@ pub mod plant;
 mod stability;
 mod terms;
 
+pub use check::Check;
 pub use closed_loop::{ClosedLoop, Feedback, LoopOptions, Reference, Run};
-pub use design::{Check, Controller, DesignOptions, Method, Weights, design};
+pub use controller::Controller;
+pub use design::{DesignOptions, Method, Weights, design};
 pub use equilibrium::{Equilibrium, equilibrium};
 pub use error::ControlError;
 pub use family::{Family, FamilyOptions, Spread};

@@ -259,3 +259,82 @@ fn units_play_no_part() {
         }
     }
 }
+
+/// A pole balanced on a cart, angle from upright.
+const CART_POLE: &str = r#"
+[inputs]
+u = { unit = "N" }
+[states]
+x = { unit = "m" }
+th = { unit = "rad" }
+[parameters]
+M = { value = 1.0, unit = "kg" }
+m = { value = 0.2, unit = "kg" }
+l = { value = 0.5, unit = "m" }
+g = { value = 9.81, unit = "m/s^2" }
+b = { value = 0.1, unit = "N s/m" }
+[equations]
+cart = "(M + m)*x'' + m*l*cos(th)*th'' - m*l*sin(th)*th'^2 + b*x' = u"
+pole = "cos(th)*x'' + l*th'' - g*sin(th) = 0"
+"#;
+
+#[test]
+fn a_pole_is_balanced_while_the_cart_moves() {
+    let model = load(CART_POLE);
+    let sizes = [("x", 0.3), ("x'", 1.0), ("th", 0.2), ("th'", 1.0)];
+    let plant = Plant::of(&model, "u", &sized(&sizes, 10.0)).unwrap();
+    let mut wanted = DesignOptions::new("x", &[-0.3, 0.3], 5e-3);
+    wanted.limit = Some(20.0);
+    for method in [
+        Method::Lqr,
+        Method::Hjb { degree: 4, domain: vec![1.0, 3.0, 0.6, 3.0] },
+        Method::Smc { lambda: 2.5, eta: 40.0, phi: 4.0 },
+    ] {
+        let law = design(&plant, &method, &wanted).unwrap();
+        let looped = ClosedLoop::new(&model, &law, &LoopOptions::default()).unwrap();
+        let run = looped.run(&Reference::square(0.3, 8.0, 3)).unwrap();
+        for m in &run.metrics {
+            println!("{} {m:?}", method.name());
+            assert!(m.final_error.abs() < 2e-3 && m.settling.is_some(), "{}: {m:?}", method.name());
+        }
+        let deviations = vec![("m".into(), 0.04), ("l".into(), 0.05), ("b".into(), 0.05)];
+        let family = FamilyOptions { deviations, members: 16, seed: 3 };
+        let family = looped.family(&Reference::square(0.3, 8.0, 2), &family).unwrap();
+        println!("{} {family:?}", method.name());
+        assert_eq!((family.diverged, family.settled), (0, 16));
+    }
+}
+
+#[test]
+fn a_law_without_the_memory_of_friction_runs_on_the_model_with_it() {
+    // Dahl's friction (a spring of 400 N/m that yields at 1.5 N).
+    let text = CART
+        .replace("fc*sign(x') = u", "s*z = u\"\nmemory = \"z' = x' - s/fc*abs(x')*z")
+        .replace("x = { unit = \"m\" }", "x = { unit = \"m\" }\nz = { unit = \"m\", measured = false }")
+        .replace("[equations]", "s = { value = 400.0, unit = \"N/m\" }\n[equations]");
+    let model = load(&text);
+    let mut options = sized(&[("x", 0.5), ("x'", 1.0)], 20.0);
+    options.frozen = vec![("z".into(), 0.0)];
+    let plant = Plant::of(&model, "u", &options).unwrap();
+    for method in [Method::Lqr, Method::Smc { lambda: 8.0, eta: 20.0, phi: 2.0 }] {
+        let law = design(&plant, &method, &DesignOptions::new("x", &[0.0, 1.0], 5e-3)).unwrap();
+        let looped = ClosedLoop::new(&model, &law, &LoopOptions::default()).unwrap();
+        let run = looped.run(&Reference::step(1.0, 6.0)).unwrap();
+        assert_eq!(run.states, ["x", "x'", "z"]);
+        assert!(run.metrics[0].final_error.abs() < 1.01 * 1.5 / law.gains()[0], "{:?}", run.metrics);
+        let differences = LoopOptions { feedback: Feedback::Differences, ..LoopOptions::default() };
+        let run =
+            ClosedLoop::new(&model, &law, &differences).unwrap().run(&Reference::step(1.0, 6.0)).unwrap();
+        assert!(run.metrics[0].final_error.abs() < 1.01 * 1.5 / law.gains()[0], "{:?}", run.metrics);
+    }
+    // With it in the law, what is not measured is missed.
+    let lag = load(
+        "[inputs]\nu = {}\n[states]\nx = {}\ny = { measured = false }\n[parameters]\nk = { value = 3.0 }\n\
+                    [equations]\none = \"x' + k*x = y\"\ntwo = \"y' + k*y = u\"\n",
+    );
+    let plant = Plant::of(&lag, "u", &PlantOptions::default()).unwrap();
+    let law = design(&plant, &Method::Lqr, &DesignOptions::new("x", &[0.0], 5e-3)).unwrap();
+    let differences = LoopOptions { feedback: Feedback::Differences, ..LoopOptions::default() };
+    let error = ClosedLoop::new(&lag, &law, &differences).unwrap_err();
+    assert!(matches!(&error, ControlError::Unmeasured { name } if name == "y"), "{error}");
+}
