@@ -57,7 +57,7 @@ pub struct Family {
 
 impl ClosedLoop<'_> {
     /// Runs the law, made for the model's own parameters, on plants with other ones. A parameter keeps its sign: a
-    /// draw beyond zero is drawn again.
+    /// draw beyond zero is drawn again. An example stands on the [crate's page](crate).
     ///
     /// # Errors
     /// [`ControlError::UnknownParameter`], [`ControlError::Option`].

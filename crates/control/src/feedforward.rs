@@ -17,6 +17,26 @@ const GOOD: f64 = 1e-7;
 const POOR: f64 = 1e-5;
 
 /// x_e(r) and u_e(r) over a range of set points.
+///
+/// ```
+/// use greybox_control::{Equilibrium, FeedForward, Plant, PlantOptions};
+/// # let model = greybox_model::Model::from_toml(r#"
+/// # [inputs]
+/// # tau = { unit = "N m" }
+/// # [states]
+/// # theta = { unit = "rad" }
+/// # [parameters]
+/// # J = { value = 0.02, unit = "kg m^2" }
+/// # mgl = { value = 0.5, unit = "N m" }
+/// # [equations]
+/// # arm = "J*theta'' + mgl*sin(theta) = tau"
+/// # "#, "pendulum.toml")?;
+/// let plant = Plant::of(&model, "tau", &PlantOptions::default())?;
+/// let held = FeedForward::new(&plant, 0, (-1.0, 1.0), &Equilibrium::origin(2), "r")?;
+/// let torque = held.input.eval(&|name, _| (name == "r").then_some(0.7)).ok_or("a name is missing")?;
+/// assert!((torque - 0.5 * 0.7f64.sin()).abs() < 1e-7 && held.input_error < 1e-7);
+/// # Ok::<(), Box<dyn std::error::Error>>(())
+/// ```
 #[derive(Debug, Clone, PartialEq)]
 pub struct FeedForward {
     /// The range; outside of it the set point is taken to be the nearer end.

@@ -206,3 +206,47 @@ fn equilibria_that_are_none_are_refused() {
     assert!(law.command(&[0.5, 0.0], 0.5).abs() < 1e-9);
     assert!(law.command(&[0.5], 0.5).is_nan() && law.command(&[f64::NAN, 0.0], 0.5).is_nan());
 }
+
+#[test]
+fn extreme_numbers_are_refused_and_never_panic() {
+    let extremes =
+        [0.0, -0.0, f64::NAN, f64::INFINITY, f64::NEG_INFINITY, 1e300, -1e300, 1e-300, f64::MIN_POSITIVE];
+    let methods = [
+        Method::Lqr,
+        Method::Hjb { degree: 3, domain: vec![] },
+        Method::Smc { lambda: 8.0, eta: 20.0, phi: 2.0 },
+    ];
+    let mut designed = 0;
+    for text in [PENDULUM, CART] {
+        let model = load(text);
+        let (input, tracked) = (model.inputs[0].name.clone(), model.states[0].name.clone());
+        for parameter in 0..model.parameters.len() {
+            for value in extremes {
+                let mut odd = model.clone();
+                odd.parameters[parameter].value = value;
+                let Ok(plant) = Plant::of(&odd, &input, &PlantOptions::default()) else { continue };
+                for method in &methods {
+                    let Ok(law) = design(&plant, method, &DesignOptions::new(&tracked, &[0.0, 0.3], 1e-3))
+                    else {
+                        continue;
+                    };
+                    designed += 1;
+                    let options = greybox_control::LoopOptions::default();
+                    let looped = greybox_control::ClosedLoop::new(&odd, &law, &options).unwrap();
+                    looped.run(&greybox_control::Reference::step(0.3, 0.05)).unwrap();
+                }
+            }
+        }
+        for value in extremes {
+            let sized = PlantOptions { sizes: vec![(tracked.clone(), value)], ..PlantOptions::default() };
+            let Ok(plant) = Plant::of(&model, &input, &sized) else { continue };
+            for method in &methods {
+                for set_points in [vec![0.1], vec![value], vec![-0.1, value]] {
+                    drop(design(&plant, method, &DesignOptions::new(&tracked, &set_points, 1e-3)));
+                }
+                drop(design(&plant, method, &DesignOptions::new(&tracked, &[0.1], value)));
+            }
+        }
+    }
+    assert!(designed > 20, "{designed}");
+}
