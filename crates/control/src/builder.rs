@@ -88,6 +88,7 @@ impl<'a> Builder<'a> {
     pub(crate) fn plant(&self) -> Result<Plant, ControlError> {
         let mut range = Range::default();
         let mut dropped = Vec::new();
+        let mut closed_gaps = Vec::new();
         let residuals: Vec<Expr> = self
             .model
             .equations
@@ -97,7 +98,12 @@ impl<'a> Builder<'a> {
                 self.check(&equation.name, &residual)?;
                 let residual = self.timeless(&equation.name, &residual, &mut dropped)?;
                 let value = |e: &Expr| self.value(e, &[]);
-                Ok(terms::without_limits(&residual, self.input, &value, &mut range).simplify())
+                let free = terms::without_limits(&residual, self.input, &value, &mut range);
+                let mut gaps = Vec::new();
+                let bridged = terms::without_gaps(&free, &|e| self.moves(e), &mut gaps);
+                let told = |term| Dropped { equation: equation.name.clone(), term };
+                closed_gaps.extend(gaps.into_iter().map(told));
+                Ok(if self.options.close_gaps { bridged } else { free }.simplify())
             })
             .collect::<Result<_, ControlError>>()?;
         let limits = range.limits;
@@ -107,14 +113,16 @@ impl<'a> Builder<'a> {
         let smoothed: Vec<Expr> = residuals
             .iter()
             .map(|e| {
-                terms::without_signs(e, &|v| {
+                terms::without_signs(e, &|e| self.moves(e), &|v| {
                     let width = self.options.smoothing * self.size(v);
                     Expr::call(Func::Tanh, vec![v.clone() / Expr::Num(width)])
                 })
             })
             .collect();
-        let still: Vec<Expr> =
-            residuals.iter().map(|e| terms::without_signs(e, &|_| Expr::Num(0.0)).simplify()).collect();
+        let still: Vec<Expr> = residuals
+            .iter()
+            .map(|e| terms::without_signs(e, &|e| self.moves(e), &|_| Expr::Num(0.0)).simplify())
+            .collect();
         let (f, g) = self.explicit(&smoothed)?;
         let still = self.explicit(&still)?;
         if g.iter().all(|g| *g == Expr::Num(0.0)) {
@@ -140,11 +148,18 @@ impl<'a> Builder<'a> {
             limits,
             dead_zone: range.dead_zone.unwrap_or(0.0),
             dropped,
+            open_gaps: !self.options.close_gaps && !closed_gaps.is_empty(),
+            closed_gaps: if self.options.close_gaps { closed_gaps } else { Vec::new() },
             sizes: self.sizes.clone(),
             input_size: self.options.input_size,
             measured,
             parameters,
         })
+    }
+
+    /// Whether a state or the input occurs.
+    fn moves(&self, e: &Expr) -> bool {
+        e.mentions(self.input) || self.model.states.iter().any(|s| e.mentions(&s.name))
     }
 
     /// Held inputs and frozen states as their constants.

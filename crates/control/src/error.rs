@@ -177,7 +177,8 @@ pub enum ControlError {
     /// At the wanted value the equations have no unique solution to first order.
     #[error(
         "at {tracked} = {value} the rest position is not determined{by}: freeze a state that nothing brings to rest \
-         (a memory of friction or hysteresis, `frozen`), or track the coordinate that the input can hold"
+         (a memory of friction or hysteresis, `frozen`), close a \
+         gap (`close_gaps`), or track the coordinate that the input can hold"
     )]
     SingularEquilibrium {
         /// The tracked state.
@@ -218,28 +219,34 @@ pub enum ControlError {
         high: f64,
     },
     /// No linear regulator.
-    #[error("linear design at the set point {set_point}: {source}")]
+    #[error("linear design at the set point {set_point}: {source}{hint}")]
     Linear {
         /// Where.
         set_point: f64,
         /// Why.
         source: RiccatiError,
+        /// What may be the matter, where something is known.
+        hint: &'static str,
     },
     /// No nonlinear optimal law.
-    #[error("Hamilton-Jacobi-Bellman design at the set point {set_point}: {source}")]
+    #[error("Hamilton-Jacobi-Bellman design at the set point {set_point}: {source}{hint}")]
     Hjb {
         /// Where.
         set_point: f64,
         /// Why.
         source: HjbError,
+        /// What may be the matter, where something is known.
+        hint: &'static str,
     },
     /// No sliding-mode law.
-    #[error("sliding-mode design at the set point {set_point}: {source}")]
+    #[error("sliding-mode design at the set point {set_point}: {source}{hint}")]
     Smc {
         /// Where.
         set_point: f64,
         /// Why.
         source: SmcError,
+        /// What may be the matter, where something is known.
+        hint: &'static str,
     },
     /// More states than a sliding-mode law is made for.
     #[error(

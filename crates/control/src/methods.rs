@@ -46,6 +46,14 @@ impl Design<'_> {
         Expr::prime(name, *primes)
     }
 
+    fn hint(&self) -> &'static str {
+        if self.plant.open_gaps {
+            "; within a dead zone nothing pulls: design as if it were closed (`close_gaps`)"
+        } else {
+            ""
+        }
+    }
+
     /// xᵢ − x_eᵢ(r).
     fn deviation(&self, i: usize) -> Expr {
         (self.state(i) - self.feed_forward.state[i].clone()).simplify()
@@ -83,7 +91,7 @@ impl Design<'_> {
         let a = DMatrix::from_fn(n, n, |i, j| a[(i, j)] / sizes[i] * sizes[j]);
         let b = DMatrix::from_fn(n, 1, |i, _| b[i] / sizes[i] * unit);
         let (q, r) = self.cost(sizes, unit);
-        let wrap = |source| ControlError::Linear { set_point, source };
+        let wrap = |source| ControlError::Linear { set_point, source, hint: self.hint() };
         let regulator = greybox_hjb::lqr(&a, &b, &q, &r).map_err(wrap)?;
         Ok((0..n).map(|i| regulator.gain[(0, i)] * unit / sizes[i]).collect())
     }
@@ -112,7 +120,7 @@ impl Design<'_> {
         let unit = self.plant.input_size();
         let shifted = Shifted { plant: self.plant, at: self.at, widths: &widths, unit };
         let (q, r) = self.cost(&widths, unit);
-        let wrap = |source| ControlError::Hjb { set_point: self.set_point, source };
+        let wrap = |source| ControlError::Hjb { set_point: self.set_point, source, hint: self.hint() };
         let box_ = Domain::symmetric(&vec![1.0; n]).map_err(wrap)?;
         let odd_terms = degree % 2 == 1 || !shifted.is_odd(&box_.halton(40).map_err(wrap)?);
         let optimal = greybox_hjb::design(&shifted, &q, &r, &box_, degree, odd_terms).map_err(wrap)?;
@@ -148,7 +156,8 @@ impl Design<'_> {
             8 => self.surface::<8>(lambda, eta, phi),
             _ => return Err(ControlError::SmcStates { states }),
         };
-        let row = row.map_err(|source| ControlError::Smc { set_point: self.set_point, source })?;
+        let row =
+            row.map_err(|source| ControlError::Smc { set_point: self.set_point, source, hint: self.hint() })?;
         let along = |e: &[Expr]| sum(row.iter().copied().zip(e.iter().cloned()));
         let deviations: Vec<Expr> = (0..states).map(|i| self.deviation(i)).collect();
         let surface = along(&deviations);

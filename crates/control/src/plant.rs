@@ -24,8 +24,12 @@ pub struct PlantOptions {
     /// Other inputs and the constants that they are held at; zero where none is stated.
     pub held: Vec<(String, f64)>,
     /// States that the design leaves out, and the constants that they are held at: memories of friction, which
-    /// nothing brings to rest. All derivatives of such a state are zero.
+    /// nothing brings to rest. Its derivatives are zero, but for a highest one that stands in the equation of
+    /// another state.
     pub frozen: Vec<(String, f64)>,
+    /// Design as if `deadzone(d, gap)` of a state were d: within a gap nothing pulls, so that the tangent there cannot
+    /// be controlled. [`Plant::closed_gaps`] tells which.
+    pub close_gaps: bool,
     /// Drop additive terms with the time (disturbances); [`Plant::dropped`] tells which.
     pub ignore_time_terms: bool,
 }
@@ -38,6 +42,7 @@ impl Default for PlantOptions {
             smoothing: SMOOTHING,
             held: Vec::new(),
             frozen: Vec::new(),
+            close_gaps: false,
             ignore_time_terms: false,
         }
     }
@@ -101,6 +106,8 @@ pub struct Plant {
     pub(crate) limits: (f64, f64),
     pub(crate) dead_zone: f64,
     pub(crate) dropped: Vec<Dropped>,
+    pub(crate) closed_gaps: Vec<Dropped>,
+    pub(crate) open_gaps: bool,
     pub(crate) sizes: Vec<f64>,
     pub(crate) input_size: f64,
     pub(crate) smooth: Compiled,
@@ -197,6 +204,12 @@ impl Plant {
     #[must_use]
     pub fn dropped(&self) -> &[Dropped] {
         &self.dropped
+    }
+
+    /// The dead zones of states that the design does without.
+    #[must_use]
+    pub fn closed_gaps(&self) -> &[Dropped] {
+        &self.closed_gaps
     }
 
     /// Typical sizes of the states.

@@ -31,10 +31,22 @@ fn factor(e: &Expr) -> Vec<Expr> {
     if timed(e) { terms(e) } else { vec![e.clone()] }
 }
 
-/// `sign(v)` by what `by` makes of v, wherever v is no constant.
-pub(crate) fn without_signs(e: &Expr, by: &dyn Fn(&Expr) -> Expr) -> Expr {
+/// `sign(v)` by what `by` makes of v, wherever v moves.
+pub(crate) fn without_signs(e: &Expr, moves: &dyn Fn(&Expr) -> bool, by: &dyn Fn(&Expr) -> Expr) -> Expr {
     e.map(&mut |e| match &e {
-        Expr::Call(Func::Sign, args) if args.len() == 1 && args[0].constant().is_none() => by(&args[0]),
+        Expr::Call(Func::Sign, args) if args.first().is_some_and(moves) => by(&args[0]),
+        _ => e,
+    })
+}
+
+/// `deadzone(d, gap)` by d wherever d moves; what was replaced goes to `closed`.
+pub(crate) fn without_gaps(e: &Expr, moves: &dyn Fn(&Expr) -> bool, closed: &mut Vec<Expr>) -> Expr {
+    e.map(&mut |e| match &e {
+        Expr::Call(Func::Deadzone, args) if args.first().is_some_and(moves) => {
+            let inner = args[0].clone();
+            closed.push(e);
+            inner
+        }
         _ => e,
     })
 }

@@ -338,3 +338,42 @@ fn a_law_without_the_memory_of_friction_runs_on_the_model_with_it() {
     let error = ClosedLoop::new(&lag, &law, &differences).unwrap_err();
     assert!(matches!(&error, ControlError::Unmeasured { name } if name == "y"), "{error}");
 }
+
+#[test]
+fn a_gap_is_designed_as_closed_and_simulated_as_open() {
+    // A motor moves a load through a spring with backlash; the law must hold the motor.
+    let model = load(
+        r#"
+[inputs]
+u = { unit = "N" }
+[states]
+x = { unit = "m" }
+y = { unit = "m" }
+[parameters]
+m = { value = 1.0, unit = "kg" }
+b = { value = 4.0, unit = "N s/m" }
+k = { value = 300.0, unit = "N/m" }
+gap = { value = 0.01, unit = "m" }
+[equations]
+motor = "m*x'' + b*x' + k*deadzone(x - y, gap) = u"
+load = "m*y'' + b*y' - k*deadzone(x - y, gap) = 0"
+"#,
+    );
+    let mut options = sized(&[("x", 0.2), ("x'", 1.0), ("y", 0.2), ("y'", 1.0)], 10.0);
+    let open = Plant::of(&model, "u", &options).unwrap();
+    let wanted = DesignOptions::new("x", &[0.0, 0.3], 2e-3);
+    let error = design(&open, &Method::Lqr, &wanted).unwrap_err();
+    assert!(error.to_string().contains("close_gaps"), "{error}");
+    options.close_gaps = true;
+    let plant = Plant::of(&model, "u", &options).unwrap();
+    let closed: Vec<String> = plant.closed_gaps().iter().map(|d| d.term.to_string()).collect();
+    assert_eq!(closed, ["deadzone(x - y, gap)", "deadzone(x - y, gap)"]);
+    for method in [Method::Lqr, Method::Smc { lambda: 10.0, eta: 60.0, phi: 2.0 }] {
+        let law = design(&plant, &method, &wanted).unwrap();
+        let run = ClosedLoop::new(&model, &law, &LoopOptions::default()).unwrap();
+        let run = run.run(&Reference::step(0.3, 6.0)).unwrap();
+        let m = run.metrics[0];
+        println!("{} {m:?}", method.name());
+        assert!(run.diverged.is_none() && m.final_error.abs() < 0.02, "{}: {m:?}", method.name());
+    }
+}
