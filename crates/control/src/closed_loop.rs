@@ -10,6 +10,9 @@ use crate::metrics::{Metrics, metrics};
 /// Most samples of one run.
 pub const MOST_SAMPLES: usize = 10_000_000;
 
+/// A state this many times its size, start or set point has run away.
+const FAR: f64 = 1e9;
+
 /// Set points over the time.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Reference {
@@ -253,6 +256,14 @@ impl<'a> ClosedLoop<'a> {
             diverged: None,
             metrics: Vec::new(),
         };
+        let largest = reference.set_points.iter().fold(0.0f64, |m, (_, r)| m.max(r.abs()));
+        let sizes = self.controller.plant().sizes();
+        let far: Vec<f64> = self
+            .places
+            .iter()
+            .zip(sizes)
+            .map(|(&p, s)| FAR * s.max(self.start[p].abs()).max(largest))
+            .collect();
         let mut x = self.start.clone();
         let mut carry: Option<Carry> = None;
         let mut known: Vec<f64> = self.places.iter().map(|&p| x[p]).collect();
@@ -276,7 +287,8 @@ impl<'a> ClosedLoop<'a> {
             for (series, x) in run.x.iter_mut().zip(&x) {
                 series.push(*x);
             }
-            if !u.is_finite() {
+            let away = self.places.iter().zip(&far).any(|(&p, far)| x[p].abs() > *far);
+            if away || !u.is_finite() {
                 run.diverged = Some(k);
                 break;
             }

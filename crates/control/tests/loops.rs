@@ -293,6 +293,10 @@ fn a_pole_is_balanced_while_the_cart_moves() {
         let law = design(&plant, &method, &wanted).unwrap();
         let looped = ClosedLoop::new(&model, &law, &LoopOptions::default()).unwrap();
         let run = looped.run(&Reference::square(0.3, 8.0, 3)).unwrap();
+        // From where the actuator cannot catch the pole, it falls, and swings.
+        let fallen = LoopOptions { start: Some(vec![0.0, 0.0, 1.2, 0.0]), ..LoopOptions::default() };
+        let fallen = ClosedLoop::new(&model, &law, &fallen).unwrap().run(&Reference::step(0.0, 2.0)).unwrap();
+        assert!(fallen.diverged.is_some() || fallen.metrics[0].settling.is_none(), "{}", method.name());
         for m in &run.metrics {
             println!("{} {m:?}", method.name());
             assert!(m.final_error.abs() < 2e-3 && m.settling.is_some(), "{}: {m:?}", method.name());
