@@ -34,7 +34,8 @@ kt  = { value = 0.00768, unit = "N m/A" }
 km  = { value = 0.00768, unit = "V s/rad" }
 Rm  = { value = 2.6, unit = "ohm" }
 [equations]
-hub  = """Jeq*theta'' + Beq*theta' - ks*alpha + kc*(theta - alpha) + fc*sign(theta') + mc*alpha'' + kst*max(theta - xst, 0) \
+hub  = """Jeq*theta'' + Beq*theta' - ks*alpha + kc*(theta - alpha) + fc*sign(theta') \
+          + mc*alpha'' + kst*max(theta - xst, 0) \
           = eta*Kg*kt/Rm*(v - Kg*km*theta')"""
 link = "Jl*(theta'' + alpha'') + Bl*alpha' + ks*alpha + kc*(alpha - theta) + mc*theta'' = 0"
 "#;
