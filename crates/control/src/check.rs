@@ -1,0 +1,93 @@
+//! Whether a loop is stable at a set point.
+
+use greybox_hjb::Linear;
+use greybox_smc::check::Pole;
+use nalgebra::DMatrix;
+
+use crate::compiled::Compiled;
+use crate::equilibrium::Equilibrium;
+use crate::error::ControlError;
+use crate::plant::Plant;
+use crate::stability;
+
+/// The loop's tangent at a set point.
+#[derive(Debug, Clone, PartialEq)]
+pub struct Check {
+    /// The set point.
+    pub set_point: f64,
+    /// Where the plant rests there.
+    pub equilibrium: Equilibrium,
+    /// Poles of the continuous loop, 1/s, the rightmost first; friction dropped.
+    pub poles: Vec<Pole>,
+    /// Largest magnitude of a pole in z of the loop with the command held.
+    pub spectral_radius: f64,
+}
+
+/// A law under examination.
+pub(crate) struct Examined<'a> {
+    pub(crate) plant: &'a Plant,
+    pub(crate) names: &'a str,
+    pub(crate) dt: f64,
+    pub(crate) limits: (f64, f64),
+    pub(crate) frictionless: Compiled,
+    /// The law with its compensation of friction, where it has one.
+    pub(crate) smooth: Option<Compiled>,
+}
+
+impl Examined<'_> {
+    /// ∂u/∂x, one row.
+    pub(crate) fn gain(&self, law: &Compiled, x: &[f64], r: f64) -> DMatrix<f64> {
+        let mut at = x.to_vec();
+        at.push(r);
+        law.jacobian(&at).columns(0, x.len()).into_owned()
+    }
+
+    pub(crate) fn check(&self, set_point: f64, at: Equilibrium) -> Result<Check, ControlError> {
+        let (low, high) = self.limits;
+        let swallowed = self.plant.dead_zone() * if at.input == 0.0 { 0.0 } else { at.input.signum() };
+        let input = at.input + swallowed;
+        if !(low <= input && input <= high) {
+            let tracked = self.names.to_owned();
+            return Err(ControlError::Unholdable { tracked, value: set_point, input, low, high });
+        }
+        if let Some(law) = &self.smooth {
+            let plant = self.plant.tangent(&at.state, at.input);
+            self.stable(&plant, &self.gain(law, &at.state, set_point), set_point)?;
+        }
+        let plant = self.plant.frictionless_tangent(&at.state, at.input);
+        let gain = self.gain(&self.frictionless, &at.state, set_point);
+        let (poles, spectral_radius) = self.stable(&plant, &gain, set_point)?;
+        Ok(Check { set_point, equilibrium: at, poles, spectral_radius })
+    }
+
+    /// The poles and the largest magnitude in z, if stable.
+    fn stable(
+        &self,
+        plant: &Linear,
+        gain: &DMatrix<f64>,
+        set_point: f64,
+    ) -> Result<(Vec<Pole>, f64), ControlError> {
+        let sizes = self.plant.sizes();
+        let none = || ControlError::NoPoles { set_point };
+        let poles = stability::poles(&stability::closed(plant, gain), sizes).ok_or_else(none)?;
+        let size = poles.iter().fold(0.0f64, |size, p| size.max(p.magnitude()));
+        // A pole at zero is found anywhere within the rounding errors of the largest one.
+        let rounding = 16.0 * poles.len() as f64 * f64::EPSILON * size;
+        if let Some(&pole) = poles.first().filter(|p| p.re.is_nan() || p.re >= -rounding) {
+            return Err(ControlError::Unstable { set_point, pole });
+        }
+        let radius = |dt: f64| {
+            let held = stability::held(plant, dt, sizes, self.plant.input_size())?;
+            let poles = stability::poles(&stability::closed(&held, gain), sizes)?;
+            Some(poles.iter().fold(0.0f64, |radius, p| radius.max(p.magnitude())))
+        };
+        let found = radius(self.dt).ok_or_else(none)?;
+        if found < 1.0 {
+            return Ok((poles, found));
+        }
+        let shorter =
+            (1..40).map(|k| self.dt * 0.8f64.powi(k)).find(|dt| radius(*dt).is_some_and(|r| r < 1.0));
+        let longest = shorter.map_or(String::new(), |dt| format!(", {dt:.2e} s would do"));
+        Err(ControlError::UnstableSampled { set_point, dt: self.dt, radius: found, longest })
+    }
+}

@@ -1,0 +1,358 @@
+//! The model and its controller, simulated together.
+
+use greybox_model::{Hold, Model, System};
+use greybox_simulate::{Carry, Environment, Method as Integration, Seeds, Signal, Simulation};
+
+use crate::controller::Controller;
+use crate::error::{ControlError, listed};
+use crate::metrics::{Metrics, metrics};
+
+/// Most samples of one run.
+pub const MOST_SAMPLES: usize = 10_000_000;
+
+/// A state this many times its size, start or set point has run away.
+const FAR: f64 = 1e9;
+
+/// Set points over the time.
+#[derive(Debug, Clone, PartialEq)]
+pub struct Reference {
+    /// From which time on (s, rising, the first at zero) which set point (SI).
+    pub set_points: Vec<(f64, f64)>,
+    /// Length of the run, s.
+    pub duration: f64,
+}
+
+impl Reference {
+    /// One set point from the start on.
+    #[must_use]
+    pub fn step(value: f64, duration: f64) -> Reference {
+        Reference { set_points: vec![(0.0, value)], duration }
+    }
+
+    /// `value` and −`value` in turn, each for `half_period` s, `count` set points in all.
+    #[must_use]
+    pub fn square(value: f64, half_period: f64, count: usize) -> Reference {
+        let at = |k: usize| (k as f64 * half_period, if k.is_multiple_of(2) { value } else { -value });
+        Reference { set_points: (0..count).map(at).collect(), duration: count as f64 * half_period }
+    }
+
+    /// The set point at a time.
+    #[must_use]
+    pub fn at(&self, t: f64) -> f64 {
+        let later = self.set_points.partition_point(|(start, _)| *start <= t + 1e-9 * self.duration);
+        self.set_points.get(later.saturating_sub(1)).map_or(0.0, |(_, r)| *r)
+    }
+
+    fn check(&self, dt: f64) -> Result<usize, ControlError> {
+        let samples = (self.duration / dt).round();
+        if !(samples >= 1.0 && samples <= MOST_SAMPLES as f64) {
+            let what = "the length of the run, in samples".to_owned();
+            return Err(ControlError::Option { what, value: samples, wanted: "one to ten millions" });
+        }
+        let starts = self.set_points.first().is_some_and(|(t, _)| *t == 0.0);
+        let rising = self.set_points.windows(2).all(|w| w[0].0 < w[1].0);
+        let finite = self.set_points.iter().all(|(t, r)| t.is_finite() && r.is_finite());
+        if !(starts && rising && finite) {
+            return Err(ControlError::Option {
+                what: "the list of set points".into(),
+                value: self.set_points.len() as f64,
+                wanted: "finite, with rising times from zero on",
+            });
+        }
+        Ok(samples as usize)
+    }
+}
+
+/// What the law is given of the state.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
+pub enum Feedback {
+    /// All of it.
+    #[default]
+    FullState,
+    /// Measured states, and rates by differences of the last two samples.
+    Differences,
+}
+
+/// How a closed loop is simulated.
+#[derive(Debug, Clone, PartialEq)]
+pub struct LoopOptions {
+    /// Start, a value for each entry of the model's state vector; zeros where there is none.
+    pub start: Option<Vec<f64>>,
+    /// What the law is given.
+    pub feedback: Feedback,
+    /// Integration between two commands.
+    pub integration: Integration,
+}
+
+impl Default for LoopOptions {
+    fn default() -> Self {
+        let integration = Integration::Adaptive { rtol: 1e-7, atol: 1e-10 };
+        Self { start: None, feedback: Feedback::FullState, integration }
+    }
+}
+
+/// A simulated run, sampled where the command changes.
+#[derive(Debug, Clone, PartialEq)]
+pub struct Run {
+    /// Time, s.
+    pub t: Vec<f64>,
+    /// Set point.
+    pub r: Vec<f64>,
+    /// Command, held until the next sample.
+    pub u: Vec<f64>,
+    /// States of the model (all, also those that the law does not know), one series each.
+    pub x: Vec<Vec<f64>>,
+    /// Their names.
+    pub states: Vec<String>,
+    /// The tracked state's index.
+    pub tracked: usize,
+    /// The sample at which the run ended because the state or the command left every bound.
+    pub diverged: Option<usize>,
+    /// What was reached, for each set point.
+    pub metrics: Vec<Metrics>,
+}
+
+/// A model, compiled, under a controller: friction sticks truly ([`greybox_simulate`]), the command is held over the
+/// sample time of the law and stays within its limits.
+///
+/// The model may be fuller than the one that the law was made for: it needs the law's states and input, and may have
+/// further states, delays, disturbances.
+///
+/// ```
+/// use greybox_control::{ClosedLoop, DesignOptions, LoopOptions, Method, Plant, PlantOptions, Reference, design};
+/// # let model = greybox_model::Model::from_toml(r#"
+/// # [inputs]
+/// # tau = { unit = "N m" }
+/// # [states]
+/// # theta = { unit = "rad" }
+/// # [parameters]
+/// # J = { value = 0.02, unit = "kg m^2" }
+/// # mgl = { value = 0.5, unit = "N m" }
+/// # [equations]
+/// # arm = "J*theta'' + mgl*sin(theta) = tau"
+/// # "#, "pendulum.toml")?;
+/// let plant = Plant::of(&model, "tau", &PlantOptions::default())?;
+/// let law = design(&plant, &Method::Lqr, &DesignOptions::new("theta", &[-0.5, 0.5], 1e-3))?;
+/// let run = ClosedLoop::new(&model, &law, &LoopOptions::default())?.run(&Reference::square(0.5, 10.0, 2))?;
+/// assert!(run.metrics.iter().all(|m| m.final_error.abs() < 1e-3 && m.settling.is_some()));
+/// # Ok::<(), Box<dyn std::error::Error>>(())
+/// ```
+#[derive(Debug, Clone)]
+pub struct ClosedLoop<'a> {
+    controller: &'a Controller,
+    pub(crate) system: System,
+    pub(crate) names: Vec<String>,
+    pub(crate) parameters: Vec<f64>,
+    states: Vec<String>,
+    start: Vec<f64>,
+    /// Where the law's states stand in the model's state vector.
+    places: Vec<usize>,
+    /// For each of the law's states by differences: the state that it is the rate of.
+    rates: Vec<Option<usize>>,
+    input: usize,
+    held: Vec<f64>,
+    integration: Integration,
+    delays: bool,
+}
+
+impl<'a> ClosedLoop<'a> {
+    /// A model under a controller.
+    ///
+    /// # Errors
+    /// [`ControlError::Compile`], [`ControlError::Foreign`] for a model that lacks what the law needs,
+    /// [`ControlError::Unmeasured`], [`ControlError::Size`].
+    pub fn new(
+        model: &Model,
+        controller: &'a Controller,
+        options: &LoopOptions,
+    ) -> Result<ClosedLoop<'a>, ControlError> {
+        let system = System::compile(model)?;
+        let plant = controller.plant();
+        let mut states = Vec::with_capacity(system.nx);
+        for state in &model.states {
+            states.extend((0..state.order).map(|p| format!("{}{}", state.name, "'".repeat(p))));
+        }
+        let start = options.start.clone().unwrap_or_else(|| vec![0.0; system.nx]);
+        if start.len() != system.nx {
+            return Err(ControlError::Size { what: "the start", found: start.len(), wanted: system.nx });
+        }
+        if !start.iter().all(|x| x.is_finite()) {
+            return Err(ControlError::NotFinite { state: start });
+        }
+        let names = plant.state_names();
+        let foreign = |name: &str| ControlError::Foreign { name: name.to_owned() };
+        let places: Vec<usize> = names
+            .iter()
+            .map(|name| states.iter().position(|s| s == name).ok_or_else(|| foreign(name)))
+            .collect::<Result<_, _>>()?;
+        let input = model.input(plant.input_name()).ok_or_else(|| foreign(plant.input_name()))?;
+        let constant = |name: &str| plant.held().iter().find(|(n, _)| n == name).map_or(0.0, |(_, v)| *v);
+        let held = model.inputs.iter().map(|i| constant(&i.name)).collect();
+        let mut rates = vec![None; names.len()];
+        if options.feedback == Feedback::Differences {
+            for (i, (name, primes)) in plant.symbols().iter().enumerate() {
+                if plant.measured()[i] {
+                    continue;
+                }
+                let below = primes.checked_sub(1).and_then(|p| {
+                    plant
+                        .symbols()
+                        .iter()
+                        .position(|(n, q)| n == name && *q == p)
+                        .filter(|k| plant.measured()[*k])
+                });
+                rates[i] = Some(below.ok_or_else(|| ControlError::Unmeasured { name: names[i].clone() })?);
+            }
+        }
+        let delays = !system.rhs.delays.is_empty();
+        Ok(ClosedLoop {
+            controller,
+            parameters: model.parameters.iter().map(|p| p.value).collect(),
+            names: model.parameters.iter().map(|p| p.name.clone()).collect(),
+            system,
+            states,
+            start,
+            places,
+            rates,
+            input,
+            held,
+            integration: options.integration,
+            delays,
+        })
+    }
+
+    /// The controller.
+    #[must_use]
+    pub fn controller(&self) -> &Controller {
+        self.controller
+    }
+
+    /// A run with the model's own parameters.
+    ///
+    /// # Errors
+    /// [`ControlError::Option`] for a reference that is none.
+    pub fn run(&self, reference: &Reference) -> Result<Run, ControlError> {
+        self.run_with(&self.parameters, reference)
+    }
+
+    /// A run with other values (SI) of the model's parameters, in the model's order.
+    ///
+    /// # Errors
+    /// [`ControlError::Option`] for a reference that is none, [`ControlError::Size`].
+    pub fn run_with(&self, parameters: &[f64], reference: &Reference) -> Result<Run, ControlError> {
+        if parameters.len() != self.system.np {
+            let (found, wanted) = (parameters.len(), self.system.np);
+            return Err(ControlError::Size { what: "the list of parameters", found, wanted });
+        }
+        let dt = self.controller.dt();
+        let samples = reference.check(dt)?;
+        let mut run = Run {
+            t: Vec::with_capacity(samples + 1),
+            r: Vec::with_capacity(samples + 1),
+            u: Vec::with_capacity(samples + 1),
+            x: vec![Vec::with_capacity(samples + 1); self.system.nx],
+            states: self.states.clone(),
+            tracked: self.places[self.controller.tracked()],
+            diverged: None,
+            metrics: Vec::new(),
+        };
+        let largest = reference.set_points.iter().fold(0.0f64, |m, (_, r)| m.max(r.abs()));
+        let sizes = self.controller.plant().sizes();
+        let far: Vec<f64> = self
+            .places
+            .iter()
+            .zip(sizes)
+            .map(|(&p, s)| FAR * s.max(self.start[p].abs()).max(largest))
+            .collect();
+        let mut x = self.start.clone();
+        let mut carry: Option<Carry> = None;
+        let mut known: Vec<f64> = self.places.iter().map(|&p| x[p]).collect();
+        for k in 0..=samples {
+            let t = k as f64 * dt;
+            let r = reference.at(t);
+            let before = known.clone();
+            for (i, &place) in self.places.iter().enumerate() {
+                known[i] = x[place];
+            }
+            for i in 0..known.len() {
+                // At the start there is no sample before: nothing moves yet.
+                if let Some(below) = self.rates[i] {
+                    known[i] = if k == 0 { 0.0 } else { (known[below] - before[below]) / dt };
+                }
+            }
+            let u = self.controller.command(&known, r);
+            run.t.push(t);
+            run.r.push(r);
+            run.u.push(u);
+            for (series, x) in run.x.iter_mut().zip(&x) {
+                series.push(*x);
+            }
+            let away = self.places.iter().zip(&far).any(|(&p, far)| x[p].abs() > *far);
+            if away || !u.is_finite() {
+                run.diverged = Some(k);
+                break;
+            }
+            if k == samples {
+                break;
+            }
+            match self.advance(parameters, &run.u, &x, carry.take()) {
+                Some((next, after)) => (x, carry) = (next, after),
+                None => {
+                    run.diverged = Some(k);
+                    break;
+                }
+            }
+        }
+        run.metrics = metrics(&run, reference, dt);
+        Ok(run)
+    }
+
+    /// The state one sample later under the last of the commands `u`; none where it left every bound.
+    fn advance(
+        &self,
+        parameters: &[f64],
+        u: &[f64],
+        x: &[f64],
+        carry: Option<Carry>,
+    ) -> Option<(Vec<f64>, Option<Carry>)> {
+        let dt = self.controller.dt();
+        let k = u.len() - 1;
+        // Only a delay looks back.
+        let first = if self.delays { 0 } else { k };
+        let signal = |i: usize| {
+            let mut samples =
+                if i == self.input { u[first..].to_vec() } else { vec![self.held[i]; u.len() - first] };
+            samples.push(samples[samples.len() - 1]);
+            Signal::new(Hold::Zero, dt, &samples, <[f64]>::to_vec)
+        };
+        let environment = Environment {
+            start: first as f64 * dt,
+            dt,
+            len: k - first + 2,
+            inputs: (0..self.system.nu).map(signal).collect(),
+            forces: Vec::new(),
+        };
+        let simulation = Simulation {
+            system: &self.system,
+            environment: &environment,
+            parameters,
+            method: self.integration,
+            seeds: &Seeds::default(),
+        };
+        let at = k - first;
+        let every: Vec<usize> = (0..self.system.nx).collect();
+        // Both ends are recorded: only so does a divergence between them show.
+        let (trajectory, after) =
+            simulation.run_on(x, at..at + 2, carry.as_ref().filter(|_| self.delays), &every);
+        let next: Vec<f64> = trajectory.x.chunks(2).filter_map(|ends| ends.get(1).copied()).collect();
+        let lost =
+            trajectory.diverged.is_some() || next.len() != x.len() || !next.iter().all(|x| x.is_finite());
+        (!lost).then_some((next, self.delays.then_some(after)))
+    }
+
+    /// Index of a parameter.
+    pub(crate) fn parameter(&self, name: &str) -> Result<usize, ControlError> {
+        let unknown = || ControlError::UnknownParameter { name: name.to_owned(), known: listed(&self.names) };
+        self.names.iter().position(|n| n == name).ok_or_else(unknown)
+    }
+}

@@ -1,0 +1,29 @@
+#![doc = include_str!("../README.md")]
+
+mod builder;
+mod check;
+pub mod closed_loop;
+mod compiled;
+mod controller;
+mod design;
+mod equilibrium;
+mod error;
+mod explicit;
+pub mod family;
+mod feedforward;
+mod methods;
+pub mod metrics;
+pub mod plant;
+mod stability;
+mod terms;
+
+pub use check::Check;
+pub use closed_loop::{ClosedLoop, Feedback, LoopOptions, Reference, Run};
+pub use controller::Controller;
+pub use design::{DesignOptions, Method, Weights, design};
+pub use equilibrium::{Equilibrium, equilibrium};
+pub use error::ControlError;
+pub use family::{Family, FamilyOptions, Spread};
+pub use feedforward::FeedForward;
+pub use metrics::Metrics;
+pub use plant::{Dropped, Plant, PlantOptions};
