@@ -7,7 +7,7 @@ use clap::error::ErrorKind;
 use clap::{Args, Parser, Subcommand};
 
 use crate::answer::Answer;
-use crate::commands::{calibrate, check, demo, diagnose, identify, mechanisms, simulate};
+use crate::commands::{calibrate, check, control, demo, diagnose, identify, mechanisms, simulate};
 use crate::failure::Failure;
 use crate::loading::{self, LoadedModel};
 use crate::output::OutputFolder;
@@ -27,6 +27,7 @@ use greybox_recording::Recording;
   greybox diagnose link.toml run1.csv run2.csv --holdout run3.csv --out result
   greybox simulate result/improved.toml run3.csv --out simulated.csv
   greybox identify run1.csv --states x --inputs f --holdout run2.csv --out found
+  greybox control result/improved.toml --track theta --to 0.5 --out controller
 
 Exit status: 0 finished, whatever the verdict; 2 bad usage or bad input; 1 internal failure."
 )]
@@ -127,6 +128,7 @@ pub(crate) enum Command {
     Calibrate(calibrate::Arguments),
     Simulate(simulate::Arguments),
     Check(check::Arguments),
+    Control(control::Arguments),
     Mechanisms(mechanisms::Arguments),
     Demo(demo::Arguments),
 }
@@ -139,6 +141,7 @@ impl Command {
             Command::Calibrate(arguments) => calibrate::run(arguments),
             Command::Simulate(arguments) => simulate::run(arguments),
             Command::Check(arguments) => check::run(arguments),
+            Command::Control(arguments) => control::run(arguments),
             Command::Mechanisms(arguments) => mechanisms::run(arguments),
             Command::Demo(arguments) => demo::run(arguments),
         }
@@ -155,7 +158,7 @@ impl Cli {
             }
             Err(e) if e.kind() == ErrorKind::DisplayHelpOnMissingArgumentOrSubcommand => {
                 Err(Failure::input("no command is given").mend(
-                    "name one: `greybox diagnose`, `identify`, `calibrate`, `simulate`, `check`, `mechanisms` or `demo`; \
+                    "name one: `greybox diagnose`, `identify`, `calibrate`, `simulate`, `check`, `control`, `mechanisms` or `demo`; \
                      `greybox --help` explains them",
                 ))
             }

@@ -1,0 +1,407 @@
+//! `greybox control`: from a model to a controller, its closed loop, and its law as code.
+
+use std::fmt::Write as _;
+use std::path::{Path, PathBuf};
+
+use clap::{Args, ValueEnum};
+use greybox_control::{
+    ClosedLoop, Controller, DesignOptions, Family, FamilyOptions, LoopOptions, Method, Metrics, Plant,
+    PlantOptions, Reference, Run, design,
+};
+use greybox_export::{Constant, Function, Group, Language, Member};
+use greybox_model::Model;
+use greybox_recording::write_csv;
+use greybox_report::format;
+use serde_json::{Value, json};
+
+use crate::answer::Answer;
+use crate::failure::Failure;
+use crate::loading;
+use crate::output::OutputFolder;
+use crate::progress::Progress;
+
+/// Files of a result.
+const FILES: [&str; 5] = ["report.json", "closed_loop.csv", "law.c", "law.rs", "vectors.csv"];
+/// States at which the exported code must agree, for each set point.
+const VECTORS: usize = 32;
+
+/// Design a controller for a model, simulate its closed loop, and write its law as code
+#[derive(Debug, Args)]
+#[command(after_help = "Examples:
+  greybox control improved.toml --track theta --to 0.5 --size theta=0.5 --size \"theta'=5\" --out controller
+  greybox control improved.toml --method smc --lambda 16 --rate 100 --track theta --to 0.5 --limit 10 --out controller
+
+All numbers are in SI. Sizes are the typical deviations of states and input: weights (Bryson's rule), the width of
+smoothed friction and the perturbation of the state follow from them.
+DIR receives report.json, closed_loop.csv (a square wave between the set points), law.c (C99), law.rs (no_std Rust)
+and vectors.csv (states and set points with the command that the code must give).")]
+pub(crate) struct Arguments {
+    /// Model (TOML), for example the improved.toml of a diagnosis
+    #[arg(value_name = "MODEL.toml")]
+    model: PathBuf,
+
+    /// How the law is found
+    #[arg(long, value_enum, default_value_t = Way::Lqr)]
+    method: Way,
+
+    /// Input that commands; the model's only one where it has one
+    #[arg(long, value_name = "NAME")]
+    input: Option<String>,
+
+    /// State to bring to the set points, with its primes; the model's first where none is named
+    #[arg(long, value_name = "STATE")]
+    track: Option<String>,
+
+    /// Set point; the closed loop steps between it and its negative
+    #[arg(long, value_name = "VALUE", default_value_t = 1.0, allow_negative_numbers = true)]
+    to: f64,
+
+    /// Typical size of a state, NAME=VALUE (may be given more than once); 1 where none is stated
+    #[arg(long, value_name = "NAME=VALUE")]
+    size: Vec<String>,
+
+    /// Typical size of the command
+    #[arg(long, value_name = "VALUE", default_value_t = 1.0)]
+    input_size: f64,
+
+    /// The actuator gives ± this at most
+    #[arg(long, value_name = "VALUE")]
+    limit: Option<f64>,
+
+    /// Sample time of the law, s
+    #[arg(long, value_name = "SECONDS", default_value_t = 1e-3)]
+    dt: f64,
+
+    /// Time for each set point of the simulated square wave, s
+    #[arg(long, value_name = "SECONDS", default_value_t = 2.0)]
+    hold: f64,
+
+    /// Degree of the value function (hjb)
+    #[arg(long, value_name = "EVEN", default_value_t = 4)]
+    degree: u8,
+
+    /// Poles on the sliding surface are at −λ, 1/s (smc)
+    #[arg(long, value_name = "RATE", default_value_t = 10.0)]
+    lambda: f64,
+
+    /// Pole towards the sliding surface, 1/s (smc)
+    #[arg(long, value_name = "RATE", default_value_t = 50.0)]
+    rate: f64,
+
+    /// Reaching rate η in units of the command; ten input sizes where none is given (smc)
+    #[arg(long, value_name = "VALUE")]
+    eta: Option<f64>,
+
+    /// Drop disturbances that depend on the time from the design
+    #[arg(long)]
+    ignore_time_terms: bool,
+
+    /// Take friction, smoothed, out of the motion (smc)
+    #[arg(long)]
+    compensate_friction: bool,
+
+    /// Perturbed plants on which the law is tried; parameters vary by the `std` of the model
+    #[arg(long, value_name = "N", default_value_t = 50)]
+    members: usize,
+
+    /// Seed of the perturbed plants
+    #[arg(long, value_name = "N", default_value_t = 0)]
+    seed: u64,
+
+    /// Folder for the results; made where it is missing
+    #[arg(long, value_name = "DIR")]
+    out: PathBuf,
+}
+
+/// The methods, as on the command line.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, ValueEnum)]
+enum Way {
+    /// Linear-quadratic regulator
+    Lqr,
+    /// Value function of a higher degree by the Hamilton–Jacobi–Bellman equation
+    Hjb,
+    /// Flat-output sliding mode
+    Smc,
+}
+
+pub(crate) fn run(arguments: &Arguments) -> Result<Answer, Failure> {
+    let loaded = loading::model(&arguments.model)?;
+    let model = &loaded.model;
+    let out = OutputFolder::prepare(&arguments.out)?;
+    out.spares(&FILES, [&arguments.model])?;
+    let refused = |e: greybox_control::ControlError| Failure::file(&arguments.model, e);
+
+    let plant = Plant::of(model, &input(arguments, model)?, &options(arguments)?).map_err(refused)?;
+    let tracked = match &arguments.track {
+        Some(name) => name.clone(),
+        None => plant.state_names().first().cloned().unwrap_or_default(),
+    };
+    let progress = Progress::steps(3);
+    progress.stage("designing");
+    let wanted = DesignOptions {
+        limit: arguments.limit,
+        compensate_friction: arguments.compensate_friction,
+        ..DesignOptions::new(&tracked, &[-arguments.to, arguments.to], arguments.dt)
+    };
+    let controller = design(&plant, &method(arguments), &wanted).map_err(refused)?;
+    progress.advance();
+    progress.stage("simulating");
+    let closed = ClosedLoop::new(model, &controller, &LoopOptions::default()).map_err(refused)?;
+    let reference = Reference::square(arguments.to, arguments.hold, 4);
+    let run = closed.run(&reference).map_err(refused)?;
+    progress.advance();
+    progress.stage("perturbing");
+    let deviations: Vec<(String, f64)> = model
+        .parameters
+        .iter()
+        .filter(|p| !p.fixed)
+        .filter_map(|p| Some((p.name.clone(), p.std.filter(|s| *s > 0.0)?)))
+        .collect();
+    let family = if deviations.is_empty() || arguments.members == 0 {
+        None
+    } else {
+        let options = FamilyOptions { deviations, members: arguments.members, seed: arguments.seed };
+        Some(closed.family(&reference, &options).map_err(refused)?)
+    };
+    progress.advance();
+    drop(progress);
+
+    let function = function(model, &controller, &loaded.file);
+    let written = |e: greybox_export::ExportError| Failure::file(&arguments.model, e);
+    let (c, rust) = (
+        function.code(Language::C99).map_err(written)?,
+        function.code(Language::Rust).map_err(written)?,
+    );
+    let vectors = vectors(&function, &controller, arguments.to).map_err(written)?;
+    let report = report(arguments, &loaded.file, &controller, &run, family.as_ref());
+    let closed_loop = series(&run)?;
+    out.write(&[
+        ("report.json", format!("{report:#}\n").as_bytes()),
+        ("closed_loop.csv", &closed_loop),
+        ("law.c", c.as_bytes()),
+        ("law.rs", rust.as_bytes()),
+        ("vectors.csv", vectors.as_bytes()),
+    ])?;
+    Ok(Answer::new(in_words(arguments, &controller, &run, family.as_ref()), report))
+}
+
+/// The input that commands.
+fn input(arguments: &Arguments, model: &Model) -> Result<String, Failure> {
+    match (&arguments.input, model.inputs.as_slice()) {
+        (Some(name), _) => Ok(name.clone()),
+        (None, [only]) => Ok(only.name.clone()),
+        (None, []) => Err(Failure::file(&arguments.model, "the model has no input to command with")
+            .mend("state one under [inputs] and let it act in an equation")),
+        (None, several) => {
+            let names: Vec<&str> = several.iter().map(|i| i.name.as_str()).collect();
+            Err(Failure::file(&arguments.model, format!("the model has the inputs {}", names.join(", ")))
+                .mend("name the one that commands with `--input`; the others are held at zero"))
+        }
+    }
+}
+
+fn options(arguments: &Arguments) -> Result<PlantOptions, Failure> {
+    let size = |text: &String| -> Result<(String, f64), Failure> {
+        let parsed = text.rsplit_once('=').and_then(|(name, v)| Some((name.trim(), v.trim().parse::<f64>().ok()?)));
+        match parsed {
+            Some((name, value)) if value > 0.0 && value.is_finite() => Ok((name.to_owned(), value)),
+            _ => Err(Failure::input(format!("`--size {text}` is no size of a state"))
+                .mend("write it as NAME=VALUE with a positive number, such as `--size theta=0.5`")),
+        }
+    };
+    Ok(PlantOptions {
+        sizes: arguments.size.iter().map(size).collect::<Result<_, _>>()?,
+        input_size: arguments.input_size,
+        ignore_time_terms: arguments.ignore_time_terms,
+        ..PlantOptions::default()
+    })
+}
+
+fn method(arguments: &Arguments) -> Method {
+    match arguments.method {
+        Way::Lqr => Method::Lqr,
+        Way::Hjb => Method::Hjb { degree: arguments.degree, domain: Vec::new() },
+        Way::Smc => {
+            let eta = arguments.eta.unwrap_or(10.0 * arguments.input_size);
+            Method::Smc { lambda: arguments.lambda, eta, phi: eta / arguments.rate }
+        }
+    }
+}
+
+/// The law as a function of the state and the set point.
+fn function(model: &Model, controller: &Controller, file: &str) -> Function {
+    let plant = controller.plant();
+    // Rates have no unit text of their own.
+    let member = |(name, primes): &(String, u8)| {
+        let unit = model.state(name).map_or("", |i| model.states[i].unit.text.as_str());
+        let unit = match (unit, primes) {
+            ("", _) => String::new(),
+            (unit, 0) => format!("SI of {unit}"),
+            (unit, 1) => format!("SI of {unit} per s"),
+            (unit, n) => format!("SI of {unit} per s^{n}"),
+        };
+        Member::new(name, *primes, &unit)
+    };
+    let parameter = |(name, value): &(String, f64)| {
+        let unit = model.parameter(name).and_then(|i| model.parameters[i].unit.as_ref());
+        Constant::new(name, *value, unit.map_or("", |u| u.text.as_str()))
+    };
+    let law = controller.law().first().cloned().unwrap_or(greybox_model::Expr::Num(0.0));
+    let (low, high) = controller.limits();
+    Function {
+        name: "control_law".into(),
+        summary: vec![
+            format!("{} law of {} for {}", controller.method().name(), plant.input_name(), model.name),
+            format!("Made by greybox {} from {file}.", env!("CARGO_PKG_VERSION")),
+            format!("Call it every {} s and hold the command; range {low} to {high}.", controller.dt()),
+        ],
+        arguments: vec![
+            Group { name: "state".into(), members: plant.symbols().iter().map(member).collect() },
+            Group { name: "set_point".into(), members: vec![member(&(controller.reference().to_owned(), 0))] },
+        ],
+        constants: plant.parameters().iter().map(parameter).collect(),
+        outputs: vec![(format!("{}, SI", plant.input_name()), law)],
+    }
+}
+
+/// States around the set points, with the command that the code must give.
+fn vectors(function: &Function, controller: &Controller, to: f64) -> Result<String, greybox_export::ExportError> {
+    let plant = controller.plant();
+    let mut points = Vec::new();
+    for check in controller.checks() {
+        for k in 0..VECTORS {
+            // Evenly spread whatever the number of states: a Kronecker sequence of square roots of primes.
+            let roots = [2f64, 3.0, 5.0, 7.0, 11.0, 13.0, 17.0, 19.0, 23.0, 29.0, 31.0, 37.0];
+            let spread = |i: usize| 2.0 * (k as f64 * roots[i % roots.len()].sqrt()).fract() - 1.0;
+            let state = check.equilibrium.state.iter().zip(plant.sizes()).enumerate();
+            let mut point: Vec<f64> = state.map(|(i, (x, size))| x + size * spread(i)).collect();
+            point.push(if k % 2 == 0 { check.set_point } else { 0.5 * to });
+            points.push(point);
+        }
+    }
+    let mut text = plant.state_names().join(",");
+    let _ = writeln!(text, ",{},{}", controller.reference(), plant.input_name());
+    for vector in function.vectors(&points)? {
+        let numbers: Vec<String> =
+            vector.arguments.iter().chain(&vector.outputs).map(|v| format!("{v:?}")).collect();
+        let _ = writeln!(text, "{}", numbers.join(","));
+    }
+    Ok(text)
+}
+
+/// The closed loop as a table.
+fn series(run: &Run) -> Result<Vec<u8>, Failure> {
+    let mut columns: Vec<(&str, &[f64])> = vec![("set_point", &run.r), ("command", &run.u)];
+    columns.extend(run.states.iter().zip(&run.x).map(|(name, x)| (name.as_str(), x.as_slice())));
+    let mut csv = Vec::new();
+    write_csv(&mut csv, &run.t, &columns)?;
+    Ok(csv)
+}
+
+fn report(
+    arguments: &Arguments,
+    file: &str,
+    controller: &Controller,
+    run: &Run,
+    family: Option<&Family>,
+) -> Value {
+    let plant = controller.plant();
+    let (low, high) = controller.limits();
+    let limit = |v: f64| if v.is_finite() { json!(v) } else { Value::Null };
+    let checks: Vec<Value> = controller
+        .checks()
+        .iter()
+        .map(|c| {
+            let poles: Vec<[f64; 2]> = c.poles.iter().map(|p| [p.re, p.im]).collect();
+            json!({
+                "set_point": c.set_point, "state": c.equilibrium.state, "command": c.equilibrium.input,
+                "poles": poles, "spectral_radius": c.spectral_radius,
+            })
+        })
+        .collect();
+    let spread = |s: &greybox_control::Spread| json!({ "median": limit(s.median), "worst": limit(s.worst) });
+    json!({
+        "greybox": { "version": env!("CARGO_PKG_VERSION"), "seed": arguments.seed },
+        "model": file,
+        "method": controller.method().name(),
+        "input": plant.input_name(),
+        "states": plant.state_names(),
+        "tracked": plant.state_names().get(controller.tracked()),
+        "dt": controller.dt(),
+        "limits": [limit(low), limit(high)],
+        "gains": controller.gains(),
+        "law": controller.law().iter().map(ToString::to_string).collect::<Vec<_>>(),
+        "checks": checks,
+        "left_out": plant.dropped().iter().map(|d| json!({
+            "equation": d.equation, "term": d.term.to_string(),
+        })).collect::<Vec<_>>(),
+        "closed_loop": {
+            "diverged": run.diverged.is_some(),
+            "set_points": run.metrics.iter().map(metrics).collect::<Vec<_>>(),
+        },
+        "family": family.map(|f| json!({
+            "members": f.members, "diverged": f.diverged, "settled": f.settled,
+            "settling": spread(&f.settling), "overshoot": spread(&f.overshoot),
+            "final_error": spread(&f.final_error), "largest_command": spread(&f.largest_command),
+        })),
+    })
+}
+
+fn metrics(m: &Metrics) -> Value {
+    json!({
+        "set_point": m.set_point, "settling": m.settling, "overshoot": m.overshoot,
+        "final_error": m.final_error, "largest_command": m.largest_command, "effort": m.effort,
+    })
+}
+
+fn in_words(arguments: &Arguments, controller: &Controller, run: &Run, family: Option<&Family>) -> String {
+    let plant = controller.plant();
+    let tracked = plant.state_names().get(controller.tracked()).cloned().unwrap_or_default();
+    let mut text = format!(
+        "{} of {} for {tracked}, commanded by {} every {} s\n",
+        match arguments.method {
+            Way::Lqr => "Linear-quadratic regulator",
+            Way::Hjb => "Optimal law",
+            Way::Smc => "Sliding-mode law",
+        },
+        file_name(&arguments.model),
+        plant.input_name(),
+        format::number(controller.dt()),
+    );
+    for (name, gain) in plant.state_names().iter().zip(controller.gains()) {
+        let _ = writeln!(text, "  gain of {name}: {}", format::number(*gain));
+    }
+    for dropped in plant.dropped() {
+        let _ = writeln!(text, "  left out of {}: {}", dropped.equation, dropped.term);
+    }
+    for m in run.metrics.iter().skip(1) {
+        let settling = m.settling.map_or("does not settle".into(), |s| format!("settles in {} s", format::number(s)));
+        let _ = writeln!(
+            text,
+            "  to {}: {settling}, overshoot {}, ends {} off, command up to {}",
+            format::number(m.set_point),
+            format::percent(m.overshoot),
+            format::number(m.final_error.abs()),
+            format::number(m.largest_command),
+        );
+    }
+    if let Some(at) = run.diverged {
+        let t = run.t.get(at).copied().unwrap_or_default();
+        let _ = writeln!(text, "  warning: the simulated loop leaves every bound after {} s", format::number(t));
+    }
+    if let Some(f) = family {
+        let _ = writeln!(
+            text,
+            "  on {} perturbed plants: {} settle, {} diverge",
+            f.members, f.settled, f.diverged
+        );
+    }
+    let out = arguments.out.display();
+    let files: Vec<String> = FILES.iter().map(|f| format!("{out}/{f}")).collect();
+    let _ = writeln!(text, "Written: {}", files.join(", "));
+    text
+}
+
+fn file_name(path: &Path) -> String {
+    path.file_name().map_or_else(|| path.display().to_string(), |n| n.to_string_lossy().into_owned())
+}

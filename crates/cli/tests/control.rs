@@ -1,0 +1,115 @@
+//! `greybox control`: a law from a model file, and code that gives the same commands.
+#![allow(missing_docs, clippy::unwrap_used)]
+
+use std::path::Path;
+use std::process::Command;
+
+use assert_cmd::cargo::CommandCargoExt as _;
+
+const MODEL: &str = r#"name = "Arm"
+
+[inputs]
+v = { unit = "V" }
+
+[states]
+theta = { unit = "rad" }
+
+[parameters]
+J = { value = 0.02, unit = "kg m^2", std = 0.002 }
+b = { value = 0.15, unit = "N m s/rad" }
+fc = { value = 0.005, unit = "N m", std = 0.001 }
+mgl = { value = 0.5, unit = "N m", std = 0.03 }
+kt = { value = 0.4, unit = "N m/V" }
+
+[equations]
+arm = "J*theta'' + b*theta' + fc*sign(theta') + mgl*sin(theta) = kt*v"
+"#;
+
+fn greybox(folder: &Path, arguments: &[&str]) -> (Option<i32>, String, String) {
+    let output = Command::cargo_bin("greybox").unwrap().current_dir(folder).args(arguments).output().unwrap();
+    let text = |b: Vec<u8>| String::from_utf8(b).unwrap();
+    (output.status.code(), text(output.stdout), text(output.stderr))
+}
+
+#[test]
+fn every_method_gives_a_law_that_tracks_and_code_that_agrees() {
+    let folder = tempfile::tempdir().unwrap();
+    std::fs::write(folder.path().join("arm.toml"), MODEL).unwrap();
+    for method in ["lqr", "hjb", "smc"] {
+        let arguments = [
+            "control", "arm.toml", "--method", method, "--to", "0.8", "--size", "theta=0.4", "--size", "theta'=4",
+            "--input-size", "5", "--limit", "10", "--dt", "0.002", "--members", "10", "--out", method, "--json",
+        ];
+        let (code, out, err) = greybox(folder.path(), &arguments);
+        assert_eq!(code, Some(0), "{method}: {err}");
+        let report: serde_json::Value = serde_json::from_str(&out).unwrap();
+        assert_eq!(report["closed_loop"]["diverged"], false);
+        for point in report["closed_loop"]["set_points"].as_array().unwrap() {
+            assert!(point["final_error"].as_f64().unwrap().abs() < 0.02, "{method}: {point}");
+        }
+        assert_eq!(report["family"]["diverged"], 0, "{method}");
+        let read = |name: &str| std::fs::read_to_string(folder.path().join(method).join(name)).unwrap();
+        assert!(read("law.rs").contains("pub fn control_law(state: &[f64; 2], set_point: &[f64; 1]) -> [f64; 1]"));
+        agrees(&folder.path().join(method), &read("vectors.csv"));
+    }
+}
+
+/// The C law, compiled freestanding with all warnings as errors, gives the commands of the vectors.
+fn agrees(folder: &Path, vectors: &str) {
+    if Command::new("gcc").arg("--version").output().is_err() {
+        println!("skipped: no C compiler here");
+        return;
+    }
+    let rows: Vec<&str> = vectors.lines().skip(1).collect();
+    assert!(rows.len() >= 64);
+    let main = format!(
+        "#include <stdio.h>\nvoid control_law(const double state[2], const double set_point[1], double out[1]);\n\
+         static const double in[{n}][4] = {{{}}};\nint main(void) {{\n double worst = 0.0;\n\
+         for (int i = 0; i < {n}; i++) {{\n  double u[1];\n  control_law(in[i], in[i] + 2, u);\n\
+         const double off = u[0] > in[i][3] ? u[0] - in[i][3] : in[i][3] - u[0];\n\
+         if (!(off <= worst)) worst = off;\n }}\n printf(\"%.3e\\n\", worst);\n return 0;\n}}\n",
+        rows.iter().map(|r| format!("{{{r}}}")).collect::<Vec<_>>().join(", "),
+        n = rows.len()
+    );
+    std::fs::write(folder.join("main.c"), main).unwrap();
+    let strict = ["-std=c99", "-O2", "-ffreestanding", "-Wall", "-Werror", "-c", "law.c", "-o", "law.o"];
+    let links = ["main.c", "law.o", "-lm", "-o", "run"];
+    for arguments in [&strict[..], &links[..]] {
+        let made = Command::new("gcc").current_dir(folder).args(arguments).output().unwrap();
+        assert!(made.status.success(), "{}", String::from_utf8_lossy(&made.stderr));
+    }
+    let worst = Command::new(folder.join("run")).output().unwrap();
+    let worst: f64 = String::from_utf8(worst.stdout).unwrap().trim().parse().unwrap();
+    assert!(worst < 1e-9, "{worst:e}");
+}
+
+#[test]
+fn what_cannot_be_controlled_is_said() {
+    let folder = tempfile::tempdir().unwrap();
+    let write = |name: &str, text: &str| std::fs::write(folder.path().join(name), text).unwrap();
+    write("arm.toml", MODEL);
+    write("late.toml", &MODEL.replace("= kt*v", "= kt*delay(v, 0.1)"));
+    write("shaken.toml", &MODEL.replace("= kt*v", "= kt*v + 0.1*sin(7*t)"));
+    write("two.toml", &MODEL.replace("v = { unit = \"V\" }", "v = { unit = \"V\" }\nw = { unit = \"N m\" }").replace("= kt*v", "= kt*v + w"));
+    for (arguments, part) in [
+        (&["control", "arm.toml", "--track", "phi", "--out", "o"][..], "no state `phi`"),
+        (&["control", "arm.toml", "--input", "w", "--out", "o"], "no input `w`"),
+        (&["control", "arm.toml", "--size", "theta", "--out", "o"], "NAME=VALUE"),
+        (&["control", "arm.toml", "--dt", "0", "--out", "o"], "dt"),
+        (&["control", "arm.toml", "--to", "1.5", "--limit", "0.1", "--out", "o"], "limit"),
+        (&["control", "late.toml", "--out", "o"], "delay"),
+        (&["control", "shaken.toml", "--out", "o"], "time"),
+        (&["control", "two.toml", "--out", "o"], "--input"),
+        (&["control", "missing.toml", "--out", "o"], "no such file"),
+    ] {
+        let (code, _, err) = greybox(folder.path(), arguments);
+        assert_eq!(code, Some(2), "{arguments:?}: {err}");
+        assert!(err.contains(part), "{arguments:?}: {err}");
+        assert!(!folder.path().join("o").exists());
+    }
+    // With the disturbance left out of the design, the loop is simulated with it.
+    let (code, out, err) =
+        greybox(folder.path(), &["control", "shaken.toml", "--ignore-time-terms", "--to", "0.5", "--out", "o"]);
+    assert_eq!(code, Some(0), "{err}");
+    assert!(out.contains("left out of arm"), "{out}");
+}
