@@ -37,8 +37,27 @@ fn every_method_gives_a_law_that_tracks_and_code_that_agrees() {
     std::fs::write(folder.path().join("arm.toml"), MODEL).unwrap();
     for method in ["lqr", "hjb", "smc"] {
         let arguments = [
-            "control", "arm.toml", "--method", method, "--to", "0.8", "--size", "theta=0.4", "--size", "theta'=4",
-            "--input-size", "5", "--limit", "10", "--dt", "0.002", "--members", "10", "--out", method, "--json",
+            "control",
+            "arm.toml",
+            "--method",
+            method,
+            "--to",
+            "0.8",
+            "--size",
+            "theta=0.4",
+            "--size",
+            "theta'=4",
+            "--input-size",
+            "5",
+            "--limit",
+            "10",
+            "--dt",
+            "0.002",
+            "--members",
+            "10",
+            "--out",
+            method,
+            "--json",
         ];
         let (code, out, err) = greybox(folder.path(), &arguments);
         assert_eq!(code, Some(0), "{method}: {err}");
@@ -49,7 +68,9 @@ fn every_method_gives_a_law_that_tracks_and_code_that_agrees() {
         }
         assert_eq!(report["family"]["diverged"], 0, "{method}");
         let read = |name: &str| std::fs::read_to_string(folder.path().join(method).join(name)).unwrap();
-        assert!(read("law.rs").contains("pub fn control_law(state: &[f64; 2], set_point: &[f64; 1]) -> [f64; 1]"));
+        assert!(
+            read("law.rs").contains("pub fn control_law(state: &[f64; 2], set_point: &[f64; 1]) -> [f64; 1]")
+        );
         agrees(&folder.path().join(method), &read("vectors.csv"));
     }
 }
@@ -89,14 +110,28 @@ fn what_cannot_be_controlled_is_said() {
     let write = |name: &str, text: &str| std::fs::write(folder.path().join(name), text).unwrap();
     write("arm.toml", MODEL);
     write("late.toml", &MODEL.replace("= kt*v", "= kt*delay(v, 0.1)"));
-    write("shaken.toml", &MODEL.replace("= kt*v", "= kt*v + 0.1*sin(7*t)"));
-    write("two.toml", &MODEL.replace("v = { unit = \"V\" }", "v = { unit = \"V\" }\nw = { unit = \"N m\" }").replace("= kt*v", "= kt*v + w"));
+    write(
+        "shaken.toml",
+        &MODEL.replace("= kt*v", "= kt*v + ad*sin(om*t)").replace(
+            "[eq",
+            "ad = { value = 0.1, unit = \"N m\" }\nom = { value = 7, unit = \"1/s\" }\n\n[eq",
+        ),
+    );
+    write(
+        "two.toml",
+        &MODEL
+            .replace("v = { unit = \"V\" }", "v = { unit = \"V\" }\nw = { unit = \"N m\" }")
+            .replace("= kt*v", "= kt*v + w"),
+    );
     for (arguments, part) in [
         (&["control", "arm.toml", "--track", "phi", "--out", "o"][..], "no state `phi`"),
         (&["control", "arm.toml", "--input", "w", "--out", "o"], "no input `w`"),
         (&["control", "arm.toml", "--size", "theta", "--out", "o"], "NAME=VALUE"),
-        (&["control", "arm.toml", "--dt", "0", "--out", "o"], "dt"),
-        (&["control", "arm.toml", "--to", "1.5", "--limit", "0.1", "--out", "o"], "limit"),
+        (&["control", "arm.toml", "--dt", "0", "--out", "o"], "sample time is 0"),
+        (
+            &["control", "arm.toml", "--to", "1.5", "--limit", "0.1", "--out", "o"],
+            "the actuator gives -0.1 to 0.1",
+        ),
         (&["control", "late.toml", "--out", "o"], "delay"),
         (&["control", "shaken.toml", "--out", "o"], "time"),
         (&["control", "two.toml", "--out", "o"], "--input"),
@@ -108,8 +143,10 @@ fn what_cannot_be_controlled_is_said() {
         assert!(!folder.path().join("o").exists());
     }
     // With the disturbance left out of the design, the loop is simulated with it.
-    let (code, out, err) =
-        greybox(folder.path(), &["control", "shaken.toml", "--ignore-time-terms", "--to", "0.5", "--out", "o"]);
+    let (code, out, err) = greybox(
+        folder.path(),
+        &["control", "shaken.toml", "--ignore-time-terms", "--to", "0.5", "--out", "o"],
+    );
     assert_eq!(code, Some(0), "{err}");
     assert!(out.contains("left out of arm"), "{out}");
 }

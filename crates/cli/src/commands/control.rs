@@ -28,7 +28,7 @@ const VECTORS: usize = 32;
 /// Design a controller for a model, simulate its closed loop, and write its law as code
 #[derive(Debug, Args)]
 #[command(after_help = "Examples:
-  greybox control improved.toml --track theta --to 0.5 --size theta=0.5 --size \"theta'=5\" --out controller
+  greybox control improved.toml --report report.json --track theta --to 0.5 --size theta=0.5 --size \"theta'=5\" --out controller
   greybox control improved.toml --method smc --lambda 16 --rate 100 --track theta --to 0.5 --limit 10 --out controller
 
 All numbers are in SI. Sizes are the typical deviations of states and input: weights (Bryson's rule), the width of
@@ -100,7 +100,11 @@ pub(crate) struct Arguments {
     #[arg(long)]
     compensate_friction: bool,
 
-    /// Perturbed plants on which the law is tried; parameters vary by the `std` of the model
+    /// Report of the diagnosis or calibration the model is from: how sure its parameters are
+    #[arg(long, value_name = "report.json")]
+    report: Option<PathBuf>,
+
+    /// Perturbed plants on which the law is tried: parameters vary as the report says, else by the model's `std`
     #[arg(long, value_name = "N", default_value_t = 50)]
     members: usize,
 
@@ -151,12 +155,10 @@ pub(crate) fn run(arguments: &Arguments) -> Result<Answer, Failure> {
     let run = closed.run(&reference).map_err(refused)?;
     progress.advance();
     progress.stage("perturbing");
-    let deviations: Vec<(String, f64)> = model
-        .parameters
-        .iter()
-        .filter(|p| !p.fixed)
-        .filter_map(|p| Some((p.name.clone(), p.std.filter(|s| *s > 0.0)?)))
-        .collect();
+    let deviations = match &arguments.report {
+        Some(path) => reported(path, model)?,
+        None => stated(model),
+    };
     let family = if deviations.is_empty() || arguments.members == 0 {
         None
     } else {
@@ -168,10 +170,8 @@ pub(crate) fn run(arguments: &Arguments) -> Result<Answer, Failure> {
 
     let function = function(model, &controller, &loaded.file);
     let written = |e: greybox_export::ExportError| Failure::file(&arguments.model, e);
-    let (c, rust) = (
-        function.code(Language::C99).map_err(written)?,
-        function.code(Language::Rust).map_err(written)?,
-    );
+    let (c, rust) =
+        (function.code(Language::C99).map_err(written)?, function.code(Language::Rust).map_err(written)?);
     let vectors = vectors(&function, &controller, arguments.to).map_err(written)?;
     let report = report(arguments, &loaded.file, &controller, &run, family.as_ref());
     let closed_loop = series(&run)?;
@@ -183,6 +183,42 @@ pub(crate) fn run(arguments: &Arguments) -> Result<Answer, Failure> {
         ("vectors.csv", vectors.as_bytes()),
     ])?;
     Ok(Answer::new(in_words(arguments, &controller, &run, family.as_ref()), report))
+}
+
+/// Standard deviations that the model states.
+fn stated(model: &Model) -> Vec<(String, f64)> {
+    let free = model.parameters.iter().filter(|p| !p.fixed);
+    free.filter_map(|p| Some((p.name.clone(), p.std.filter(|s| *s > 0.0)?))).collect()
+}
+
+/// Standard deviations from the 95 % intervals of a report, SI.
+fn reported(path: &Path, model: &Model) -> Result<Vec<(String, f64)>, Failure> {
+    let text = std::fs::read_to_string(path)
+        .map_err(|e| Failure::file(path, format!("the report cannot be read: {e}")).mend("check the path"))?;
+    let report: Value = serde_json::from_str(&text).map_err(|e| {
+        Failure::file(path, format!("this is no report: {e}"))
+            .mend("give the report.json of `greybox diagnose`")
+    })?;
+    let mechanisms = report["mechanisms"].as_array().into_iter().flatten().map(|m| &m["parameters"]);
+    let tables: Vec<&Value> = [&report["parameters"]].into_iter().chain(mechanisms).collect();
+    let deviation = |name: &str| {
+        let interval = tables.iter().find_map(|t| t.get(name)?.get("ci95")?.as_array())?;
+        let (low, high) = (interval.first()?.as_f64()?, interval.get(1)?.as_f64()?);
+        Some((high - low) / (2.0 * 1.96))
+    };
+    let found: Vec<(String, f64)> = model
+        .parameters
+        .iter()
+        .filter_map(|p| {
+            let factor = p.unit.as_ref().map_or(1.0, |u| u.factor);
+            Some((p.name.clone(), deviation(&p.name).map(|d| d * factor).filter(|d| *d > 0.0)?))
+        })
+        .collect();
+    if found.is_empty() {
+        return Err(Failure::file(path, "no interval of this report belongs to a parameter of the model")
+            .mend("give the report.json that was written with the model"));
+    }
+    Ok(found)
 }
 
 /// The input that commands.
@@ -202,7 +238,8 @@ fn input(arguments: &Arguments, model: &Model) -> Result<String, Failure> {
 
 fn options(arguments: &Arguments) -> Result<PlantOptions, Failure> {
     let size = |text: &String| -> Result<(String, f64), Failure> {
-        let parsed = text.rsplit_once('=').and_then(|(name, v)| Some((name.trim(), v.trim().parse::<f64>().ok()?)));
+        let parsed =
+            text.rsplit_once('=').and_then(|(name, v)| Some((name.trim(), v.trim().parse::<f64>().ok()?)));
         match parsed {
             Some((name, value)) if value > 0.0 && value.is_finite() => Ok((name.to_owned(), value)),
             _ => Err(Failure::input(format!("`--size {text}` is no size of a state"))
@@ -257,7 +294,10 @@ fn function(model: &Model, controller: &Controller, file: &str) -> Function {
         ],
         arguments: vec![
             Group { name: "state".into(), members: plant.symbols().iter().map(member).collect() },
-            Group { name: "set_point".into(), members: vec![member(&(controller.reference().to_owned(), 0))] },
+            Group {
+                name: "set_point".into(),
+                members: vec![member(&(controller.reference().to_owned(), 0))],
+            },
         ],
         constants: plant.parameters().iter().map(parameter).collect(),
         outputs: vec![(format!("{}, SI", plant.input_name()), law)],
@@ -265,7 +305,11 @@ fn function(model: &Model, controller: &Controller, file: &str) -> Function {
 }
 
 /// States around the set points, with the command that the code must give.
-fn vectors(function: &Function, controller: &Controller, to: f64) -> Result<String, greybox_export::ExportError> {
+fn vectors(
+    function: &Function,
+    controller: &Controller,
+    to: f64,
+) -> Result<String, greybox_export::ExportError> {
     let plant = controller.plant();
     let mut points = Vec::new();
     for check in controller.checks() {
@@ -375,7 +419,8 @@ fn in_words(arguments: &Arguments, controller: &Controller, run: &Run, family: O
         let _ = writeln!(text, "  left out of {}: {}", dropped.equation, dropped.term);
     }
     for m in run.metrics.iter().skip(1) {
-        let settling = m.settling.map_or("does not settle".into(), |s| format!("settles in {} s", format::number(s)));
+        let settling =
+            m.settling.map_or("does not settle".into(), |s| format!("settles in {} s", format::number(s)));
         let _ = writeln!(
             text,
             "  to {}: {settling}, overshoot {}, ends {} off, command up to {}",
@@ -387,7 +432,8 @@ fn in_words(arguments: &Arguments, controller: &Controller, run: &Run, family: O
     }
     if let Some(at) = run.diverged {
         let t = run.t.get(at).copied().unwrap_or_default();
-        let _ = writeln!(text, "  warning: the simulated loop leaves every bound after {} s", format::number(t));
+        let _ =
+            writeln!(text, "  warning: the simulated loop leaves every bound after {} s", format::number(t));
     }
     if let Some(f) = family {
         let _ = writeln!(
