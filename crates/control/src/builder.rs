@@ -223,8 +223,7 @@ impl<'a> Builder<'a> {
                 kept = kept + term;
                 continue;
             }
-            let moving =
-                term.mentions(self.input) || self.model.states.iter().any(|s| term.mentions(&s.name));
+            let moving = self.moves(&term);
             let (equation, text) = (equation.to_owned(), term.to_string());
             match (self.options.ignore_time_terms, moving) {
                 (false, false) => return Err(ControlError::Time { equation, term: text }),

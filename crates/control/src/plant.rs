@@ -116,7 +116,7 @@ pub struct Plant {
 }
 
 pub(crate) fn with_primes(name: &str, primes: u8) -> String {
-    format!("{name}{}", "'".repeat(usize::from(primes)))
+    Expr::prime(name, primes).to_string()
 }
 
 impl Plant {

@@ -31,7 +31,7 @@ impl Member {
 
 /// The symbol as in the model language.
 pub(crate) fn symbol(name: &str, primes: u8) -> String {
-    format!("{name}{}", "'".repeat(usize::from(primes)))
+    Expr::prime(name, primes).to_string()
 }
 
 /// An argument: an array of symbols.

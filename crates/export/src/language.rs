@@ -230,13 +230,13 @@ impl Writer<'_> {
             ),
             (
                 Func::Min,
-                "static double smaller(double a, double b) { return b < a ? b : a; }",
-                "fn smaller(a: f64, b: f64) -> f64 {\n    if b < a { b } else { a }\n}",
+                "static double smaller(double a, double b) { return a < b || a != a ? a : b; }",
+                "fn smaller(a: f64, b: f64) -> f64 {\n    if a < b || a.is_nan() { a } else { b }\n}",
             ),
             (
                 Func::Max,
-                "static double larger(double a, double b) { return b > a ? b : a; }",
-                "fn larger(a: f64, b: f64) -> f64 {\n    if b > a { b } else { a }\n}",
+                "static double larger(double a, double b) { return a > b || a != a ? a : b; }",
+                "fn larger(a: f64, b: f64) -> f64 {\n    if a > b || a.is_nan() { a } else { b }\n}",
             ),
             (
                 Func::Deadzone,

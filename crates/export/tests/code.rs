@@ -174,6 +174,29 @@ fn rust_compiles_without_the_standard_library_and_agrees() {
     compare(&path("run"), &vectors);
 }
 
+/// An argument that is not a number must not become a command, whichever operand it is.
+#[test]
+fn what_is_no_number_stays_none() {
+    if Command::new("gcc").arg("--version").output().is_err() {
+        println!("skipped: no C compiler here");
+        return;
+    }
+    let outputs =
+        ["min(q, 1)", "min(1, q)", "max(q, 1)", "max(1, q)", "saturate(q, 1)", "deadzone(q, 1)", "sign(q)"];
+    let code = function(&outputs).code(Language::C99).unwrap();
+    let folder = tempfile::tempdir().unwrap();
+    let path = |name: &str| folder.path().join(name);
+    let main = format!(
+        "{code}\n#include <stdio.h>\nint main(void) {{\n double x[3] = {{NAN, 0.0, 0.0}}, r[1] = {{0.0}}, out[7];\n\
+         law(x, r, out);\n for (int k = 0; k < 7; k++) printf(\"%d \", out[k] != out[k]);\n return 0;\n}}\n"
+    );
+    std::fs::write(path("main.c"), main).unwrap();
+    let made = Command::new("gcc").arg(path("main.c")).args(["-lm", "-o"]).arg(path("run")).output().unwrap();
+    assert!(made.status.success(), "{}", String::from_utf8_lossy(&made.stderr));
+    let told = Command::new(path("run")).output().unwrap().stdout;
+    assert_eq!(String::from_utf8(told).unwrap().trim(), "1 1 1 1 1 1 1");
+}
+
 #[test]
 fn what_occurs_twice_is_computed_once() {
     let code = function(&["sin(q)*sin(q) + sin(q)"]).code(Language::C99).unwrap();
