@@ -1,23 +1,15 @@
 //! Poles of linear loops, continuous and with a held command.
 
-use greybox_hjb::Linear;
+use greybox_hjb::{Linear, eigenvalues};
 use greybox_smc::check::Pole;
-use nalgebra::{DMatrix, Schur};
-
-/// Iterations of the eigenvalue solver for each state.
-const ITERATIONS: usize = 200;
+use nalgebra::DMatrix;
 
 /// Eigenvalues, the rightmost first; `None` where a number is not finite or the iteration does not end. `sizes` are
 /// those of the states: they balance the matrix.
 pub(crate) fn poles(a: &DMatrix<f64>, sizes: &[f64]) -> Option<Vec<Pole>> {
     let n = a.nrows();
     let balanced = DMatrix::from_fn(n, n, |i, j| a[(i, j)] / sizes[i] * sizes[j]);
-    if !balanced.iter().all(|v| v.is_finite()) {
-        return None;
-    }
-    let schur = Schur::try_new(balanced, f64::EPSILON, ITERATIONS * n)?;
-    let mut poles: Vec<Pole> =
-        schur.complex_eigenvalues().iter().map(|z| Pole { re: z.re, im: z.im }).collect();
+    let mut poles: Vec<Pole> = eigenvalues(&balanced)?.iter().map(|z| Pole { re: z.re, im: z.im }).collect();
     if !poles.iter().all(|p| p.re.is_finite() && p.im.is_finite()) {
         return None;
     }

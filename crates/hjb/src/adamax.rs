@@ -20,7 +20,7 @@ pub struct AdamaxOptions {
     /// A J at or below which training ends.
     pub target: f64,
     /// Iterations without a better J after which the step size is halved; a constant one keeps bursting out of the
-    /// minimum, by as much as J = 10⁻² for the F16. `None` for the constant step of Algorithm 3.
+    /// minimum, by as much as J = 5·10⁻² for the F16. `None` for the constant step of Algorithm 3.
     pub patience: Option<usize>,
     /// Record J and the weights every so many iterations; 0 for never.
     pub record_every: usize,

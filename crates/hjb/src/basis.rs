@@ -104,16 +104,22 @@ impl Monomials {
         self.exponents().position(|e| e == exponents)
     }
 
-    /// Σ Wⱼ φⱼ(x) for N weights at a point of n states.
+    /// Σ Wⱼ φⱼ(x) for N weights at a point of n states; not a number at a point of another size.
     #[must_use]
     pub fn value(&self, weights: &[f64], x: &[f64]) -> f64 {
+        if x.len() != self.states {
+            return f64::NAN;
+        }
         let power = |e: &[u8]| e.iter().zip(x).map(|(e, x)| x.powi(i32::from(*e))).product::<f64>();
         self.exponents().zip(weights).map(|(e, w)| w * power(e)).sum()
     }
 
-    /// Σ Wⱼ ∇φⱼ(x), n values.
+    /// Σ Wⱼ ∇φⱼ(x), n values; not numbers at a point of another size.
     #[must_use]
     pub fn gradient(&self, weights: &[f64], x: &[f64]) -> Vec<f64> {
+        if x.len() != self.states {
+            return vec![f64::NAN; self.states];
+        }
         let mut gradient = vec![0.0; self.states];
         for (e, w) in self.exponents().zip(weights) {
             for (i, g) in gradient.iter_mut().enumerate() {

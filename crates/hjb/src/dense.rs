@@ -47,10 +47,12 @@ pub(crate) fn solve_refined(m: &DMatrix<f64>, b: &DMatrix<f64>) -> Option<DMatri
     (is_finite(&x) && left <= SOLVED * (b.norm() + m.norm() * x.norm())).then_some(x)
 }
 
-/// Eigenvalues, in the order of the real Schur form; `None` when the iteration does not converge.
-pub(crate) fn eigenvalues(m: &DMatrix<f64>) -> Option<Vec<Complex<f64>>> {
+/// Eigenvalues of a square matrix, in the order of the real Schur form; `None` for one that is not square or not
+/// finite, or when the iteration does not converge.
+#[must_use]
+pub fn eigenvalues(m: &DMatrix<f64>) -> Option<Vec<Complex<f64>>> {
     let n = m.nrows();
-    if !is_finite(m) {
+    if n != m.ncols() || !is_finite(m) {
         return None;
     }
     MatRef::from_column_major_slice(m.as_slice(), n, n).eigenvalues().ok()

@@ -52,12 +52,16 @@ impl Feedback {
         self.basis.value(&self.weights, x)
     }
 
-    /// u(x), m values, for a plant's g(x) (n × m by columns).
+    /// u(x), m values, for a plant's g(x) (n × m by columns); not numbers where x or g has another size.
     #[must_use]
     pub fn control(&self, x: &[f64], g: &[f64]) -> Vec<f64> {
+        let inputs = self.r.l_dirty().nrows();
+        if x.len() != self.basis.states() || g.len() != x.len() * inputs {
+            return vec![f64::NAN; inputs];
+        }
         let gradient = self.basis.gradient(&self.weights, x);
         let products = g.chunks(x.len()).map(|g| g.iter().zip(&gradient).map(|(g, v)| g * v).sum());
-        let right = DVector::from_iterator(g.len() / x.len().max(1), products);
+        let right = DVector::from_iterator(inputs, products);
         (self.r.solve(&right) * -0.5).as_slice().to_vec()
     }
 

@@ -18,6 +18,7 @@ mod riccati;
 
 pub use adamax::{AdamaxOptions, Training, TrainingEnd, adamax};
 pub use basis::Monomials;
+pub use dense::eigenvalues;
 pub use design::{Optimal, design};
 pub use error::{HjbError, RiccatiError};
 pub use feedback::{Feedback, Verification, verify};

@@ -17,7 +17,7 @@ pub trait Plant {
     fn input(&self, x: &[f64], g: &mut [f64]);
 }
 
-/// ẋ = A x + B u.
+/// ẋ = A x + B u; B must have as many rows as A, or its input is not a number.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Linear {
     /// A, n × n.
@@ -42,7 +42,11 @@ impl Plant for Linear {
     }
 
     fn input(&self, _: &[f64], g: &mut [f64]) {
-        g.copy_from_slice(self.b.as_slice());
+        // Where A and B are not of one system there is no number, which every user of a plant looks for.
+        let fits = self.b.len() == g.len();
+        for (i, g) in g.iter_mut().enumerate() {
+            *g = if fits { self.b.as_slice()[i] } else { f64::NAN };
+        }
     }
 }
 

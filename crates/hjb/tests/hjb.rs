@@ -100,7 +100,7 @@ fn nonlinear_plant_with_a_known_value_function() {
     println!("nonlinear: J {:.1e} after {} iterations", trained.loss, trained.iterations);
     assert_eq!(trained.end, TrainingEnd::Target);
     assert!(trained.loss < 1e-9 && distance(&trained.weights, &exact) < 1e-6);
-    // Another minimum, which attracts half of all random starts, is told from the answer.
+    // Another minimum, which attracts a quarter of random starts, is told from the answer.
     let options = AdamaxOptions { rate: 0.005, iterations: 4000, ..Default::default() };
     let spurious = adamax(&problem, &[0.42, -0.3, -0.1], &options).unwrap();
     assert!(distance(&spurious.weights, &[0.424, -0.30, -0.105]) < 0.01, "{spurious:?}");
@@ -228,6 +228,16 @@ fn what_cannot_be_designed_is_refused() {
     assert!(design(&plant, &dmatrix![1.0], &r, &domain, 2, false).is_err());
     assert!(design(&plant, &q, &dmatrix![-1.0], &domain, 2, false).is_err());
     assert!(design(&plant, &q, &r, &domain, 3, false).is_err());
+    // A and B of different systems; a law at a point of another size.
+    let torn = Linear { a: plant.a.clone(), b: dmatrix![0.0; 0.0; 1.0] };
+    assert!(matches!(design(&torn, &q, &r, &domain, 2, false), Err(HjbError::NotFinite { .. })));
+    let law = design(&plant, &q, &r, &domain, 2, false).unwrap().feedback;
+    for (x, g) in [(&[][..], &[][..]), (&[1.0], &[0.0, 1.0]), (&[1.0, 0.0], &[1.0])] {
+        assert!(law.control(x, g).iter().all(|u| u.is_nan()));
+    }
+    assert!(
+        law.value(&[1.0]).is_nan() && law.basis().gradient(law.weights(), &[]).iter().all(|g| g.is_nan())
+    );
     // Fewer points than weights, points on a line, options that make no sense.
     let basis = Monomials::even(2, 2).unwrap();
     let on = |points: &[Vec<f64>]| Problem::new(&plant, &q, &r, basis.clone(), points);
