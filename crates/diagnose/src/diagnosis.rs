@@ -397,13 +397,13 @@ fn conclude(
     let shares: Vec<f64> = (0..improved.parts.len())
         .into_par_iter()
         .map(|i| {
-            let without = search.rss_without(&improved, i, &found.scale).unwrap_or(base);
+            let without = search.rss_without(&improved, &[i], &found.scale).unwrap_or(base);
             ((without - full) / base.max(1e-300)).clamp(0.0, 1.0)
         })
         .collect();
     // Two laws that share one work lose little each when the other takes over, and all together.
     let redundant = |a: usize, b: usize| {
-        let both = search.rss_without_both(&improved, a, b, &found.scale).unwrap_or(base);
+        let both = search.rss_without(&improved, &[a.max(b), a.min(b)], &found.scale).unwrap_or(base);
         (both - full) / base.max(1e-300) > REDUNDANT * (shares[a] + shares[b])
     };
     // A law that another one, which the library has no name for, stands in for.

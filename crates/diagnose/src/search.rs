@@ -710,9 +710,13 @@ impl<'a> Search<'a> {
         (on_windows(&found.calibrated), on_windows(&found.improved))
     }
 
-    /// Residual sum of squares of a model without its part `index`, refitted.
-    pub fn rss_without(&self, fitted: &Fitted, index: usize, scale: &[f64]) -> Option<f64> {
-        Some(raw_rss(&self.without(fitted, index, scale, 10)?, scale).iter().sum())
+    /// Residual sum of squares of a model without some of its parts (indices falling), refitted.
+    pub fn rss_without(&self, fitted: &Fitted, parts: &[usize], scale: &[f64]) -> Option<f64> {
+        let mut left = fitted.clone();
+        for index in parts {
+            left = self.without(&left, *index, scale, 10)?;
+        }
+        Some(raw_rss(&left, scale).iter().sum())
     }
 
     /// How far the score of the law that casts doubt on part `index` is above its own; `None` where none does.
@@ -738,12 +742,6 @@ impl<'a> Search<'a> {
         let kappa = kappa(&best.setup, &best.level, scale, &best.fit.point);
         let score = |f: &Fitted| self.weigh_with(&base, f, scale, &kappa).score;
         Some(score(&rival) - score(fitted))
-    }
-
-    /// Residual sum of squares of a model without two of its parts, refitted.
-    pub fn rss_without_both(&self, fitted: &Fitted, a: usize, b: usize, scale: &[f64]) -> Option<f64> {
-        let one = self.without(fitted, a.max(b), scale, 10)?;
-        Some(raw_rss(&self.without(&one, a.min(b), scale, 10)?, scale).iter().sum())
     }
 
     /// Runs all levels; again on whitened residuals where what is left over is coloured.
