@@ -223,6 +223,27 @@ impl RotaryFlexibleLink {
         [[0.0, 0.0, 1.0, 0.0], [0.0, 0.0, 0.0, 1.0], by_row(&self.hub), by_row(&self.link)]
     }
 
+    /// The drift f(x) of ẋ = f(x) + g V at x = (θ, α, θ̇, α̇), in rad/s and rad/s², with `sign` in the place of the
+    /// set-valued sign(θ̇): for laws, which need a number there.
+    #[must_use]
+    pub fn drift(&self, x: [f64; 4], sign: f64) -> [f64; 4] {
+        let by_row = |row: &VoltageBalance| -(row.smooth(x) + row.coulomb * sign) / row.acceleration;
+        [x[2], x[3], by_row(&self.hub), by_row(&self.link)]
+    }
+
+    /// The input vector g of ẋ = f(x) + g V: (0, 0, B_θ, B_α) of thesis Eq 4.2, in rad/(V s²).
+    #[must_use]
+    pub fn input(&self) -> [f64; 4] {
+        [0.0, 0.0, 1.0 / self.hub.acceleration, 1.0 / self.link.acceleration]
+    }
+
+    /// The same link without Coulomb friction.
+    #[must_use]
+    pub fn without_friction(&self) -> Self {
+        let free = |row: VoltageBalance| VoltageBalance { coulomb: 0.0, ..row };
+        Self { hub: free(self.hub), link: free(self.link), ..*self }
+    }
+
     /// Runs `samples` samples from `start` = (θ, α, θ̇, α̇). At sample k `command` gets k and the true (θ, α)
     /// and returns the voltage held until the next sample: sensor, noise and controller are its business.
     ///

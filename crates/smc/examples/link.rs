@@ -8,7 +8,7 @@ mod rig;
 use greybox_simulate::rigs::RotaryFlexibleLink;
 use greybox_smc::thesis::{LinkTangent, PrintedLaw};
 use greybox_smc::{BoundaryLayer, Design, Rate, Surface, Target};
-use rig::{DT, Figures, LIMIT, f, follow, frictionless, g, rest};
+use rig::{DT, Figures, LIMIT, f, follow, rest};
 
 fn row(name: &str, angle: f64, figures: Result<Figures, Box<dyn std::error::Error>>) {
     match figures {
@@ -28,7 +28,7 @@ fn main() -> Result<(), Box<dyn std::error::Error>> {
     println!("law                          square  settled  over    last       α      V     unlimited  |s|");
     for (what, rig) in [
         ("with friction", RotaryFlexibleLink::IDENTIFIED),
-        ("without friction", frictionless(&RotaryFlexibleLink::IDENTIFIED)),
+        ("without friction", RotaryFlexibleLink::IDENTIFIED.without_friction()),
     ] {
         // Let overshoots beyond ±40° be seen.
         let rig = RotaryFlexibleLink { theta_limit: 60_f64.to_radians(), ..rig };
@@ -55,7 +55,7 @@ fn main() -> Result<(), Box<dyn std::error::Error>> {
                 let (to_up, to_down) = (design(flat[0]).law()?, design(flat[1]).law()?);
                 let figures = follow(&rig, amplitude, |x, wanted| {
                     let (law, end) = if wanted > 0.0 { (&to_up, &up) } else { (&to_down, &down) };
-                    law.step(&x, &f(&rig, x), &g(&rig), &Target::rest(end.state))
+                    law.step(&x, &f(&rig, x), &rig.input(), &Target::rest(end.state))
                 });
                 row(name, angle, figures);
             }

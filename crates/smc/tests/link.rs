@@ -7,7 +7,7 @@ use greybox_simulate::rigs::RotaryFlexibleLink;
 use greybox_smc::check::ClosedLoop;
 use greybox_smc::thesis::{LinkTangent, PrintedLaw};
 use greybox_smc::{BoundaryLayer, Design, FlatOutput, Rate, Surface, Tangent, Target};
-use rig::{DT, Figures, LIMIT, f, follow, frictionless, g, rest};
+use rig::{DT, Figures, LIMIT, f, follow, rest};
 
 const RIG: RotaryFlexibleLink = RotaryFlexibleLink::IDENTIFIED;
 const ANGLES: [f64; 5] = [10.0, 15.0, 20.0, 25.0, 30.0];
@@ -85,7 +85,7 @@ fn erratum_e20_by_the_letter_the_loop_diverges() {
     let (mut samples, mut largest) = (0, 0.0_f64);
     let run = follow(&RIG, 30_f64.to_radians(), |x, wanted| {
         // y_f⁗ of the last sample: α″ under the voltage that was held.
-        let fourth = f(&RIG, x)[3] + g(&RIG)[3] * last;
+        let fourth = f(&RIG, x)[3] + RIG.input()[3] * last;
         let command = law.step_by_the_letter(&x, f(&RIG, x)[2], fourth, wanted)?;
         last = command.u;
         samples += 1;
@@ -116,14 +116,14 @@ fn with_feed_forward(
     let (up, down) = (to(amplitude), to(-amplitude));
     follow(rig, amplitude, |x, wanted| {
         let (law, target) = if wanted > 0.0 { &up } else { &down };
-        law.step(&x, &f(rig, x), &g(rig), target)
+        law.step(&x, &f(rig, x), &rig.input(), target)
     })
     .map_err(|e| e.to_string())
 }
 
 #[test]
 fn acceptance_c6_with_feed_forward_of_the_equilibrium_no_error_is_left() {
-    let rig = frictionless(&RIG);
+    let rig = RIG.without_friction();
     for angle in ANGLES {
         for rate in [Rate::Chain, Rate::Model] {
             let link = |_| LinkTangent::IDENTIFIED.tangent();
@@ -138,7 +138,7 @@ fn acceptance_c6_with_feed_forward_of_the_equilibrium_no_error_is_left() {
 
 #[test]
 fn the_tangent_at_the_target_needs_less_voltage_and_reaches_farther() {
-    let rig = frictionless(&RIG);
+    let rig = RIG.without_friction();
     for angle in [10.0, 15.0, 20.0, 25.0, 30.0, 35.0] {
         let there = |theta: f64| rest(&rig, theta).unwrap().1;
         let figures = with_feed_forward(&rig, angle, there, Rate::Model).unwrap();

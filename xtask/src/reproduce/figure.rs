@@ -98,10 +98,7 @@ impl Series {
     }
 
     /// With error bars of ± `errors`, one per point.
-    #[cfg_attr(
-        not(test),
-        expect(dead_code, reason = "no table of chapters 2 and 3 is drawn with error bars")
-    )]
+    #[cfg_attr(not(test), expect(dead_code, reason = "no table of chapters 2 to 4 is drawn with error bars"))]
     pub(crate) fn with_errors(self, errors: Vec<f64>) -> Self {
         Self { errors, ..self }
     }

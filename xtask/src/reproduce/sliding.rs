@@ -1,7 +1,7 @@
 //! Sliding-mode control of the identified link: section 4.2.
 
 use anyhow::Result;
-use greybox_simulate::rigs::{LinkRun, RotaryFlexibleLink, Sampling, VoltageBalance, square_wave};
+use greybox_simulate::rigs::{LinkRun, RigError, RotaryFlexibleLink, Sampling, square_wave};
 use greybox_smc::thesis::{LinkTangent, PrintedLaw};
 use greybox_smc::{
     BoundaryLayer, Design, Equilibrium, EquilibriumSolver, Law, Surface, Tangent, Target, smooth_sign,
@@ -28,34 +28,9 @@ const RIG: RotaryFlexibleLink = RotaryFlexibleLink::IDENTIFIED;
 const ASSUMED: &str = "The identified link with its friction, sampled every 0.5 ms, the voltage limited to 10 V, on a \
                        square wave of 0.25 Hz; the thesis states neither its frequency nor its amplitude.";
 
-/// Acceleration of a balance without voltage.
-fn drift(row: &VoltageBalance, [theta, alpha, theta_dot, alpha_dot]: [f64; 4]) -> f64 {
-    let volts = row.rate * theta_dot
-        + row.rate_cubed * theta_dot.powi(3)
-        + row.angle * theta
-        + row.angle_squared * theta * theta
-        + row.angle_cubed * theta.powi(3)
-        + row.deflection_rate * alpha_dot
-        + row.deflection * alpha
-        + row.deflection_squared * alpha * alpha
-        + row.coulomb * smooth_sign(theta_dot, SMOOTHING);
-    -volts / row.acceleration
-}
-
+/// f(x) of a rig for its laws, friction smoothed.
 fn f(rig: &RotaryFlexibleLink, x: [f64; 4]) -> [f64; 4] {
-    [x[2], x[3], drift(&rig.hub, x), drift(&rig.link, x)]
-}
-
-fn g(rig: &RotaryFlexibleLink) -> [f64; 4] {
-    [0.0, 0.0, 1.0 / rig.hub.acceleration, 1.0 / rig.link.acceleration]
-}
-
-fn frictionless() -> RotaryFlexibleLink {
-    RotaryFlexibleLink {
-        hub: VoltageBalance { coulomb: 0.0, ..RIG.hub },
-        link: VoltageBalance { coulomb: 0.0, ..RIG.link },
-        ..RIG
-    }
+    rig.drift(x, smooth_sign(x[2], SMOOTHING))
 }
 
 /// What a law did on the square wave, and its surface.
@@ -116,6 +91,26 @@ fn printed() -> Result<impl Fn([f64; 4], f64) -> greybox_smc::Command> {
     Ok(move |x: [f64; 4], wanted: f64| law.step(&x, f(&RIG, x)[2], wanted).unwrap_or(STOPPED))
 }
 
+/// When the law as 4.19 prints it, with y_f⁗ (that of the last sample) in the place of ÿ_f, has taken the link out of the
+/// range of its model, s; not finite when it does not.
+fn by_the_letter(amplitude: f64) -> Result<f64> {
+    let law = PrintedLaw::new(LinkTangent::IDENTIFIED, 16.0, 5e4, 500.0, LIMIT)?;
+    let samples = (2.0 / FREQUENCY / DT) as usize;
+    let mut fourth = 0.0;
+    let run = RIG.run_with_state(Sampling { dt: DT, substeps: 2 }, [0.0; 4], samples, |k, x| {
+        let drift = f(&RIG, x);
+        let command =
+            law.step_by_the_letter(&x, drift[2], fourth, reference(amplitude, k)).unwrap_or(STOPPED);
+        fourth = drift[3] + RIG.input()[3] * command.u;
+        command.u
+    });
+    match run {
+        Err(RigError::OutOfRange { time, .. }) => Ok(time),
+        Err(other) => Err(other.into()),
+        Ok(_) => Ok(f64::INFINITY),
+    }
+}
+
 const STOPPED: greybox_smc::Command =
     greybox_smc::Command { u: 0.0, unlimited: 0.0, surface: 0.0, saturated: false };
 
@@ -124,7 +119,7 @@ fn with_equilibrium(
     rig: RotaryFlexibleLink,
     amplitude: f64,
 ) -> Result<impl Fn([f64; 4], f64) -> greybox_smc::Command> {
-    let (smooth, g) = (frictionless(), g(&rig));
+    let (smooth, g) = (RIG.without_friction(), rig.input());
     let model = move |x: &[f64; 4], u: f64| {
         let f = f(&smooth, *x);
         std::array::from_fn(|i| f[i] + g[i] * u)
@@ -172,6 +167,8 @@ pub(crate) fn figure_4_1(_: &Fixture) -> Result<Piece> {
         ]);
     }
     let step = ours.step(amplitude)?;
+    let lost = by_the_letter(amplitude)?;
+    piece.checks.push(Check::new("law by the letter of 4.19: time until it leaves ±40° in s", lost));
     piece.checks.push(Check::new("printed law: settling in s", step.settling));
     piece.checks.push(Check::new("printed law: overshoot in %", step.overshoot));
     piece.checks.push(Check::new("printed law: largest deflection in degrees", ours.deflection()));
@@ -180,7 +177,7 @@ pub(crate) fn figure_4_1(_: &Fixture) -> Result<Piece> {
     let mut worst: f64 = 0.0;
     for degrees in [10.0, 15.0, 20.0, 25.0, 30.0_f64] {
         let amplitude = degrees.to_radians();
-        let still = frictionless();
+        let still = RIG.without_friction();
         let step = Followed::new(&still, amplitude, with_equilibrium(still, amplitude)?)?.step(amplitude)?;
         worst = worst.max(step.left.to_degrees());
         rows.push(vec![

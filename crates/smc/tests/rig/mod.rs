@@ -1,7 +1,7 @@
 //! The virtual rotary flexible link as a plant of the laws, and how well a square wave is followed. Shared by tests
 //! and the example `link`.
 
-use greybox_simulate::rigs::{RotaryFlexibleLink, Sampling, VoltageBalance, square_wave};
+use greybox_simulate::rigs::{RotaryFlexibleLink, Sampling, square_wave};
 use greybox_smc::{Command, Equilibrium, EquilibriumSolver, Fault, SmcError, Tangent, smooth_sign};
 
 /// Sample time, s.
@@ -13,42 +13,14 @@ pub(crate) const LIMIT: f64 = 10.0;
 /// Width of the smoothed friction in the laws, rad/s.
 const SMOOTHING: f64 = 0.05;
 
-/// The acceleration of one balance without voltage.
-fn drift(row: &VoltageBalance, [theta, alpha, theta_dot, alpha_dot]: [f64; 4]) -> f64 {
-    let torque = row.rate * theta_dot
-        + row.rate_cubed * theta_dot.powi(3)
-        + row.angle * theta
-        + row.angle_squared * theta * theta
-        + row.angle_cubed * theta.powi(3)
-        + row.deflection_rate * alpha_dot
-        + row.deflection * alpha
-        + row.deflection_squared * alpha * alpha
-        + row.coulomb * smooth_sign(theta_dot, SMOOTHING);
-    -torque / row.acceleration
-}
-
 /// f(x) of the rig, its friction smoothed.
 pub(crate) fn f(rig: &RotaryFlexibleLink, x: [f64; 4]) -> [f64; 4] {
-    [x[2], x[3], drift(&rig.hub, x), drift(&rig.link, x)]
-}
-
-/// g of the rig.
-pub(crate) fn g(rig: &RotaryFlexibleLink) -> [f64; 4] {
-    [0.0, 0.0, 1.0 / rig.hub.acceleration, 1.0 / rig.link.acceleration]
-}
-
-/// The rig without Coulomb friction.
-pub(crate) fn frictionless(rig: &RotaryFlexibleLink) -> RotaryFlexibleLink {
-    RotaryFlexibleLink {
-        hub: VoltageBalance { coulomb: 0.0, ..rig.hub },
-        link: VoltageBalance { coulomb: 0.0, ..rig.link },
-        ..*rig
-    }
+    rig.drift(x, smooth_sign(x[2], SMOOTHING))
 }
 
 /// The equilibrium with a given θ and the tangent of the whole rig there, without Coulomb friction.
 pub(crate) fn rest(rig: &RotaryFlexibleLink, theta: f64) -> Result<(Equilibrium<4>, Tangent<4>), SmcError> {
-    let (rig, g) = (frictionless(rig), g(rig));
+    let (rig, g) = (rig.without_friction(), rig.input());
     let model = |x: &[f64; 4], u: f64| {
         let f = f(&rig, *x);
         std::array::from_fn(|i| f[i] + g[i] * u)
