@@ -36,6 +36,10 @@ pub struct Score {
 /// held-out recordings.
 pub const START_SHARE: f64 = 0.25;
 
+/// Samples from which an initial state is estimated first, and fewest that tell states no sensor sees.
+const FIRST_HORIZON: usize = 15;
+const LEAST_UNMEASURED: usize = 60;
+
 impl Setup {
     /// Simulates every piece from an initial state estimated on its first quarter (prior: what the
     /// smoothed measurements say of the first sample; the residuals weigh `1/scale`).
@@ -65,6 +69,19 @@ impl Setup {
     pub fn estimate_start(&self, piece: usize, parameters: &[f64], scale: &[f64]) -> Vec<f64> {
         let n = self.data.pieces[piece].len;
         let most = ((n as f64 * START_SHARE) as usize).clamp(2, n);
+        self.grow_start(piece, parameters, scale, most)
+    }
+
+    /// Initial state of a piece by output error on a growing part of its first `most` samples. The smoothed
+    /// measurements, one-sided there, may take a free decay for one twice as large, and far beyond its first period
+    /// an output error has many minima.
+    pub(crate) fn grow_start(
+        &self,
+        piece: usize,
+        parameters: &[f64],
+        scale: &[f64],
+        most: usize,
+    ) -> Vec<f64> {
         let prior = self.start_prior(piece, 0);
         let mut x0 = self.start(piece, 0);
         for (x, (mean, std)) in x0.iter_mut().zip(&prior) {
@@ -77,15 +94,19 @@ impl Setup {
         }
         let fixed = Setup { free: Vec::new(), noise: None, ..self.clone() };
         let mut horizons = Vec::new();
-        let mut h = 60;
+        let mut h = FIRST_HORIZON;
         while h < most {
             horizons.push(h);
-            h = h * 7 / 2;
+            h *= 2;
         }
         horizons.push(most);
         for horizon in horizons {
-            let level =
-                Level { segments: vec![Segment { piece, range: 0..horizon }], priors: vec![prior.clone()] };
+            // What no sensor sees stays where it is until there is enough to tell it from.
+            let hold = |(j, p): (usize, &(f64, f64))| {
+                if horizon < LEAST_UNMEASURED && p.1.is_infinite() { (x0[j], 0.0) } else { *p }
+            };
+            let prior = prior.iter().enumerate().map(hold).collect();
+            let level = Level { segments: vec![Segment { piece, range: 0..horizon }], priors: vec![prior] };
             let point = Point { parameters: parameters.to_vec(), starts: vec![x0.clone()] };
             let fit = fixed
                 .with_problem(&level, scale, |p| p.fit(point, Limits { iterations: 12, tolerance: 1e-6 }));
@@ -161,7 +182,10 @@ impl Setup {
             let mut prior = self.start_prior(piece, a);
             for (i, (x, (mean, std))) in x0.iter_mut().zip(&mut prior).enumerate() {
                 if std.is_finite() {
-                    *x = *mean;
+                    // (The free run has its start from more than the smoothing.)
+                    if a > 0 {
+                        *x = *mean;
+                    }
                 } else {
                     let state = &run.x[piece][i * n..(i + 1) * n];
                     (*mean, *std) = (*x, (0.3 * crate::data::spread(state)).max(f64::MIN_POSITIVE));

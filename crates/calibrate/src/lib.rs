@@ -9,5 +9,5 @@ pub mod setup;
 pub use data::{Data, DataError, Hats, PieceData, spread};
 pub use free_run::{FreeRun, Score, window_length};
 pub use noise_model::Autoregression;
-pub use problem::{Ending, Fit, Free, Limits, Point, Problem, Segment, SegmentRows, StartPrior};
+pub use problem::{Ending, Fit, Free, Limits, Point, Problem, Segment, SegmentRows, StartPrior, Work};
 pub use setup::{Level, Setup, UnknownState, free_parameters};

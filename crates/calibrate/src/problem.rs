@@ -29,6 +29,7 @@
 
 use std::ops::Range;
 use std::sync::Arc;
+use std::sync::atomic::{AtomicU64, Ordering};
 
 use greybox_model::System;
 use greybox_simulate::{
@@ -93,6 +94,25 @@ pub struct Problem<'a> {
     pub past: &'a [Vec<Option<Vec<f64>>>],
     /// Noise per channel by which the rows of the measurements are whitened; `None`: as they are.
     pub noise: Option<&'a [Autoregression]>,
+    /// Where the work done is added up.
+    pub work: &'a Work,
+}
+
+/// Work done: evaluations of the right-hand side, each counted once for the state and once for every tangent, times
+/// the operations of one. Unlike time it is the same in every run, whatever the machine and the number of threads.
+#[derive(Debug, Default)]
+pub struct Work(AtomicU64);
+
+impl Work {
+    /// So far.
+    pub fn done(&self) -> u64 {
+        self.0.load(Ordering::Relaxed)
+    }
+
+    fn add(&self, trajectory: &Trajectory, lanes: usize, system: &System) {
+        let work = trajectory.evaluations * (1 + lanes) * system.rhs.registers();
+        self.0.fetch_add(work as u64, Ordering::Relaxed);
+    }
 }
 
 /// A point of the search.
@@ -306,6 +326,7 @@ impl Problem<'_> {
             let (trajectory, carry) = simulation.run_on(start, range, before, carried);
             (trajectory, Some(carry))
         };
+        self.work.add(&trajectory, seeds.lanes(), self.system);
         let missing: Vec<Vec<bool>> = match self.noise {
             Some(_) => (0..ny).map(|c| self.missing(segment, c)).collect(),
             None => Vec::new(),

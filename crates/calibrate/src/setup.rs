@@ -8,7 +8,7 @@ use rayon::prelude::*;
 
 use crate::data::{Data, Hats};
 use crate::noise_model::{Autoregression, MOST};
-use crate::problem::{Fit, Free, Limits, Point, Problem, Segment, StartPrior, segments};
+use crate::problem::{Fit, Free, Limits, Point, Problem, Segment, StartPrior, Work, segments};
 
 /// Shortest segment, samples.
 const LEAST: usize = 40;
@@ -16,6 +16,12 @@ const LEAST: usize = 40;
 /// Samples of a recording, and stretches of it, by which a method is judged.
 const JUDGED: usize = 1500;
 const STRETCHES: usize = 8;
+
+/// Most samples to which the state at a piece's first sample is fitted.
+const ONE_SIDED: usize = 60;
+
+/// Mean square of these samples over that of all from which a start is in doubt.
+const BADLY_STARTED: f64 = 2.0;
 
 /// A compiled model, its data, and how to integrate it.
 #[derive(Debug, Clone)]
@@ -41,6 +47,8 @@ pub struct Setup {
     /// Noise per channel by which fits are whitened (see [`Problem::noise`]); simulations and scores
     /// do not use it.
     pub noise: Option<Arc<Vec<Autoregression>>>,
+    /// Work done by the fits of this setup and of all that were made from it.
+    pub work: Arc<Work>,
 }
 
 /// A name that is no state of the model.
@@ -87,6 +95,7 @@ impl Setup {
             free,
             carried: Vec::new(),
             noise: None,
+            work: Arc::default(),
         };
         let tolerance: Vec<f64> = setup.data.spread.iter().map(|s| 1e-3 * s).collect();
         setup.choose_method(&tolerance, JUDGED);
@@ -294,7 +303,8 @@ impl Setup {
         Level { segments, priors }
     }
 
-    /// Initial states from the measurements; unmeasured entries from a simulation with `parameters`.
+    /// Initial states from the measurements; unmeasured entries from a simulation with `parameters`. That at a piece's
+    /// first sample, where smoothing is one-sided, is fitted to its first samples.
     pub fn starts(&self, level: &Level, parameters: &[f64]) -> Vec<Vec<f64>> {
         let unmeasured: Vec<usize> =
             (0..self.system.nx).filter(|&i| self.hats.tolerance[i].is_infinite()).collect();
@@ -324,11 +334,13 @@ impl Setup {
             .segments
             .iter()
             .map(|s| {
+                if s.range.start == 0 {
+                    let most = s.range.len().min(ONE_SIDED);
+                    return self.grow_start(s.piece, parameters, &self.data.sigma, most);
+                }
                 let mut x = self.start(s.piece, s.range.start);
                 for &i in &unmeasured {
-                    if let Some(Some(run)) = runs.get(s.piece)
-                        && s.range.start > 0
-                    {
+                    if let Some(Some(run)) = runs.get(s.piece) {
                         x[i] = run[i * self.data.pieces[s.piece].len + s.range.start];
                     }
                 }
@@ -363,6 +375,7 @@ impl Setup {
             carried: &self.carried,
             past: &self.hats.states,
             noise: self.noise.as_ref().map(|noise| noise.as_slice()),
+            work: &self.work,
         })
     }
 
@@ -399,8 +412,52 @@ impl Setup {
                 .min_by(|a, b| a.0.total_cmp(&b.0))
                 .map(|(_, p)| p.clone())
                 .unwrap_or_else(|| Point { parameters: self.values(), starts: Vec::new() });
-            problem.fit(best, limits)
+            problem.fit(self.with_fresh_starts(problem, best), limits)
         })
+    }
+
+    /// A point whose pieces' first samples fit worse than the rest of its level (the wrong physics of an earlier fit
+    /// may have led the start of a free decay into another minimum) gets those starts anew where they are better.
+    fn with_fresh_starts(&self, problem: &Problem<'_>, mut point: Point) -> Point {
+        let firsts: Vec<usize> =
+            (0..problem.segments.len()).filter(|&i| problem.segments[i].range.start == 0).collect();
+        if firsts.is_empty() || point.starts.len() != problem.segments.len() {
+            return point;
+        }
+        let ny = self.system.ny;
+        let rows = problem.rows(&point, false, None);
+        let squares = |r: &[f64]| r.iter().map(|v| v * v).sum::<f64>();
+        let samples: usize = problem.segments.iter().map(|s| s.range.len()).sum();
+        let mean =
+            rows.iter().map(|s| squares(&s.r[..s.rows - self.system.nx])).sum::<f64>() / samples as f64;
+        let grown: Vec<(usize, Vec<f64>)> = firsts
+            .into_par_iter()
+            .filter(|&i| {
+                let n = problem.segments[i].range.len();
+                let few = n.min(ONE_SIDED);
+                let first: f64 = (0..ny).map(|c| squares(&rows[i].r[c * n..c * n + few])).sum();
+                !(first <= BADLY_STARTED * mean * few as f64)
+            })
+            .map(|i| {
+                let segment = &problem.segments[i];
+                let most = segment.range.len().min(ONE_SIDED);
+                (i, self.grow_start(segment.piece, &point.parameters, &self.data.sigma, most))
+            })
+            .collect();
+        if grown.is_empty() {
+            return point;
+        }
+        let before = point.clone();
+        for (i, start) in &grown {
+            point.starts[*i].clone_from(start);
+        }
+        let anew = problem.rows(&point, false, None);
+        for (i, _) in grown {
+            if !(squares(&anew[i].r) < squares(&rows[i].r)) {
+                point.starts[i].clone_from(&before.starts[i]);
+            }
+        }
+        point
     }
 
     /// The `most` points of least cost, best first; points that cannot be simulated are left out, and so is

@@ -6,10 +6,10 @@ use std::sync::Arc;
 use greybox_calibrate::{Data, Setup, free_parameters};
 use greybox_diagnose::{Observer, Stage, evidence::Evidence, library, search};
 
-struct Talk(std::time::Instant);
+struct Talk(std::time::Instant, Arc<greybox_calibrate::Work>);
 impl Observer for Talk {
     fn stage(&self, stage: Stage) {
-        println!("{:7.2} {stage:?}", self.0.elapsed().as_secs_f64());
+        println!("{:7.2} {:7.2} G {stage:?}", self.0.elapsed().as_secs_f64(), self.1.done() as f64 / 1e9);
     }
     fn weighed(&self, kind: &str, e: &Evidence, share: f64) {
         println!("{:7.2}   best {kind}: {e:?} share {share:.2e}", self.0.elapsed().as_secs_f64());
@@ -39,9 +39,9 @@ fn main() -> Result<(), Box<dyn std::error::Error>> {
     };
     let train = read(&args[1..split])?;
     let test = read(args.get(split + 1..).unwrap_or(&[]))?;
-    let talk = Talk(std::time::Instant::now());
     let data = Arc::new(Data::new(&model, &train)?);
     let setup = Setup::new(&model, data, free_parameters(&model))?;
+    let talk = Talk(std::time::Instant::now(), setup.work.clone());
     println!("sigma {:?} spread {:?} method {:?}", setup.data.sigma, setup.data.spread, setup.method);
     for (i, s) in setup.data.pieces[0].smooth.iter().enumerate() {
         println!("channel {i} window {} {}", s.window, s.derivative_window);

@@ -26,12 +26,20 @@ use crate::{Observer, Stage};
 pub const HELD_OUT_SHARE: f64 = 0.2;
 
 /// What may be chosen.
-#[derive(Debug, Clone, Default)]
+#[derive(Debug, Clone)]
 pub struct Options {
     /// Seed, echoed into the report. (Nothing in the present algorithm is random.)
     pub seed: u64,
     /// Mechanisms instead of the built-in library.
     pub library: Option<Vec<Mechanism>>,
+    /// Work of the search ([`greybox_calibrate::Work`]) after which it looks for nothing more.
+    pub work: u64,
+}
+
+impl Default for Options {
+    fn default() -> Options {
+        Options { seed: 0, library: None, work: crate::search::MOST_WORK }
+    }
 }
 
 /// Why a diagnosis could not be made.
@@ -236,6 +244,8 @@ pub struct Diagnosis {
     pub better_holds: Vec<usize>,
     /// Seed.
     pub seed: u64,
+    /// The search ended at its limit of work ([`Options::work`]), not because nothing more was to be found.
+    pub limited: bool,
 }
 
 /// Diagnoses a model.
@@ -255,7 +265,8 @@ pub fn diagnose(
     };
     let Layout { train, holdout, source } = layout(model, train, holdout)?;
     let nominal = Setup::new(model, train.clone(), free_parameters(model))?;
-    let search = Search::new(nominal.clone(), &library, observer);
+    let mut search = Search::new(nominal.clone(), &library, observer);
+    search.most_work = options.work;
     let found = search.run();
     conclude(&nominal, holdout, source, &library, &search, found, options, observer)
 }
@@ -468,6 +479,7 @@ fn conclude(
         holds,
         better_holds: found.better_holds.iter().map(|b| b.0).collect(),
         seed: options.seed,
+        limited: found.limited,
     })
 }
 

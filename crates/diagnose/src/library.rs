@@ -126,6 +126,8 @@ pub struct Inner {
     /// The parameter is an angular frequency over this variable: first values come from the spectrum of
     /// what is left over, besides the grid.
     pub spectral: Option<Expr>,
+    /// What a spectral law is multiplied by.
+    pub carrier: Option<Expr>,
 }
 
 /// A state of a mechanism's own.
@@ -391,6 +393,7 @@ struct InnerFile {
     #[serde(default)]
     grid: Vec<f64>,
     spectral: Option<String>,
+    carrier: Option<String>,
     #[serde(default)]
     scale: Option<String>,
     low: Option<f64>,
@@ -707,7 +710,7 @@ impl Mechanism {
                 | Scale::Frequency(e) => Some(e),
                 Scale::One | Scale::Step | Scale::Duration | Scale::PerDuration => None,
             };
-            for e in scale.into_iter().chain(&inner.spectral) {
+            for e in scale.into_iter().chain(&inner.spectral).chain(&inner.carrier) {
                 if let Some(n) = stranger(e, placeholder) {
                     return Err(Fault::new(
                         "inner",
@@ -923,7 +926,11 @@ fn memory(name: String, value: toml::Value) -> Result<Memory, Fault> {
 fn inner(name: String, value: toml::Value) -> Result<Inner, Fault> {
     let fault = |message: String| Fault::new("inner", &name, format!("[inner] {name}: {message}"));
     let entry: InnerFile = value.try_into().map_err(|e: toml::de::Error| fault(e.message().to_string()))?;
-    let spectral = entry.spectral.as_deref().map(|t| expression(t, "inner", &name)).transpose()?;
+    let of = |text: &Option<String>| text.as_deref().map(|t| expression(t, "inner", &name)).transpose();
+    let (spectral, carrier) = (of(&entry.spectral)?, of(&entry.carrier)?);
+    if carrier.is_some() && spectral.is_none() {
+        return Err(fault("`carrier` is what a law with a `spectral` variable is multiplied by".into()));
+    }
     if (entry.grid.is_empty() && spectral.is_none()) || !entry.grid.iter().all(|v| v.is_finite()) {
         return Err(fault("`grid` must list finite first values, such as [0.1, 0.3]".into()));
     }
@@ -936,7 +943,7 @@ fn inner(name: String, value: toml::Value) -> Result<Inner, Fault> {
     if !enclosed {
         return Err(fault(format!("`low` ({low}) and `high` ({high}) must enclose the grid")));
     }
-    Ok(Inner { name, grid: entry.grid, scale, low, high, spectral })
+    Ok(Inner { name, grid: entry.grid, scale, low, high, spectral, carrier })
 }
 
 fn scale(text: &str, name: &str) -> Result<Scale, Fault> {

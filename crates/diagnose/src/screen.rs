@@ -548,7 +548,7 @@ fn grid(
     for (inner, scale) in mechanism.inner.iter().zip(scales) {
         let mut values: Vec<f64> = inner.grid.iter().map(|g| g * scale).collect();
         if let Some(variable) = &inner.spectral {
-            let proposed = spectra.propose(candidate, variable);
+            let proposed = spectra.propose(candidate, variable, inner.carrier.as_ref());
             values
                 .extend(proposed.into_iter().filter(|v| *v >= inner.low * scale && *v <= inner.high * scale));
         }

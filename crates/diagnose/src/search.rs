@@ -2,6 +2,7 @@
 //! ones later.
 
 use std::sync::Arc;
+use std::sync::atomic::{AtomicBool, Ordering};
 
 use greybox_calibrate::{Ending, Fit, Free, Level, Limits, Point, Setup, free_parameters};
 use greybox_model::system::CompileError;
@@ -30,6 +31,9 @@ const CLEAR: f64 = 1.35;
 const SLOWEST: f64 = 10.0;
 /// Most samples that a level of the search looks at; longer recordings are seen through windows.
 const MOST_SAMPLES: usize = 5000;
+/// Work after which nothing more is looked for: laws that the library lacks are pieced together from mechanisms with
+/// memories and delays, each slower to simulate than the one before.
+pub const MOST_WORK: u64 = 60_000_000_000;
 /// Most mechanisms that are looked for.
 const MOST_MECHANISMS: usize = 4;
 /// Most candidates that are fitted per round.
@@ -168,6 +172,8 @@ pub struct Found {
     pub better_holds: Vec<(usize, Hold, Hold)>,
     /// Residual scale of the improved model per channel, SI.
     pub scale: Vec<f64>,
+    /// The work ran out before the search had come to its end.
+    pub limited: bool,
 }
 
 /// The search with everything it needs.
@@ -178,6 +184,10 @@ pub struct Search<'a> {
     pub observer: &'a dyn Observer,
     /// Never try another hold than the stated ones.
     pub keep_holds: bool,
+    /// Work ([`greybox_calibrate::Work`]) after which nothing more is looked for.
+    pub most_work: u64,
+    /// Whether something was left out for that.
+    limited: AtomicBool,
     nominal: Setup,
     all: Vec<Candidate>,
     /// Laws that only cast doubt on others.
@@ -281,7 +291,17 @@ impl<'a> Search<'a> {
         all.retain(|c| samples >= MEMORY_SAMPLES || library[c.mechanism].states.is_empty());
         let (all, doubts) = all.into_iter().partition(|c| library[c.mechanism].doubts.is_empty());
         let lengths = lengths(&nominal);
-        Search { library, observer, keep_holds: false, nominal, all, doubts, lengths }
+        Search {
+            library,
+            observer,
+            keep_holds: false,
+            most_work: MOST_WORK,
+            limited: AtomicBool::new(false),
+            nominal,
+            all,
+            doubts,
+            lengths,
+        }
     }
 
     /// The candidates it considers.
@@ -723,8 +743,13 @@ impl<'a> Search<'a> {
     pub fn doubt(&self, fitted: &Fitted, index: usize, scale: &[f64]) -> Option<f64> {
         let part = &fitted.parts[index].candidate;
         let kind = &self.library[part.mechanism].kind;
+        let meets = |place: &Place| match (place, &part.place) {
+            // A force of the motion beside one that is a force of time alone.
+            (Place::Motion(motion), Place::Equation(e)) => motion.weights[*e] != 0.0,
+            (place, other) => place == other,
+        };
         let doubts = |c: &&Candidate| {
-            c.place == part.place && !c.mirrored && self.library[c.mechanism].doubts.contains(kind)
+            meets(&c.place) && !c.mirrored && self.library[c.mechanism].doubts.contains(kind)
         };
         let doubt = self.doubts.iter().find(doubts)?;
         let base = self.without(fitted, index, scale, 12)?;
@@ -771,6 +796,10 @@ impl<'a> Search<'a> {
         // ones a fit may also be stuck.
         state.loose = state.misfit() > 1.05;
         for (step, &length) in self.lengths.iter().enumerate() {
+            // The last, on which conclusions rest, in any case.
+            if self.is_spent() && step + 1 < self.lengths.len() {
+                continue;
+            }
             if step > 0 {
                 self.lengthen(&mut calibrated, &mut state, length);
             }
@@ -801,6 +830,7 @@ impl<'a> Search<'a> {
         if !settled {
             self.think_again(&mut calibrated, &mut state);
         }
+        let limited = self.limited.load(Ordering::Relaxed);
         // What was searched through windows is fitted to all data in the end.
         let length = self.lengths.last().copied().unwrap_or(SHORTEST);
         let whole = self.nominal.windows(length, usize::MAX);
@@ -821,7 +851,23 @@ impl<'a> Search<'a> {
             .filter(|&i| current.setup.holds[i] != self.nominal.holds[i])
             .map(|i| (i, self.nominal.holds[i], current.setup.holds[i]))
             .collect();
-        Found { calibrated, improved: current, accepted: state.accepted, better_holds, scale: state.scale }
+        let (accepted, scale) = (state.accepted, state.scale);
+        Found { calibrated, improved: current, accepted, better_holds, scale, limited }
+    }
+
+    /// Whether the work is used up. Asked only between one step of the search and the next: the sum does not
+    /// depend on the order in which threads add to it.
+    fn is_spent(&self) -> bool {
+        self.would_overspend(0)
+    }
+
+    /// Whether so much more is too much.
+    fn would_overspend(&self, more: u64) -> bool {
+        let over = self.nominal.work.done().saturating_add(more) > self.most_work;
+        if over {
+            self.limited.store(true, Ordering::Relaxed);
+        }
+        over
     }
 
     /// From the windows to all data. A mechanism that fits what the windows show and nothing beyond them is
@@ -857,7 +903,7 @@ impl<'a> Search<'a> {
     /// A fit that is left well above the noise may be stuck where long segments led it: from the shortest
     /// segments up again, with all its mechanisms; if that is better, the search goes on from there.
     fn anneal(&self, calibrated: &mut Fitted, state: &mut State) {
-        if state.misfit() < STUCK || self.lengths.len() < 2 {
+        if state.misfit() < STUCK || self.lengths.len() < 2 || self.is_spent() {
             return;
         }
         let mut fitted = state.current.clone();
@@ -936,7 +982,10 @@ impl<'a> Search<'a> {
     /// One level: rounds until nothing more is believable.
     fn level(&self, calibrated: &mut Fitted, state: &mut State) {
         let mut seen: Vec<Vec<Candidate>> = Vec::new();
-        while state.current.parts.len() < MOST_MECHANISMS {
+        // A round is dearer than the one before, which had a mechanism less to simulate.
+        let mut last = 0;
+        while state.current.parts.len() < MOST_MECHANISMS && !self.would_overspend(last) {
+            let begun = self.nominal.work.done();
             if state.misfit() < 1.03 && !self.is_coloured(state, WHITE) && state.current.setup.noise.is_none()
             {
                 break;
@@ -945,6 +994,7 @@ impl<'a> Search<'a> {
             if !self.round(calibrated, state) && !self.pair_round(calibrated, state) {
                 break;
             }
+            last = self.nominal.work.done() - begun;
             seen.push(before);
             if seen.contains(&state.candidates()) {
                 break; // what was accepted has been dropped again
@@ -1217,6 +1267,9 @@ impl<'a> Search<'a> {
     /// Second thoughts; where they change the model, whether it lacks something still.
     fn think_again(&self, calibrated: &mut Fitted, state: &mut State) {
         for _ in 0..MOST_MECHANISMS {
+            if self.is_spent() {
+                break;
+            }
             let before = state.candidates();
             self.reconsider(calibrated, state);
             if state.candidates() == before {
@@ -1237,7 +1290,7 @@ impl<'a> Search<'a> {
         self.reconsider_pair(state);
         let mut index = 0;
         let mut relieved = 0;
-        while index < state.current.parts.len() {
+        while index < state.current.parts.len() && !self.is_spent() {
             let at = index;
             index += 1;
             let Some(base) = self.without(&state.current, at, &state.scale, 12) else { continue };

@@ -45,8 +45,18 @@ pub struct Spectra<'a> {
     along: &'a Along<'a>,
     /// The force that each equation lacks, `[piece][equation][sample]`.
     forces: &'a [Vec<Vec<f64>>],
-    /// Those already made: (equation, variable) and the values.
-    known: Mutex<Vec<(usize, Expr, Vec<f64>)>>,
+    /// Those already made.
+    known: Mutex<Vec<(Wanted, Vec<f64>)>>,
+}
+
+/// What a proposal is made for.
+#[derive(Debug, Clone, PartialEq)]
+struct Wanted {
+    equation: usize,
+    /// What the law swings over.
+    variable: Expr,
+    /// What it is multiplied by.
+    carrier: Option<Expr>,
 }
 
 impl<'a> Spectra<'a> {
@@ -62,31 +72,46 @@ impl<'a> Spectra<'a> {
         Spectra { setup, level, scale, point, along, forces, known: Mutex::new(Vec::new()) }
     }
 
-    /// Angular frequencies over `variable` (an expression in the mechanism's placeholders), strongest first.
-    pub fn propose(&self, candidate: &Candidate, variable: &Expr) -> Vec<f64> {
-        let variable = candidate.translate(&self.setup.model, variable, &|n| n.to_string());
+    /// Angular frequencies over `variable` of a law that is multiplied by `carrier` (expressions in the mechanism's
+    /// placeholders), strongest first.
+    pub fn propose(&self, candidate: &Candidate, variable: &Expr, carrier: Option<&Expr>) -> Vec<f64> {
+        let translate = |e: &Expr| candidate.translate(&self.setup.model, e, &|n| n.to_string());
         let equation = match &candidate.place {
             Place::Equation(e) => Some(*e),
             _ => candidate.motion().and_then(|m| m.weights.iter().position(|w| *w != 0.0)),
         };
         let Some(equation) = equation else { return Vec::new() };
-        let found = |known: &Vec<(usize, Expr, Vec<f64>)>| {
-            known.iter().find(|k| k.0 == equation && k.1 == variable).map(|k| k.2.clone())
-        };
+        let wanted = Wanted { equation, variable: translate(variable), carrier: carrier.map(translate) };
+        let found =
+            |known: &Vec<(Wanted, Vec<f64>)>| known.iter().find(|k| k.0 == wanted).map(|k| k.1.clone());
         if let Ok(known) = self.known.lock()
             && let Some(values) = found(&known)
         {
             return values;
         }
-        let values = if variable == Expr::var("t") {
-            self.over_time(equation)
-        } else {
-            self.over(equation, &variable)
-        };
+        let values = self.lines_of(&wanted).unwrap_or_default();
         if let Ok(mut known) = self.known.lock() {
-            known.push((equation, variable, values.clone()));
+            known.push((wanted, values.clone()));
         }
         values
+    }
+
+    fn lines_of(&self, wanted: &Wanted) -> Option<Vec<f64>> {
+        let mut force = self.force(wanted.equation);
+        let over_time = wanted.variable == Expr::var("t");
+        let Some(carrier) = &wanted.carrier else {
+            return if over_time {
+                Some(self.over_time(force.into_iter().chain(self.residuals())))
+            } else {
+                self.over(&force?, &wanted.variable)
+            };
+        };
+        // c sin wt has, times c, a line at w: that of the mean of c².
+        let carriers = self.along.eval(std::slice::from_ref(carrier), &[])?.pop()?;
+        for (f, c) in force.iter_mut().flatten().flatten().zip(carriers.iter().flatten()) {
+            *f *= if c.is_finite() { *c } else { 0.0 };
+        }
+        if over_time { Some(self.over_time(force.into_iter())) } else { self.over(&force?, &wanted.variable) }
     }
 
     /// The force that an equation leaves over, without its linear part, clipped.
@@ -113,11 +138,12 @@ impl<'a> Spectra<'a> {
         Some(force.iter().map(|piece| rest.by_ref().take(piece.len()).collect()).collect())
     }
 
-    fn over_time(&self, equation: usize) -> Vec<f64> {
+    /// Lines over time of several series `[piece][sample]`.
+    fn over_time(&self, series: impl Iterator<Item = Vec<Vec<f64>>>) -> Vec<f64> {
         let mut values = Vec::new();
-        let mut of = |series: &[Vec<f64>]| {
+        for series in series {
             let pieces = &self.setup.data.pieces;
-            let Some((x, piece)) = series.iter().zip(pieces).max_by_key(|(x, _)| x.len()) else { return };
+            let Some((x, piece)) = series.iter().zip(pieces).max_by_key(|(x, _)| x.len()) else { continue };
             let (frequency, power) = spectrum(x, piece.dt);
             // A window's main lobe is four lines wide: refine by the parabola through the peak.
             let step = frequency.get(1).copied().unwrap_or(0.0);
@@ -127,12 +153,6 @@ impl<'a> Spectra<'a> {
                 let shift = if bend < 0.0 { (0.5 * (a - c) / bend).clamp(-0.5, 0.5) } else { 0.0 };
                 values.push(2.0 * std::f64::consts::PI * step * (i as f64 + shift));
             }
-        };
-        if let Some(force) = self.force(equation) {
-            of(&force);
-        }
-        for residual in self.residuals() {
-            of(&residual);
         }
         // A frequency that the input itself is made of cannot be told from what the motion does.
         // A model far off answers wrongly wherever it is moved, line or not.
@@ -172,11 +192,9 @@ impl<'a> Spectra<'a> {
         channels.map(|c| self.setup.data.sigma[c]).sum()
     }
 
-    /// Lines of the force over a variable that is not evenly sampled.
-    fn over(&self, equation: usize, variable: &Expr) -> Vec<f64> {
-        let Some(force) = self.force(equation) else { return Vec::new() };
-        let Some(mut of) = self.along.eval(std::slice::from_ref(variable), &[]) else { return Vec::new() };
-        let Some(q) = of.pop() else { return Vec::new() };
+    /// Lines of a force over a variable that is not evenly sampled.
+    fn over(&self, force: &[Vec<f64>], variable: &Expr) -> Option<Vec<f64>> {
+        let q = self.along.eval(std::slice::from_ref(variable), &[])?.pop()?;
         let pairs: Vec<(f64, f64)> = q
             .iter()
             .flatten()
@@ -187,7 +205,7 @@ impl<'a> Spectra<'a> {
         let low = pairs.iter().fold(f64::INFINITY, |m, p| m.min(p.0));
         let high = pairs.iter().fold(f64::NEG_INFINITY, |m, p| m.max(p.0));
         if high <= low || pairs.is_empty() {
-            return Vec::new();
+            return None;
         }
         let step = 0.4 / (high - low) * 2.0;
         // No finer than the samples resolve: half a turn of phase between neighbours.
@@ -221,7 +239,7 @@ impl<'a> Spectra<'a> {
             let turns = (1..).map(|i| f64::from(i) * RIPPLE_STEP).take_while(|t| *t <= RIPPLES);
             values.extend(turns.map(|t| t * period).filter(|n| *n <= step * count as f64));
         }
-        distinct(values)
+        Some(distinct(values))
     }
 }
 

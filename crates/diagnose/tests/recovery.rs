@@ -28,6 +28,28 @@ struct Left {
     coulomb: f64,
     cubic: f64,
     offset: f64,
+    quintic: f64,
+    /// Stiffness and half of the play of a second spring.
+    gap: (f64, f64),
+    /// Amplitude and frequency, Hz, of a stiffness that swings.
+    swing: (f64, f64),
+    /// Amplitude and frequency, Hz, of a force.
+    hum: (f64, f64),
+}
+
+impl Left {
+    /// All but friction, at position x and time t.
+    fn force(&self, x: f64, t: f64) -> f64 {
+        let sine = |(a, f): (f64, f64)| a * (std::f64::consts::TAU * f * t + 0.7).sin();
+        let (stiffness, gap) = self.gap;
+        let beyond = stiffness * (x - x.clamp(-gap, gap));
+        self.cubic * x.powi(3)
+            + self.quintic * x.powi(5)
+            + self.offset
+            + beyond
+            + sine(self.swing) * x
+            + sine(self.hum)
+    }
 }
 
 /// x'' = (f − 0.6 x' − 42 x − effects) for m = 1, 200 small steps a sample.
@@ -48,7 +70,8 @@ fn record(seed: u64, left: Left, noise: f64) -> Recording {
         for i in 0..fine {
             let w = i as f64 / fine as f64;
             let f = samples[k] + w * (samples[(k + 1).min(n - 1)] - samples[k]);
-            let smooth = f - 0.6 * v - 42.0 * x - left.cubic * x * x * x - left.offset;
+            let t = k as f64 * dt + i as f64 * h;
+            let smooth = f - 0.6 * v - 42.0 * x - left.force(x, t);
             // Dry friction removes at most the momentum there is (semi-implicit, sticks exactly).
             let free = v + h * smooth;
             v = if free.abs() <= h * left.coulomb { 0.0 } else { free - h * left.coulomb * free.signum() };
@@ -121,6 +144,41 @@ fn two_effects_at_once_are_both_named() {
         })
         .count();
     assert!(both >= 3, "{both} of 4");
+}
+
+/// Seeds of four for which a mechanism is named with more than 0.8.
+fn confident(kind: &str, left: Left) -> usize {
+    let named = |s: &u64| answer(*s, left).mechanisms.iter().any(|m| m.kind == kind && m.confidence > 0.8);
+    (0..4).filter(named).count()
+}
+
+/// What looks like a gap may be a spring that hardens smoothly, and what looks like a hum a stiffness that swings:
+/// neither is in the library.
+#[test]
+fn a_law_outside_the_library_is_not_named_as_its_neighbour() {
+    let gap = Left { gap: (60.0, 0.15), ..Left::default() };
+    assert!(confident("dead_zone", gap) >= 3);
+    let hardening = Left { quintic: 4000.0, ..Left::default() };
+    assert_eq!(confident("dead_zone", hardening), 0);
+    let hum = Left { hum: (0.4, 3.1), ..Left::default() };
+    assert!(confident("periodic_disturbance", hum) >= 3);
+    let swinging = Left { swing: (8.0, 0.35), ..Left::default() };
+    assert_eq!(confident("periodic_disturbance", swinging), 0);
+}
+
+/// A search without work left says so, and what it has found stands.
+#[test]
+fn a_search_that_runs_out_of_work_says_so() {
+    let model = Model::from_toml(MODEL, "oscillator.toml").unwrap();
+    let left = Left { coulomb: 0.8, cubic: 300.0, ..Left::default() };
+    let (train, held) = ([record(1, left, 1e-3)], [record(1001, left, 1e-3)]);
+    let with = |work| {
+        let options = Options { work, ..Options::default() };
+        diagnose(&model, &train, &held, &options, &Quiet).unwrap()
+    };
+    let (none, all) = (with(0), with(Options::default().work));
+    assert!(none.limited && none.mechanisms.is_empty() && none.verdict == Verdict::Unexplained);
+    assert!(!all.limited && all.mechanisms.len() == 2);
 }
 
 /// Metres or millimetres, a shift of the clock: the physics is the same.

@@ -318,6 +318,18 @@ fn findings(d: &Diagnosis, sources: &Sources<'_>) -> Vec<Finding> {
             });
         }
     }
+    if d.limited {
+        out.push(Finding {
+            severity: Severity::Warning,
+            code: "limit".to_string(),
+            recording: None,
+            channel: None,
+            message: "the search ended at its limit of work: more may be missing than was found, and other \
+                      explanations were not all tried"
+                .to_string(),
+            mend: Some("give it more with `--work`, or a shorter recording".to_string()),
+        });
+    }
     out.extend(health_findings(&d.nominal, sources.train.iter().chain(sources.holdout)));
     out
 }

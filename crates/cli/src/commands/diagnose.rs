@@ -34,7 +34,13 @@ pub(crate) struct Arguments {
     /// Folder of mechanisms of your own (*.toml), tried beside the built-in ones
     #[arg(long, value_name = "DIR")]
     mechanisms: Option<PathBuf>,
+
+    /// Most work of the search, in billions of operations; the report says when it was not enough
+    #[arg(long, value_name = "N", default_value_t = Options::default().work / BILLION)]
+    work: u64,
 }
+
+const BILLION: u64 = 1_000_000_000;
 
 pub(crate) fn run(arguments: &Arguments) -> Result<Answer, Failure> {
     let own = arguments.mechanisms.as_deref().map(loading::mechanisms).transpose()?;
@@ -42,8 +48,11 @@ pub(crate) fn run(arguments: &Arguments) -> Result<Answer, Failure> {
     let results = ["report.json", "report.html", "improved.toml"];
     let out = arguments.inputs.folder(&results)?;
     out.spares(&results, own.iter().flat_map(|own| &own.files))?;
-    let options =
-        Options { seed: arguments.seed, library: own.as_ref().map(|o| o.library.mechanisms.clone()) };
+    let options = Options {
+        seed: arguments.seed,
+        library: own.as_ref().map(|o| o.library.mechanisms.clone()),
+        work: arguments.work.saturating_mul(BILLION),
+    };
     let results = diagnose(&loaded, &recordings.train, &recordings.holdout, &options)?;
     results.write(&out)?;
     let tried = own.as_ref().map(tried).unwrap_or_default();
