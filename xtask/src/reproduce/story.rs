@@ -300,3 +300,22 @@ fn judge(piece: &mut Piece, way: &Way, degrees: f64, reached: &[Reached]) {
     }
     check("∫ u² dt, improved over calibrated", improved.effort / calibrated.effort);
 }
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    /// Without the diagnosis, which takes a minute: the laws of the nominal model on the rig.
+    #[test]
+    fn the_nominal_model_leaves_an_error_on_the_rig() {
+        let text = include_str!("../../../crates/cli/demo/rotary_link.toml");
+        let model = Model::from_toml(text, "rotary_link.toml").unwrap();
+        let amplitude = 20f64.to_radians();
+        for way in ways() {
+            let law = law(&model, &way, amplitude).unwrap();
+            let reached = Reached::of(&run(&law, amplitude).unwrap().unwrap(), amplitude);
+            assert!(reached.settling.is_infinite() && (1.0..2.5).contains(&reached.left), "{}", way.name);
+            assert!(reached.largest <= LIMIT && reached.rms < 15.0, "{}", way.name);
+        }
+    }
+}
