@@ -26,5 +26,5 @@ pub use error::ControlError;
 pub use family::{Envelope, Family, FamilyOptions, Spread};
 pub use feedforward::FeedForward;
 pub use greybox_smc::check::Pole;
-pub use metrics::Metrics;
+pub use metrics::{Metrics, Verdict};
 pub use plant::{Dropped, Plant, PlantOptions};

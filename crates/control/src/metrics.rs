@@ -1,6 +1,7 @@
 //! What a closed loop reached.
 
 use crate::closed_loop::{Reference, Run};
+use crate::family::Family;
 
 /// Half width of the band of settling, relative to the step.
 pub const BAND: f64 = 0.02;
@@ -69,6 +70,48 @@ impl Metrics {
             saturated: at_an_end as f64 / u.len().max(1) as f64,
             effort: u.iter().map(|u| u * u * dt).sum(),
         })
+    }
+}
+
+/// What simulated loops did.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum Verdict {
+    /// The loop settles at every set point, and so does every perturbed plant that was tried.
+    Settles,
+    /// The loop settles on the model, but not on every perturbed plant.
+    Fragile,
+    /// The loop does not settle at every set point.
+    Unsettled,
+    /// The loop leaves every bound.
+    Diverges,
+}
+
+impl Verdict {
+    /// `settles`, `fragile`, `unsettled` or `diverges`.
+    #[must_use]
+    pub fn name(self) -> &'static str {
+        match self {
+            Verdict::Settles => "settles",
+            Verdict::Fragile => "fragile",
+            Verdict::Unsettled => "unsettled",
+            Verdict::Diverges => "diverges",
+        }
+    }
+}
+
+impl Run {
+    /// What this run did, and the same law on perturbed plants, where they were tried.
+    #[must_use]
+    pub fn verdict(&self, family: Option<&Family>) -> Verdict {
+        if self.diverged.is_some() {
+            Verdict::Diverges
+        } else if self.metrics.is_empty() || self.metrics.iter().any(|m| m.settling.is_none()) {
+            Verdict::Unsettled
+        } else if family.is_some_and(|f| f.settled < f.members) {
+            Verdict::Fragile
+        } else {
+            Verdict::Settles
+        }
     }
 }
 

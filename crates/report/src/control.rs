@@ -3,6 +3,8 @@
 //! Plain data, filled by the caller ([`crate::convert::control`]). All numbers are SI; units are those of
 //! [`Quantity::unit`]. A number that is not finite is shown as unknown.
 
+use greybox_control::Verdict;
+
 use crate::contract::{ModelId, Producer};
 
 /// Everything the page of a controller shows; [`ControlPage::to_html`] writes it.
@@ -15,7 +17,7 @@ pub struct ControlPage {
     /// The model the law was designed on.
     pub model: ModelId,
     /// What the simulated loops did.
-    pub verdict: LoopVerdict,
+    pub verdict: Verdict,
     /// How the law was found.
     pub method: LawKind,
     /// Further settings of the design: name and value.
@@ -46,31 +48,6 @@ pub struct ControlPage {
     pub run: LoopRun,
     /// The files beside the page and what they hold.
     pub files: Vec<(&'static str, &'static str)>,
-}
-
-/// What the simulated loops did.
-#[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub enum LoopVerdict {
-    /// The loop settles at every set point, and so does every perturbed plant that was tried.
-    Settles,
-    /// The loop settles on the model, but not on every perturbed plant.
-    Fragile,
-    /// The loop does not settle at every set point.
-    Unsettled,
-    /// The loop leaves every bound.
-    Diverges,
-}
-
-impl LoopVerdict {
-    /// As in `report.json`.
-    pub fn name(self) -> &'static str {
-        match self {
-            LoopVerdict::Settles => "settles",
-            LoopVerdict::Fragile => "fragile",
-            LoopVerdict::Unsettled => "unsettled",
-            LoopVerdict::Diverges => "diverges",
-        }
-    }
 }
 
 /// How a law was found.

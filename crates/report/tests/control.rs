@@ -1,11 +1,10 @@
 //! The page of a controller: its structure, its words, that nothing escapes from its place, and a browser.
 #![allow(clippy::unwrap_used, reason = "helpers of tests panic like the tests themselves")]
 
+use greybox_control::Verdict;
 use greybox_report::ControlPage;
 use greybox_report::contract::{ModelId, Producer};
-use greybox_report::control::{
-    Figure, LawKind, LawState, LoopRun, LoopVerdict, Perturbed, Quantity, SetPoint, Step,
-};
+use greybox_report::control::{Figure, LawKind, LawState, LoopRun, Perturbed, Quantity, SetPoint, Step};
 
 #[path = "common/browser.rs"]
 mod browser;
@@ -42,7 +41,7 @@ fn page() -> ControlPage {
         title: "Controller of Arm".into(),
         producer: Producer { version: "0.1.0".into(), seed: 7 },
         model: ModelId { name: "Arm".into(), file: "arm.toml".into() },
-        verdict: LoopVerdict::Settles,
+        verdict: Verdict::Settles,
         method: LawKind::Lqr,
         settings: vec![("Typical size of the command", "5 V".into())],
         input: quantity("v", "V"),
@@ -139,10 +138,10 @@ fn the_page_says_what_an_engineer_signs() {
 fn every_verdict_has_its_words() {
     let mut page = page();
     for (verdict, says) in [
-        (LoopVerdict::Settles, "The loop settles<"),
-        (LoopVerdict::Fragile, "not on every perturbed plant"),
-        (LoopVerdict::Unsettled, "does not settle at every set point"),
-        (LoopVerdict::Diverges, "The loop runs away"),
+        (Verdict::Settles, "The loop settles<"),
+        (Verdict::Fragile, "not on every perturbed plant"),
+        (Verdict::Unsettled, "does not settle at every set point"),
+        (Verdict::Diverges, "The loop runs away"),
     ] {
         page.verdict = verdict;
         assert!(page.to_html().unwrap().contains(says), "{verdict:?}");

@@ -5,9 +5,7 @@ use greybox_model::{Expr, Model};
 
 use super::coherent;
 use crate::contract::{ModelId, Producer};
-use crate::control::{
-    ControlPage, Figure, LawKind, LawState, LoopRun, LoopVerdict, Perturbed, Quantity, SetPoint, Step,
-};
+use crate::control::{ControlPage, Figure, LawKind, LawState, LoopRun, Perturbed, Quantity, SetPoint, Step};
 use crate::format;
 
 /// What a page is made from.
@@ -27,19 +25,6 @@ pub struct ControlSources<'a> {
     pub producer: &'a Producer,
     /// The files beside the page and what they hold.
     pub files: &'a [(&'static str, &'static str)],
-}
-
-/// What the loops did.
-pub fn verdict(run: &Run, family: Option<&Family>) -> LoopVerdict {
-    if run.diverged.is_some() {
-        LoopVerdict::Diverges
-    } else if run.metrics.is_empty() || run.metrics.iter().any(|m| m.settling.is_none()) {
-        LoopVerdict::Unsettled
-    } else if family.is_some_and(|f| f.settled < f.members) {
-        LoopVerdict::Fragile
-    } else {
-        LoopVerdict::Settles
-    }
 }
 
 /// The page of a controller.
@@ -95,7 +80,7 @@ pub fn page(sources: &ControlSources<'_>) -> ControlPage {
         ),
         producer: sources.producer.clone(),
         model: ModelId { name: model.name.clone(), file: sources.model_file.to_owned() },
-        verdict: verdict(run, sources.family.map(|(f, _)| f)),
+        verdict: run.verdict(sources.family.map(|(f, _)| f)),
         method: match controller.method() {
             Method::Lqr => LawKind::Lqr,
             Method::Hjb { .. } => LawKind::Hjb,

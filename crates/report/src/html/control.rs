@@ -1,9 +1,10 @@
 //! The page of a controller: what its loop reached, the law, its poles, and what it does not promise.
 
 use askama::Template;
+use greybox_control::Verdict;
 
 use super::{Assets, Common, Island, PlotData, PlotView, SeriesData, extent, quantity_html, series, span};
-use crate::control::{ControlPage, LawKind, LoopVerdict, Quantity};
+use crate::control::{ControlPage, LawKind, Quantity};
 use crate::decimate::{Buckets, MAX_POINTS};
 use crate::{ReportError, expression, format, sentence, svg};
 
@@ -80,12 +81,10 @@ struct PolePlot {
 impl View {
     fn new(page: &ControlPage, island: &mut Island) -> View {
         let (verdict, verdict_class) = match page.verdict {
-            LoopVerdict::Settles => ("The loop settles", "consistent"),
-            LoopVerdict::Fragile => {
-                ("The loop settles on the model, not on every perturbed plant", "careful")
-            }
-            LoopVerdict::Unsettled => ("The loop does not settle at every set point", "careful"),
-            LoopVerdict::Diverges => ("The loop runs away", "failed"),
+            Verdict::Settles => ("The loop settles", "consistent"),
+            Verdict::Fragile => ("The loop settles on the model, not on every perturbed plant", "careful"),
+            Verdict::Unsettled => ("The loop does not settle at every set point", "careful"),
+            Verdict::Diverges => ("The loop runs away", "failed"),
         };
         let mut sentences: Vec<String> =
             sentence::control::summary(page).iter().map(|s| format::tie(s)).collect();

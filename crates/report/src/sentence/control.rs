@@ -1,6 +1,8 @@
 //! What a control engineer wants to know first, in plain language.
 
-use crate::control::{ControlPage, LoopVerdict};
+use greybox_control::Verdict;
+
+use crate::control::ControlPage;
 use crate::{expression, format};
 
 /// The conclusion, most important first: how the loop settles, then what holds on perturbed plants, then the command.
@@ -34,7 +36,7 @@ fn reached(page: &ControlPage, name: &str, unit: &str) -> String {
     let worst = |of: fn(&crate::control::Step) -> f64| page.steps.iter().map(of).fold(0.0, f64::max);
     let missed = page.steps.iter().filter(|s| s.settling.is_none()).count();
     let left = format::with_unit(&format::number(worst(|s| s.final_error.abs())), unit);
-    if page.verdict == LoopVerdict::Unsettled || missed > 0 {
+    if page.verdict == Verdict::Unsettled || missed > 0 {
         return format!(
             "{name} does not come to stay within 2 % of the step at {missed} of {} set points; it ends up to {left} off.",
             page.steps.len()
