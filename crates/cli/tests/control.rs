@@ -67,12 +67,59 @@ fn every_method_gives_a_law_that_tracks_and_code_that_agrees() {
             assert!(point["final_error"].as_f64().unwrap().abs() < 0.02, "{method}: {point}");
         }
         assert_eq!(report["family"]["diverged"], 0, "{method}");
+        assert_eq!(report["verdict"], "settles", "{method}");
+        for check in report["checks"].as_array().unwrap() {
+            let radius = |p: &serde_json::Value| p[0].as_f64().unwrap().hypot(p[1].as_f64().unwrap());
+            let held: Vec<f64> = check["held_poles"].as_array().unwrap().iter().map(radius).collect();
+            assert_eq!(held[0], check["spectral_radius"].as_f64().unwrap());
+            assert!(held.len() == 2 && held[1] <= held[0] && held[0] < 1.0, "{method}: {check}");
+        }
         let read = |name: &str| std::fs::read_to_string(folder.path().join(method).join(name)).unwrap();
         assert!(
             read("law.rs").contains("pub fn control_law(state: &[f64; 2], set_point: &[f64; 1]) -> [f64; 1]")
         );
         agrees(&folder.path().join(method), &read("vectors.csv"));
+        page_says(&read("report.html"), &report);
     }
+}
+
+/// The page has the sections in order, the numbers of the JSON, and nothing from elsewhere.
+fn page_says(html: &str, report: &serde_json::Value) {
+    let places: Vec<usize> = ["verdict", "loop", "family", "law", "stability", "promises", "reading"]
+        .iter()
+        .map(|id| html.find(&format!("<section id=\"{id}\"")).unwrap_or_else(|| panic!("no section {id}")))
+        .collect();
+    assert!(places.is_sorted(), "{places:?}");
+    let law = report["law"][0].as_str().unwrap().replace('\'', "&#39;");
+    assert!(html.contains(&law), "{law}");
+    assert!(html.contains("settle at every set point") && html.contains("Controller of Arm"));
+    for link in html.split("href=\"").skip(1) {
+        assert!(link.starts_with('#'), "a link leaves the page");
+    }
+}
+
+#[test]
+fn a_loop_that_does_not_settle_is_not_praised() {
+    let folder = tempfile::tempdir().unwrap();
+    std::fs::write(folder.path().join("arm.toml"), MODEL).unwrap();
+    let verdict = |more: &[&str]| {
+        let all = [&["control", "arm.toml", "--to", "0.3", "--out", "o", "--json"], more].concat();
+        let (code, out, err) = greybox(folder.path(), &all);
+        assert_eq!(code, Some(0), "{err}");
+        let report: serde_json::Value = serde_json::from_str(&out).unwrap();
+        let html = std::fs::read_to_string(folder.path().join("o/report.html")).unwrap();
+        (report["verdict"].as_str().unwrap().to_owned(), html)
+    };
+    // A set point for too short a time.
+    let (told, html) = verdict(&["--hold", "0.05", "--members", "0"]);
+    assert_eq!(told, "unsettled");
+    assert!(html.contains("does not come to stay within 2") && html.contains("No perturbed plants"));
+    assert!(!html.contains("<section id=\"family\""));
+    // A gravity so uncertain that a law without integral action is often off.
+    std::fs::write(folder.path().join("arm.toml"), MODEL.replace("std = 0.03", "std = 0.2")).unwrap();
+    let (told, html) = verdict(&["--size", "theta=0.2", "--hold", "4"]);
+    assert_eq!(told, "fragile");
+    assert!(html.contains("not on every perturbed plant"));
 }
 
 /// The C law, compiled freestanding with all warnings as errors, gives the commands of the vectors.

@@ -19,7 +19,9 @@ pub struct Check {
     pub equilibrium: Equilibrium,
     /// Poles of the continuous loop, 1/s, the rightmost first; friction dropped.
     pub poles: Vec<Pole>,
-    /// Largest magnitude of a pole in z of the loop with the command held.
+    /// Poles in z of the loop with the command held over the sample time, the largest first; friction dropped.
+    pub held_poles: Vec<Pole>,
+    /// Largest magnitude of these.
     pub spectral_radius: f64,
 }
 
@@ -56,17 +58,18 @@ impl Examined<'_> {
         }
         let plant = self.plant.frictionless_tangent(&at.state, at.input);
         let gain = self.gain(&self.frictionless, &at.state, set_point);
-        let (poles, spectral_radius) = self.stable(&plant, &gain, set_point)?;
-        Ok(Check { set_point, equilibrium: at, poles, spectral_radius })
+        let (poles, held_poles) = self.stable(&plant, &gain, set_point)?;
+        let spectral_radius = largest(&held_poles);
+        Ok(Check { set_point, equilibrium: at, poles, held_poles, spectral_radius })
     }
 
-    /// The poles and the largest magnitude in z, if stable.
+    /// The poles, continuous and in z, if stable.
     fn stable(
         &self,
         plant: &Linear,
         gain: &DMatrix<f64>,
         set_point: f64,
-    ) -> Result<(Vec<Pole>, f64), ControlError> {
+    ) -> Result<(Vec<Pole>, Vec<Pole>), ControlError> {
         let sizes = self.plant.sizes();
         let none = || ControlError::NoPoles { set_point };
         let poles = stability::poles(&stability::closed(plant, gain), sizes).ok_or_else(none)?;
@@ -76,18 +79,30 @@ impl Examined<'_> {
         if let Some(&pole) = poles.first().filter(|p| p.re.is_nan() || p.re >= -rounding) {
             return Err(ControlError::Unstable { set_point, pole });
         }
-        let radius = |dt: f64| {
+        let sampled = |dt: f64| {
             let held = stability::held(plant, dt, sizes, self.plant.input_size())?;
-            let poles = stability::poles(&stability::closed(&held, gain), sizes)?;
-            Some(poles.iter().fold(0.0f64, |radius, p| radius.max(p.magnitude())))
+            stability::poles(&stability::closed(&held, gain), sizes)
         };
-        let found = radius(self.dt).ok_or_else(none)?;
-        if found < 1.0 {
+        let mut found = sampled(self.dt).ok_or_else(none)?;
+        let radius = largest(&found);
+        if radius < 1.0 {
+            found.sort_by(|a, b| {
+                b.magnitude()
+                    .total_cmp(&a.magnitude())
+                    .then(b.re.total_cmp(&a.re))
+                    .then(b.im.total_cmp(&a.im))
+            });
             return Ok((poles, found));
         }
-        let shorter =
-            (1..40).map(|k| self.dt * 0.8f64.powi(k)).find(|dt| radius(*dt).is_some_and(|r| r < 1.0));
+        let shorter = (1..40)
+            .map(|k| self.dt * 0.8f64.powi(k))
+            .find(|dt| sampled(*dt).is_some_and(|poles| largest(&poles) < 1.0));
         let longest = shorter.map_or(String::new(), |dt| format!(", {dt:.2e} s would do"));
-        Err(ControlError::UnstableSampled { set_point, dt: self.dt, radius: found, longest })
+        Err(ControlError::UnstableSampled { set_point, dt: self.dt, radius, longest })
     }
+}
+
+/// The largest magnitude.
+fn largest(poles: &[Pole]) -> f64 {
+    poles.iter().fold(0.0f64, |radius, p| radius.max(p.magnitude()))
 }

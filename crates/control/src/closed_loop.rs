@@ -303,7 +303,7 @@ impl<'a> ClosedLoop<'a> {
                 }
             }
         }
-        run.metrics = metrics(&run, reference, dt);
+        run.metrics = metrics(&run, reference, dt, self.controller.limits());
         Ok(run)
     }
 

@@ -5,7 +5,7 @@ use rand_distr::{Distribution, StandardNormal};
 use rand_pcg::Pcg64Mcg;
 use rayon::prelude::*;
 
-use crate::closed_loop::{ClosedLoop, Reference};
+use crate::closed_loop::{ClosedLoop, Reference, Run};
 use crate::error::ControlError;
 use crate::metrics::Metrics;
 
@@ -53,6 +53,71 @@ pub struct Family {
     pub largest_command: Spread,
     /// ∫ u² dt over all set points.
     pub effort: Spread,
+    /// Between what bounds the tracked state of the members that did not diverge was, sample by sample.
+    pub tracked: Envelope,
+    /// The same of the command.
+    pub command: Envelope,
+}
+
+/// Bounds of a signal over a family, sample by sample.
+#[derive(Debug, Clone, PartialEq, Default)]
+pub struct Envelope {
+    /// The least value of each sample; empty where every member diverged.
+    pub lowest: Vec<f64>,
+    /// The largest.
+    pub highest: Vec<f64>,
+}
+
+impl Envelope {
+    fn of(values: &[f64]) -> Envelope {
+        Envelope { lowest: values.to_vec(), highest: values.to_vec() }
+    }
+
+    /// Wide enough for both; by total order, so that it does not matter which comes first.
+    fn join(mut self, other: Envelope) -> Envelope {
+        if self.lowest.is_empty() {
+            return other;
+        }
+        for (low, next) in self.lowest.iter_mut().zip(&other.lowest) {
+            if next.total_cmp(low).is_lt() {
+                *low = *next;
+            }
+        }
+        for (high, next) in self.highest.iter_mut().zip(&other.highest) {
+            if next.total_cmp(high).is_gt() {
+                *high = *next;
+            }
+        }
+        self
+    }
+}
+
+/// Members run so far, in order.
+#[derive(Default)]
+struct Members {
+    metrics: Vec<Option<Vec<Metrics>>>,
+    tracked: Envelope,
+    command: Envelope,
+}
+
+impl Members {
+    fn with(mut self, mut run: Run) -> Members {
+        if run.diverged.is_some() {
+            self.metrics.push(None);
+            return self;
+        }
+        self.tracked = self.tracked.join(Envelope::of(&run.x[run.tracked]));
+        self.command = self.command.join(Envelope::of(&run.u));
+        self.metrics.push(Some(std::mem::take(&mut run.metrics)));
+        self
+    }
+
+    fn join(mut self, other: Members) -> Members {
+        self.metrics.extend(other.metrics);
+        self.tracked = self.tracked.join(other.tracked);
+        self.command = self.command.join(other.command);
+        self
+    }
 }
 
 impl ClosedLoop<'_> {
@@ -78,19 +143,19 @@ impl ClosedLoop<'_> {
             }
             varied.push((self.parameter(name)?, *deviation));
         }
-        let runs: Vec<Result<Option<Vec<Metrics>>, ControlError>> = (0..options.members)
+        let member = |member: usize| {
+            let mut random = Pcg64Mcg::seed_from_u64(options.seed ^ (member as u64).wrapping_mul(STRIDE));
+            let mut parameters = self.parameters.clone();
+            for &(at, deviation) in &varied {
+                parameters[at] = draw(self.parameters[at], deviation, &mut random);
+            }
+            self.run_with(&parameters, reference)
+        };
+        let Members { metrics: runs, tracked, command } = (0..options.members)
             .into_par_iter()
-            .map(|member| {
-                let mut random = Pcg64Mcg::seed_from_u64(options.seed ^ (member as u64).wrapping_mul(STRIDE));
-                let mut parameters = self.parameters.clone();
-                for &(at, deviation) in &varied {
-                    parameters[at] = draw(self.parameters[at], deviation, &mut random);
-                }
-                let run = self.run_with(&parameters, reference)?;
-                Ok(run.diverged.is_none().then_some(run.metrics))
-            })
-            .collect();
-        let runs = runs.into_iter().collect::<Result<Vec<_>, _>>()?;
+            .map(member)
+            .try_fold(Members::default, |before, run| Ok::<_, ControlError>(before.with(run?)))
+            .try_reduce(Members::default, |a, b| Ok(a.join(b)))?;
         let spread = |of: &dyn Fn(&[Metrics]) -> f64| {
             let mut values: Vec<f64> =
                 runs.iter().map(|run| run.as_ref().map_or(f64::INFINITY, |m| of(m))).collect();
@@ -108,6 +173,8 @@ impl ClosedLoop<'_> {
             final_error: spread(&worst(|m| m.final_error.abs())),
             largest_command: spread(&worst(|m| m.largest_command)),
             effort: spread(&|m: &[Metrics]| m.iter().map(|m| m.effort).sum()),
+            tracked,
+            command,
         })
     }
 }

@@ -1,6 +1,7 @@
 //! What a closed loop reached.
 
 use crate::closed_loop::{Reference, Run};
+use crate::family::Family;
 
 /// Half width of the band of settling, relative to the step.
 pub const BAND: f64 = 0.02;
@@ -22,14 +23,100 @@ pub struct Metrics {
     pub overshoot: f64,
     /// Mean of (tracked state − set point) over the last twentieth of the time.
     pub final_error: f64,
+    /// Root mean square of (tracked state − set point) over the whole of the time.
+    pub rms_error: f64,
     /// Largest |u|.
     pub largest_command: f64,
+    /// Share of the samples at which the command is at an end of its range.
+    pub saturated: f64,
     /// ∫ u² dt.
     pub effort: f64,
 }
 
+impl Metrics {
+    /// Of one set point, given at the first of the samples `y` of the tracked state, `dt` s apart; `u` are the commands
+    /// (one fewer, or as many), which stay within `limits`. `None` where there is no sample.
+    ///
+    /// ```
+    /// use greybox_control::Metrics;
+    /// let m = Metrics::of(&[0.0, 5.0, 11.0, 10.1, 9.9], &[4.0, 1.0, -1.0, 0.0], 10.0, 0.5, (-4.0, 4.0)).unwrap();
+    /// assert_eq!((m.settling, m.saturated, m.effort), (Some(1.5), 0.25, 9.0));
+    /// assert!((m.overshoot - 0.1).abs() < 1e-12 && (m.final_error + 0.1).abs() < 1e-12);
+    /// ```
+    #[must_use]
+    pub fn of(y: &[f64], u: &[f64], set_point: f64, dt: f64, limits: (f64, f64)) -> Option<Metrics> {
+        let step = set_point - *y.first()?;
+        let band = BAND * step.abs();
+        let outside = y.iter().rposition(|y| y.is_nan() || (y - set_point).abs() > band);
+        let settling = match outside {
+            None => Some(0.0),
+            Some(k) if k + 1 < y.len() => Some((k + 1) as f64 * dt),
+            Some(_) => None,
+        };
+        let beyond = y.iter().map(|y| (y - set_point) * step.signum()).fold(0.0, f64::max);
+        let tail = &y[y.len() - ((y.len() as f64 * LAST) as usize).max(1)..];
+        let mean = |values: &[f64], of: fn(f64) -> f64| {
+            values.iter().map(|y| of(y - set_point)).sum::<f64>() / values.len() as f64
+        };
+        let at_an_end = u.iter().filter(|u| **u <= limits.0 || **u >= limits.1).count();
+        Some(Metrics {
+            set_point,
+            step,
+            settling,
+            overshoot: if step == 0.0 { 0.0 } else { beyond / step.abs() },
+            final_error: mean(tail, |e| e),
+            rms_error: mean(y, |e| e * e).sqrt(),
+            largest_command: u.iter().fold(0.0, |m, u| m.max(u.abs())),
+            saturated: at_an_end as f64 / u.len().max(1) as f64,
+            effort: u.iter().map(|u| u * u * dt).sum(),
+        })
+    }
+}
+
+/// What simulated loops did.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum Verdict {
+    /// The loop settles at every set point, and so does every perturbed plant that was tried.
+    Settles,
+    /// The loop settles on the model, but not on every perturbed plant.
+    Fragile,
+    /// The loop does not settle at every set point.
+    Unsettled,
+    /// The loop leaves every bound.
+    Diverges,
+}
+
+impl Verdict {
+    /// `settles`, `fragile`, `unsettled` or `diverges`.
+    #[must_use]
+    pub fn name(self) -> &'static str {
+        match self {
+            Verdict::Settles => "settles",
+            Verdict::Fragile => "fragile",
+            Verdict::Unsettled => "unsettled",
+            Verdict::Diverges => "diverges",
+        }
+    }
+}
+
+impl Run {
+    /// What this run did, and the same law on perturbed plants, where they were tried.
+    #[must_use]
+    pub fn verdict(&self, family: Option<&Family>) -> Verdict {
+        if self.diverged.is_some() {
+            Verdict::Diverges
+        } else if self.metrics.is_empty() || self.metrics.iter().any(|m| m.settling.is_none()) {
+            Verdict::Unsettled
+        } else if family.is_some_and(|f| f.settled < f.members) {
+            Verdict::Fragile
+        } else {
+            Verdict::Settles
+        }
+    }
+}
+
 /// For each set point that was begun.
-pub(crate) fn metrics(run: &Run, reference: &Reference, dt: f64) -> Vec<Metrics> {
+pub(crate) fn metrics(run: &Run, reference: &Reference, dt: f64, limits: (f64, f64)) -> Vec<Metrics> {
     let y = &run.x[run.tracked];
     let starts: Vec<usize> =
         reference.set_points.iter().map(|(t, _)| (t / dt - 1e-6).ceil().max(0.0) as usize).collect();
@@ -41,28 +128,9 @@ pub(crate) fn metrics(run: &Run, reference: &Reference, dt: f64) -> Vec<Metrics>
         if first >= last {
             continue;
         }
-        let (y, u) = (&y[first..=last], &run.u[first..last]);
-        let step = r - y[0];
-        let band = BAND * step.abs();
-        let outside = y.iter().rposition(|y| y.is_nan() || (y - r).abs() > band);
         let cut = run.diverged.is_some() && last + 1 == run.t.len();
-        let settling = match outside {
-            _ if cut => None,
-            None => Some(0.0),
-            Some(k) if k + 1 < y.len() => Some((k + 1) as f64 * dt),
-            Some(_) => None,
-        };
-        let beyond = y.iter().map(|y| (y - r) * step.signum()).fold(0.0, f64::max);
-        let tail = &y[y.len() - ((y.len() as f64 * LAST) as usize).max(1)..];
-        found.push(Metrics {
-            set_point: r,
-            step,
-            settling,
-            overshoot: if step == 0.0 { 0.0 } else { beyond / step.abs() },
-            final_error: tail.iter().map(|y| y - r).sum::<f64>() / tail.len() as f64,
-            largest_command: u.iter().fold(0.0, |m, u| m.max(u.abs())),
-            effort: u.iter().map(|u| u * u * dt).sum(),
-        });
+        let reached = Metrics::of(&y[first..=last], &run.u[first..last], r, dt, limits);
+        found.extend(reached.map(|m| if cut { Metrics { settling: None, ..m } } else { m }));
     }
     found
 }

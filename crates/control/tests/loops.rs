@@ -134,6 +134,13 @@ fn families_are_the_same_whatever_the_threads() {
     let same = looped.family(&reference, &same).unwrap();
     let run = looped.run(&reference).unwrap();
     assert_eq!((same.effort.median, same.effort.worst), (run.metrics[0].effort, run.metrics[0].effort));
+    assert_eq!((&same.tracked.lowest, &same.tracked.highest), (&run.x[0], &run.x[0]));
+    assert_eq!((&same.command.lowest, &same.command.highest), (&run.u, &run.u));
+    // The largest command of all members stands on the edge of the band.
+    let edges = family.command.lowest.iter().chain(&family.command.highest);
+    assert_eq!(edges.fold(0.0f64, |m, u| m.max(u.abs())), family.largest_command.worst);
+    assert!(family.tracked.lowest != family.tracked.highest);
+    assert!(family.tracked.lowest.iter().zip(&family.tracked.highest).all(|(low, high)| low <= high));
     let unknown = FamilyOptions { deviations: vec![("g".into(), 1.0)], ..options.clone() };
     let error = looped.family(&reference, &unknown).unwrap_err();
     assert!(matches!(error, ControlError::UnknownParameter { .. }), "{error}");

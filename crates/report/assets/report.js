@@ -16,6 +16,10 @@
     improved: { stroke: colour("--improved-line"), width: 1.4 },
     input: { stroke: "#5f6b7a", width: 1.3 },
     noise: { stroke: "#a4acb7", width: 1.3, dash: [5, 4] },
+    reference: { stroke: colour("--measured"), width: 1.3, dash: [6, 4], paths: uPlot.paths.stepped({ align: 1 }) },
+    command: { stroke: colour("--improved-line"), width: 1.4, paths: uPlot.paths.stepped({ align: 1 }) },
+    limit: { stroke: colour("--bad"), width: 1.1, dash: [6, 5] },
+    envelope: { stroke: "#8fc3e2", width: 1 },
   };
   const sups = { "-": "⁻", 0: "⁰", 1: "¹", 2: "²", 3: "³", 4: "⁴", 5: "⁵", 6: "⁶", 7: "⁷", 8: "⁸", 9: "⁹" };
   const power = e => "10" + String(e).replace(/./g, c => sups[c]);
@@ -93,6 +97,7 @@
         { label: log ? "f in Hz" : "t in s", value: (u, v) => number(v) },
         ...plot.series.map(s => Object.assign({ label: s.label, points: { show: false }, value: (u, v) => number(v), spanGaps: false }, look[s.role])),
       ],
+      bands: (plot.fills || []).map(([upper, lower]) => ({ series: [upper + 1, lower + 1], fill: "rgba(26, 143, 209, .18)" })),
       hooks: { drawClear: [behind(plot)] },
     };
     if (log) {

@@ -1,13 +1,14 @@
 //! From a finished [`Diagnosis`] to the report's types: units, names and order change here, nothing is
 //! decided. [`identification`] does the same for a finished identification.
 
+pub mod control;
 pub mod identification;
 
 use greybox_calibrate::{Data, FreeRun};
 use greybox_diagnose::diagnosis::{Estimate as Estimated, Finding as Found, Role as RoleRuns, Run};
 use greybox_diagnose::locate::{Location as Located, spectrum};
 use greybox_diagnose::{Diagnosis, Verdict as Answer};
-use greybox_model::{Model, WriteOptions};
+use greybox_model::{Model, Unit, WriteOptions};
 use greybox_recording::{Recording, Severity as Level, health};
 
 use crate::contract::*;
@@ -160,6 +161,18 @@ fn plan(found: &Found, improved: &Model, basis: &Basis) -> Option<Experiment> {
         },
         basis,
     ))
+}
+
+/// The SI unit in which the equations count what is recorded in `unit`.
+fn coherent(unit: &Unit) -> String {
+    if unit.factor == 1.0 {
+        return unit.text.clone();
+    }
+    // An angle has no dimension, but its unit has a name.
+    if unit.dimension.is_none() && ["deg", "°"].contains(&unit.text.as_str()) {
+        return "rad".to_owned();
+    }
+    Unit::si(unit.dimension).text
 }
 
 /// The unit of a figure that follows from the parameters: frequencies in Hz, damping ratios are pure.

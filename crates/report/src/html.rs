@@ -6,6 +6,7 @@
 //! by askama), through [`crate::expression::escape`], and as JSON in the data island, where `<`, `>` and `&`
 //! are written as `\u00XX` so that nothing in it can close the element.
 
+mod control;
 mod identified;
 
 use std::fmt::Write as _;
@@ -99,6 +100,9 @@ struct PlotData {
     x: &'static str,
     series: Vec<SeriesData>,
     bands: Vec<[f64; 2]>,
+    /// Pairs of series (upper, lower) with the area between them filled.
+    #[serde(skip_serializing_if = "Vec::is_empty")]
+    fills: Vec<[usize; 2]>,
     sigma: Option<f64>,
     split: Option<f64>,
 }
@@ -163,6 +167,7 @@ fn series(label: &str, role: &'static str, buckets: &Buckets, values: &[f64]) ->
 // View: what the template prints. Fields named `…_html` hold HTML made here from escaped parts.
 
 /// What the pages of a diagnosis and of an identification share: heading, fit, signals, residual, data health.
+#[derive(Default)]
 struct Common {
     product: &'static str,
     title: String,
@@ -711,6 +716,7 @@ fn recording_view(
             x: "time in s",
             series: lines,
             bands: Vec::new(),
+            fills: Vec::new(),
             sigma: None,
             split: recording.holdout_from.filter(|t| t.is_finite()),
         };
@@ -733,6 +739,7 @@ fn recording_view(
             x: "time in s",
             series: vec![line],
             bands: Vec::new(),
+            fills: Vec::new(),
             sigma: None,
             split: None,
         };
@@ -898,6 +905,7 @@ fn residual_view(scene: &Scene<'_>, residual: &Residual, island: &mut Island) ->
             x: "frequency in Hz",
             series: lines,
             bands: Vec::new(),
+            fills: Vec::new(),
             sigma: None,
             split: None,
         };
@@ -937,6 +945,7 @@ fn island_time(
         x: "time in s",
         series: lines.into_iter().flatten().collect(),
         bands,
+        fills: Vec::new(),
         sigma,
         split: None,
     })

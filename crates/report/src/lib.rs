@@ -1,4 +1,4 @@
-//! Reports of a diagnosis or an identification: JSON by contract and a self-contained HTML page.
+//! Reports of a diagnosis, an identification or a controller: JSON by contract and a self-contained HTML page.
 //!
 //! This crate turns a finished diagnosis (or identification) into files and **decides nothing**: every number and every word of
 //! the verdict comes in as plain data. [`Report`] is `report.json`; [`Page`] adds the signals and curves
@@ -6,6 +6,7 @@
 //!
 //! - [`contract`]: the types of `report.json` and its JSON schema
 //! - [`identified`]: the same for an identification: [`IdentifyReport`]
+//! - [`control`]: what the page of a controller shows; [`ControlPage::to_html`] writes it
 //! - [`page`]: what the page shows beside it; [`Page::to_html`] writes the file
 //! - [`sentence`]: the conclusion in plain language, to fill [`Report::summary`]
 //! - [`suggest`]: the experiment that separates a mechanism from its rivals
@@ -30,6 +31,7 @@
 //! [`convert`] fills these types from a finished diagnosis; nothing here decides, reads a file or prints.
 
 pub mod contract;
+pub mod control;
 pub mod convert;
 pub mod decimate;
 pub mod diff;
@@ -43,6 +45,7 @@ pub mod suggest;
 pub mod svg;
 
 pub use contract::Report;
+pub use control::ControlPage;
 pub use identified::IdentifyReport;
 pub use page::{IdentifyPage, Page};
 

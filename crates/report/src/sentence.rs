@@ -1,6 +1,7 @@
 //! The conclusion in plain language, worded from the numbers of a [`Report`]; [`identified`] does the same
 //! for an identification.
 
+pub mod control;
 pub mod identified;
 
 use crate::contract::{FitSet, Interval, Location, Mechanism, Names, Ordered, Report, Verdict};

@@ -1,4 +1,4 @@
-//! Drawings that need no script: the residual over the state space and a law against its points.
+//! Drawings that need no script: the residual over the state space, a law against its points, poles of a loop.
 //!
 //! Sizes are in SVG user units; the page scales the drawing to its column. Every text is escaped.
 
@@ -314,6 +314,106 @@ pub fn law_plot(plot: &MechanismPlot, alt: &str) -> Option<LawPlot> {
     out.push_str("</svg>");
     let outside = finite.iter().filter(|[x, y]| !frame.contains(*x, *y)).count();
     Some(LawPlot { svg: out, outside, every })
+}
+
+/// A plane of poles.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum Plane {
+    /// s: stable left of the imaginary axis.
+    Continuous,
+    /// z: stable inside the unit circle.
+    Sampled,
+}
+
+/// Marks of the groups of a pole plot, as text and as paths around the pole.
+const MARKS: [(&str, &str); 4] = [
+    ("×", "m-5 -5l10 10m-10 0l10 -10"),
+    ("+", "m-6 0h12m-6 -6v12"),
+    ("□", "m-5 -5h10v10h-10z"),
+    ("◇", "m0 -6l6 6l-6 6l-6 -6z"),
+];
+
+/// The mark of a group, for a key.
+pub fn pole_mark(group: usize) -> &'static str {
+    MARKS[group % MARKS.len()].0
+}
+
+/// Poles (real, imaginary part) as groups of marks. Both axes of the z plane have the same scale; of the unit circle what
+/// lies in the frame is drawn. `None` when no pole is finite.
+pub fn pole_plot(groups: &[&[[f64; 2]]], plane: Plane, alt: &str) -> Option<String> {
+    let poles = || groups.iter().flat_map(|g| g.iter()).filter(|p| p[0].is_finite() && p[1].is_finite());
+    poles().next()?;
+    let edge = if plane == Plane::Continuous { 0.0 } else { 1.0 };
+    let mut x = range(poles().map(|p| p[0]).chain([edge]), 0.12)?;
+    let mut y = range(poles().flat_map(|p| [p[1], -p[1]]), 0.15)?;
+    let right = WIDTH - 12.0;
+    if plane == Plane::Continuous {
+        // Real poles alone leave no height.
+        let least = 0.1 * (x.1 - x.0);
+        y = (y.0.min(-least), y.1.max(least));
+    } else {
+        let shape = (right - LEFT) / (HEIGHT - BOTTOM - TOP);
+        let (wide, tall) = (x.1 - x.0, y.1 - y.0);
+        let wanted = wide.max(tall * shape);
+        let (more_x, more_y) = (0.5 * (wanted - wide), 0.5 * (wanted / shape - tall));
+        (x, y) = ((x.0 - more_x, x.1 + more_x), (y.0 - more_y, y.1 + more_y));
+    }
+    let frame = Frame { x, y, right };
+    let mut out = open(alt);
+    let (across, upward) = match plane {
+        Plane::Continuous => ("real part [1/s]", "imaginary part [1/s]"),
+        Plane::Sampled => ("real part", "imaginary part"),
+    };
+    frame.axes(&mut out, across, upward);
+    if frame.y.0 < 0.0 && frame.y.1 > 0.0 {
+        let _ = write!(out, "<path class=\"zero\" d=\"M{LEFT} {:.1}H{:.1}\"/>", frame.py(0.0), frame.right);
+    }
+    match plane {
+        Plane::Continuous => {
+            let _ =
+                write!(out, "<path class=\"edge\" d=\"M{:.1} {TOP}V{}\"/>", frame.px(0.0), HEIGHT - BOTTOM);
+        }
+        Plane::Sampled => {
+            let _ = write!(out, "<path class=\"edge\" d=\"{}\"/>", unit_circle(&frame));
+        }
+    }
+    for (k, group) in groups.iter().enumerate() {
+        let mark = MARKS[k % MARKS.len()].1;
+        let mut path = String::new();
+        for &[x, y] in group.iter().filter(|[x, y]| frame.contains(*x, *y)) {
+            let _ = write!(path, "M{:.1} {:.1}{mark}", frame.px(x), frame.py(y));
+        }
+        let _ = write!(out, "<path class=\"pole pole-{}\" d=\"{path}\"/>", k % MARKS.len());
+    }
+    frame.border(&mut out);
+    out.push_str("</svg>");
+    Some(out)
+}
+
+/// What of the unit circle lies in the frame, with more points where the frame is small.
+fn unit_circle(frame: &Frame) -> String {
+    let full = std::f64::consts::PI;
+    let span = (frame.y.1 - frame.y.0).max(frame.x.1 - frame.x.0);
+    let steps = ((600.0 / span.max(1e-3)) as usize).clamp(400, 200_000);
+    let mut path = String::new();
+    let mut last: Option<(f64, f64)> = None;
+    for k in 0..=steps {
+        let angle = -full + 2.0 * full * k as f64 / steps as f64;
+        let (x, y) = (angle.cos(), angle.sin());
+        if !frame.contains(x, y) {
+            last = None;
+            continue;
+        }
+        let place = (frame.px(x), frame.py(y));
+        match last {
+            Some((px, py)) if (place.0 - px).hypot(place.1 - py) < 2.0 => continue,
+            Some(_) => path.push('L'),
+            None => path.push('M'),
+        }
+        let _ = write!(path, "{:.1} {:.1}", place.0, place.1);
+        last = Some(place);
+    }
+    path
 }
 
 #[cfg(test)]

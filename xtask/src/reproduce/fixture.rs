@@ -16,7 +16,7 @@ pub(crate) struct Fixture {
     pub(crate) id: String,
     /// The caption, shortened.
     pub(crate) title: String,
-    /// Where it stands.
+    /// Where it stands; empty for what the thesis does not have.
     pub(crate) source: String,
     /// Errata that concern it.
     pub(crate) errata: Vec<String>,

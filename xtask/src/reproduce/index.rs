@@ -137,11 +137,14 @@ fn badge(status: Status) -> String {
 fn heading(out: &mut String, fixture: &Fixture, badge: &str) {
     let _ = write!(
         out,
-        "<section id=\"{}\"><h2>{}{badge}</h2><p>{}. <span class=\"soft\">Thesis, {}.</span></p>",
+        "<section id=\"{}\"><h2>{}{badge}</h2><p>{}.{}</p>",
         slug(&fixture.id),
         escape(&fixture.id),
         escape(&fixture.title),
-        escape(&fixture.source)
+        match fixture.source.as_str() {
+            "" => String::new(),
+            source => format!(" <span class=\"soft\">Thesis, {}.</span>", escape(source)),
+        }
     );
 }
 

@@ -4,6 +4,7 @@ use std::fmt::Write as _;
 use std::sync::OnceLock;
 
 use anyhow::{Context, Result, anyhow};
+use greybox_control::Metrics;
 use greybox_hjb::{
     AdamaxOptions, Affine, Domain, Feedback, Linear, Monomials, Plant, PolicyOptions, Problem, Training,
     adamax, care, lqr, policy_iteration, verify,
@@ -15,10 +16,10 @@ use rand_pcg::Pcg64Mcg;
 use rand_pcg::rand_core::SeedableRng;
 
 use super::chapter2::draw;
-use super::chapter4::Step;
 use super::figure::{Axis, Series, Style, open, surface_map};
 use super::fixture::Fixture;
 use super::index::number;
+use super::sliding::settling;
 use super::{Check, Column, Drawing, Piece, Status, Table};
 
 /// Figure 4.3: the schematics of training, redrawn.
@@ -519,18 +520,19 @@ pub(crate) fn figure_4_10(fixture: &Fixture) -> Result<Piece> {
         // The third step, from the lower to the upper value.
         let half = (0.5 / frequency / dt) as usize;
         let angles: Vec<f64> = run.states[2 * half..3 * half].iter().map(|x| x[0]).collect();
-        let step = Step::of(&angles, dt, -amplitude, amplitude)?;
+        let volts = &run.voltages[2 * half..3 * half];
+        let step = Metrics::of(&angles, volts, amplitude, dt, (-10.0, 10.0)).context("no step to look at")?;
         let deflection = run.states.iter().map(|x| x[1].abs()).fold(0.0, f64::max).to_degrees();
         rows.push(vec![
             (*name).to_owned(),
-            number(step.settling),
-            number(step.overshoot),
-            number(step.left.to_degrees()),
+            number(settling(&step)),
+            number(100.0 * step.overshoot),
+            number(step.final_error.abs().to_degrees()),
             number(deflection),
         ]);
         if *name == "gains printed" {
-            piece.checks.push(Check::new("gains printed: overshoot in %", step.overshoot));
-            piece.checks.push(Check::new("gains printed: settling in s", step.settling));
+            piece.checks.push(Check::new("gains printed: overshoot in %", 100.0 * step.overshoot));
+            piece.checks.push(Check::new("gains printed: settling in s", settling(&step)));
             piece.checks.push(Check::new("gains printed: largest deflection in degrees", deflection));
         }
         let thin = |values: Vec<f64>| -> Vec<[f64; 2]> {

@@ -1,6 +1,7 @@
 //! Sliding-mode control of the identified link: section 4.2.
 
-use anyhow::Result;
+use anyhow::{Context, Result};
+use greybox_control::Metrics;
 use greybox_simulate::rigs::{LinkRun, RigError, RotaryFlexibleLink, Sampling, square_wave};
 use greybox_smc::thesis::{LinkTangent, PrintedLaw};
 use greybox_smc::{
@@ -8,7 +9,6 @@ use greybox_smc::{
 };
 
 use super::chapter2::draw;
-use super::chapter4::Step;
 use super::figure::{Axis, Series, Style};
 use super::fixture::Fixture;
 use super::index::number;
@@ -57,10 +57,12 @@ impl Followed {
     }
 
     /// The step from −`amplitude` to `amplitude` in the middle.
-    fn step(&self, amplitude: f64) -> Result<Step> {
+    fn step(&self, amplitude: f64) -> Result<Metrics> {
         let half = self.run.states.len() / 4;
-        let angles: Vec<f64> = self.run.states[2 * half..3 * half].iter().map(|x| x[0]).collect();
-        Step::of(&angles, DT, -amplitude, amplitude)
+        let at = 2 * half..3 * half;
+        let angles: Vec<f64> = self.run.states[at.clone()].iter().map(|x| x[0]).collect();
+        let metrics = Metrics::of(&angles, &self.run.voltages[at], amplitude, DT, (-LIMIT, LIMIT));
+        metrics.context("no step to look at")
     }
 
     fn deflection(&self) -> f64 {
@@ -74,6 +76,11 @@ impl Followed {
     fn steepest(&self) -> f64 {
         self.surface.iter().map(|s| s.abs()).fold(0.0, f64::max)
     }
+}
+
+/// Infinite where the step never settles.
+pub(crate) fn settling(step: &Metrics) -> f64 {
+    step.settling.unwrap_or(f64::INFINITY)
 }
 
 fn reference(amplitude: f64, sample: usize) -> f64 {
@@ -159,9 +166,9 @@ pub(crate) fn figure_4_1(_: &Fixture) -> Result<Piece> {
         let step = followed.step(amplitude)?;
         rows.push(vec![
             name.to_owned(),
-            number(step.settling),
-            number(step.overshoot),
-            number(step.left.to_degrees()),
+            number(settling(&step)),
+            number(100.0 * step.overshoot),
+            number(step.final_error.abs().to_degrees()),
             number(followed.deflection()),
             number(followed.voltage()),
         ]);
@@ -169,8 +176,8 @@ pub(crate) fn figure_4_1(_: &Fixture) -> Result<Piece> {
     let step = ours.step(amplitude)?;
     let lost = by_the_letter(amplitude)?;
     piece.checks.push(Check::new("law by the letter of 4.19: time until it leaves ±40° in s", lost));
-    piece.checks.push(Check::new("printed law: settling in s", step.settling));
-    piece.checks.push(Check::new("printed law: overshoot in %", step.overshoot));
+    piece.checks.push(Check::new("printed law: settling in s", settling(&step)));
+    piece.checks.push(Check::new("printed law: overshoot in %", 100.0 * step.overshoot));
     piece.checks.push(Check::new("printed law: largest deflection in degrees", ours.deflection()));
     piece.checks.push(Check::new("printed law: largest voltage in V", ours.voltage()));
     // Without friction the target at the equilibrium leaves nothing.
@@ -179,12 +186,12 @@ pub(crate) fn figure_4_1(_: &Fixture) -> Result<Piece> {
         let amplitude = degrees.to_radians();
         let still = RIG.without_friction();
         let step = Followed::new(&still, amplitude, with_equilibrium(still, amplitude)?)?.step(amplitude)?;
-        worst = worst.max(step.left.to_degrees());
+        worst = worst.max(step.final_error.abs().to_degrees());
         rows.push(vec![
             format!("target at the equilibrium, no friction, {degrees}°"),
-            number(step.settling),
-            number(step.overshoot),
-            number(step.left.to_degrees()),
+            number(settling(&step)),
+            number(100.0 * step.overshoot),
+            number(step.final_error.abs().to_degrees()),
             String::new(),
             String::new(),
         ]);

@@ -6,12 +6,14 @@ use std::path::{Path, PathBuf};
 use clap::{Args, ValueEnum};
 use greybox_control::{
     ClosedLoop, Controller, DesignOptions, Family, FamilyOptions, LoopOptions, Method, Metrics, Plant,
-    PlantOptions, Reference, Run, design,
+    PlantOptions, Pole, Reference, Run, design,
 };
 use greybox_export::{Constant, Function, Group, Language, Member};
 use greybox_model::Model;
 use greybox_recording::write_csv;
-use greybox_report::format;
+use greybox_report::contract::Producer;
+use greybox_report::convert::control::{self as convert, ControlSources};
+use greybox_report::{ControlPage, format, sentence};
 use serde_json::{Value, json};
 
 use crate::answer::Answer;
@@ -20,8 +22,15 @@ use crate::loading;
 use crate::output::OutputFolder;
 use crate::progress::Progress;
 
-/// Files of a result.
-const FILES: [&str; 5] = ["report.json", "closed_loop.csv", "law.c", "law.rs", "vectors.csv"];
+/// Files of a result and what they hold; the page names those beside it.
+const FILES: [(&str, &str); 6] = [
+    ("report.html", "this page"),
+    ("report.json", "its numbers"),
+    ("closed_loop.csv", "the simulated loop"),
+    ("law.c", "the law as C99"),
+    ("law.rs", "the law as Rust without the standard library"),
+    ("vectors.csv", "states and set points with the command that the code must give"),
+];
 /// States at which the exported code must agree, for each set point.
 const VECTORS: usize = 32;
 
@@ -33,8 +42,8 @@ const VECTORS: usize = 32;
 
 All numbers are in SI. Sizes are the typical deviations of states and input: weights (Bryson's rule), the width of
 smoothed friction and the perturbation of the state follow from them.
-DIR receives report.json, closed_loop.csv (a square wave between the set points), law.c (C99), law.rs (no_std Rust)
-and vectors.csv (states and set points with the command that the code must give).")]
+DIR receives report.html (self-contained, with plots), report.json, closed_loop.csv (a square wave between the set
+points), law.c (C99), law.rs (no_std Rust) and vectors.csv (states and set points with the command that the code must give).")]
 pub(crate) struct Arguments {
     /// Model (TOML), for example the improved.toml of a diagnosis
     #[arg(value_name = "MODEL.toml")]
@@ -132,7 +141,7 @@ pub(crate) fn run(arguments: &Arguments) -> Result<Answer, Failure> {
     let loaded = loading::model(&arguments.model)?;
     let model = &loaded.model;
     let out = OutputFolder::prepare(&arguments.out)?;
-    out.spares(&FILES, [&arguments.model])?;
+    out.spares(&FILES.map(|(name, _)| name), [&arguments.model])?;
     let refused = |e: greybox_control::ControlError| Failure::file(&arguments.model, e);
 
     let plant = Plant::of(model, &input(arguments, model)?, &options(arguments)?).map_err(refused)?;
@@ -162,20 +171,36 @@ pub(crate) fn run(arguments: &Arguments) -> Result<Answer, Failure> {
     let family = if deviations.is_empty() || arguments.members == 0 {
         None
     } else {
-        let options = FamilyOptions { deviations, members: arguments.members, seed: arguments.seed };
+        let options = FamilyOptions {
+            deviations: deviations.clone(),
+            members: arguments.members,
+            seed: arguments.seed,
+        };
         Some(closed.family(&reference, &options).map_err(refused)?)
     };
     progress.advance();
     drop(progress);
+    let producer = Producer { version: env!("CARGO_PKG_VERSION").into(), seed: arguments.seed };
+    let page = convert::page(&ControlSources {
+        model_file: &loaded.file,
+        model,
+        controller: &controller,
+        run: &run,
+        family: family.as_ref().map(|f| (f, deviations.as_slice())),
+        producer: &producer,
+        files: &FILES[1..],
+    });
 
     let function = function(model, &controller, &loaded.file);
     let written = |e: greybox_export::ExportError| Failure::file(&arguments.model, e);
     let (c, rust) =
         (function.code(Language::C99).map_err(written)?, function.code(Language::Rust).map_err(written)?);
     let vectors = vectors(&function, &controller, arguments.to).map_err(written)?;
-    let report = report(arguments, &loaded.file, &controller, &run, family.as_ref());
+    let report = report(&page, &controller, &run, family.as_ref());
     let closed_loop = series(&run)?;
+    let html = page.to_html().map_err(|e| Failure::internal(e.to_string()))?;
     out.write(&[
+        ("report.html", html.as_bytes()),
         ("report.json", format!("{report:#}\n").as_bytes()),
         ("closed_loop.csv", &closed_loop),
         ("law.c", c.as_bytes()),
@@ -342,13 +367,7 @@ fn series(run: &Run) -> Result<Vec<u8>, Failure> {
     Ok(csv)
 }
 
-fn report(
-    arguments: &Arguments,
-    file: &str,
-    controller: &Controller,
-    run: &Run,
-    family: Option<&Family>,
-) -> Value {
+fn report(page: &ControlPage, controller: &Controller, run: &Run, family: Option<&Family>) -> Value {
     let plant = controller.plant();
     let (low, high) = controller.limits();
     let limit = |v: f64| if v.is_finite() { json!(v) } else { Value::Null };
@@ -356,17 +375,19 @@ fn report(
         .checks()
         .iter()
         .map(|c| {
-            let poles: Vec<[f64; 2]> = c.poles.iter().map(|p| [p.re, p.im]).collect();
+            let poles = |poles: &[Pole]| poles.iter().map(|p| [p.re, p.im]).collect::<Vec<_>>();
             json!({
                 "set_point": c.set_point, "state": c.equilibrium.state, "command": c.equilibrium.input,
-                "poles": poles, "spectral_radius": c.spectral_radius,
+                "poles": poles(&c.poles), "held_poles": poles(&c.held_poles), "spectral_radius": c.spectral_radius,
             })
         })
         .collect();
     let spread = |s: &greybox_control::Spread| json!({ "median": limit(s.median), "worst": limit(s.worst) });
     json!({
-        "greybox": { "version": env!("CARGO_PKG_VERSION"), "seed": arguments.seed },
-        "model": file,
+        "greybox": page.producer,
+        "model": page.model.file,
+        "verdict": page.verdict.name(),
+        "summary": sentence::control::summary(page),
         "method": controller.method().name(),
         "input": plant.input_name(),
         "states": plant.state_names(),
@@ -394,7 +415,8 @@ fn report(
 fn metrics(m: &Metrics) -> Value {
     json!({
         "set_point": m.set_point, "settling": m.settling, "overshoot": m.overshoot,
-        "final_error": m.final_error, "largest_command": m.largest_command, "effort": m.effort,
+        "final_error": m.final_error, "rms_error": m.rms_error, "largest_command": m.largest_command,
+        "saturated": m.saturated, "effort": m.effort,
     })
 }
 
@@ -443,7 +465,7 @@ fn in_words(arguments: &Arguments, controller: &Controller, run: &Run, family: O
         );
     }
     let out = arguments.out.display();
-    let files: Vec<String> = FILES.iter().map(|f| format!("{out}/{f}")).collect();
+    let files: Vec<String> = FILES.iter().map(|(f, _)| format!("{out}/{f}")).collect();
     let _ = writeln!(text, "Written: {}", files.join(", "));
     text
 }

@@ -7,7 +7,9 @@ use greybox_identify::{FoundDelay, FoundEquation, HoldoutSource, Identification,
 use greybox_model::{Hold, Model, Unit, WriteOptions};
 use greybox_recording::Recording;
 
-use super::{health_findings, interval, names, recordings, residual, scores, spectra, state_map, times};
+use super::{
+    coherent, health_findings, interval, names, recordings, residual, scores, spectra, state_map, times,
+};
 use crate::contract::{Fit, FitSet, InputHold, ModelId, Ordered, Producer, RecordingFit};
 use crate::format;
 use crate::identified::{
@@ -142,18 +144,6 @@ fn variables(model: &Model, sources: &Sources<'_>) -> Ordered<Variable> {
         .filter_map(|s| Some(entry(&s.name, s.channel.as_deref()?, &s.unit, VariableRole::State)));
     let inputs = model.inputs.iter().map(|i| entry(&i.name, &i.channel, &i.unit, VariableRole::Input));
     states.chain(inputs).collect()
-}
-
-/// The SI unit in which the equations count what is recorded in `unit`.
-fn coherent(unit: &Unit) -> String {
-    if unit.factor == 1.0 {
-        return unit.text.clone();
-    }
-    // An angle has no dimension, but its unit has a name.
-    if unit.dimension.is_none() && ["deg", "°"].contains(&unit.text.as_str()) {
-        return "rad".to_owned();
-    }
-    Unit::si(unit.dimension).text
 }
 
 fn delay(found: &FoundDelay, model: &Model, units: bool) -> Delay {

@@ -1,0 +1,171 @@
+//! What the page of a controller shows: the law, what its simulated loop reached, and what it was checked for.
+//!
+//! Plain data, filled by the caller ([`crate::convert::control`]). All numbers are SI; units are those of
+//! [`Quantity::unit`]. A number that is not finite is shown as unknown.
+
+use greybox_control::Verdict;
+
+use crate::contract::{ModelId, Producer};
+
+/// Everything the page of a controller shows; [`ControlPage::to_html`] writes it.
+#[derive(Debug, Clone, PartialEq)]
+pub struct ControlPage {
+    /// Heading of the page and title of the window.
+    pub title: String,
+    /// What made the page.
+    pub producer: Producer,
+    /// The model the law was designed on.
+    pub model: ModelId,
+    /// What the simulated loops did.
+    pub verdict: Verdict,
+    /// How the law was found.
+    pub method: LawKind,
+    /// Further settings of the design: name and value.
+    pub settings: Vec<(&'static str, String)>,
+    /// The command.
+    pub input: Quantity,
+    /// Its range; infinite where there is no limit.
+    pub limits: [f64; 2],
+    /// Sample time of the law, s.
+    pub dt: f64,
+    /// The states that the law reads.
+    pub states: Vec<LawState>,
+    /// Which of them is brought to the set points.
+    pub tracked: usize,
+    /// The name of the set point in the law.
+    pub reference: String,
+    /// The law in the model language.
+    pub law: String,
+    /// Terms of the model that the design left out: equation and term.
+    pub left_out: Vec<(String, String)>,
+    /// The tangent of the loop at each set point.
+    pub set_points: Vec<SetPoint>,
+    /// What the simulated loop reached, set point by set point.
+    pub steps: Vec<Step>,
+    /// The same law on perturbed plants.
+    pub family: Option<Perturbed>,
+    /// The simulated loop.
+    pub run: LoopRun,
+    /// The files beside the page and what they hold.
+    pub files: Vec<(&'static str, &'static str)>,
+}
+
+/// How a law was found.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum LawKind {
+    /// Linear-quadratic regulator.
+    Lqr,
+    /// Value function of the Hamilton–Jacobi–Bellman equation.
+    Hjb,
+    /// Flat-output sliding mode.
+    Smc,
+}
+
+/// A name of the model with its SI unit.
+#[derive(Debug, Clone, PartialEq, Eq, Default)]
+pub struct Quantity {
+    /// As the model writes it, with its primes.
+    pub name: String,
+    /// SI unit; empty where none is known.
+    pub unit: String,
+}
+
+/// A state that the law reads.
+#[derive(Debug, Clone, PartialEq)]
+pub struct LawState {
+    /// The state.
+    pub quantity: Quantity,
+    /// Its typical size in the design.
+    pub size: f64,
+    /// Gain K of u = u_e − K (x − x_e) near the design point.
+    pub gain: f64,
+}
+
+/// The loop's tangent at a set point.
+#[derive(Debug, Clone, PartialEq)]
+pub struct SetPoint {
+    /// The set point.
+    pub value: f64,
+    /// The equilibrium there, in the order of [`ControlPage::states`].
+    pub state: Vec<f64>,
+    /// The command that holds it.
+    pub command: f64,
+    /// Poles of the continuous loop (real, imaginary part), 1/s.
+    pub poles: Vec<[f64; 2]>,
+    /// Poles in z with the command held over the sample time.
+    pub held_poles: Vec<[f64; 2]>,
+}
+
+/// What one step of the simulated loop reached.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct Step {
+    /// The set point.
+    pub set_point: f64,
+    /// Its distance from where the tracked state was.
+    pub size: f64,
+    /// Time after which the tracked state stays within 2 % of the step, s; none where it does not.
+    pub settling: Option<f64>,
+    /// Largest excursion beyond the set point, relative to the step.
+    pub overshoot: f64,
+    /// Tracked state minus set point at the end.
+    pub final_error: f64,
+    /// Root mean square of tracked state minus set point.
+    pub rms_error: f64,
+    /// Largest |command|.
+    pub largest_command: f64,
+    /// Share of the samples with the command at its limit.
+    pub saturated: f64,
+    /// ∫ u² dt.
+    pub effort: f64,
+}
+
+/// One law on perturbed plants.
+#[derive(Debug, Clone, PartialEq)]
+pub struct Perturbed {
+    /// Plants.
+    pub members: usize,
+    /// Those whose state or command left every bound.
+    pub diverged: usize,
+    /// Those that settled at every set point.
+    pub settled: usize,
+    /// The perturbed parameters: quantity, value, standard deviation.
+    pub deviations: Vec<(Quantity, f64, f64)>,
+    /// A figure's name, its unit, and the median and the worst of the members; infinite where not reached.
+    pub figures: Vec<Figure>,
+    /// Least and largest tracked state of the members that did not diverge, at the times of the run.
+    pub tracked: [Vec<f64>; 2],
+    /// The same of the command.
+    pub command: [Vec<f64>; 2],
+}
+
+/// A figure over the perturbed plants.
+#[derive(Debug, Clone, PartialEq)]
+pub struct Figure {
+    /// Its name.
+    pub name: &'static str,
+    /// Unit; `%` for a ratio.
+    pub unit: String,
+    /// On the model itself, the worst set point.
+    pub own: f64,
+    /// Half of the plants are better.
+    pub median: f64,
+    /// The worst plant.
+    pub worst: f64,
+}
+
+/// The simulated loop.
+#[derive(Debug, Clone, PartialEq, Default)]
+pub struct LoopRun {
+    /// Time, s.
+    pub t: Vec<f64>,
+    /// Set point.
+    pub reference: Vec<f64>,
+    /// Command, held until the next sample.
+    pub command: Vec<f64>,
+    /// Every state of the simulated model.
+    pub states: Vec<(Quantity, Vec<f64>)>,
+    /// Which of them is tracked.
+    pub tracked: usize,
+    /// When the loop left every bound, s.
+    pub diverged: Option<f64>,
+}

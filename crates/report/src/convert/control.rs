@@ -1,0 +1,198 @@
+//! From a controller and its simulated loops to the page.
+
+use greybox_control::{Controller, Family, Method, Metrics, Run, Spread};
+use greybox_model::{Expr, Model};
+
+use super::coherent;
+use crate::contract::{ModelId, Producer};
+use crate::control::{ControlPage, Figure, LawKind, LawState, LoopRun, Perturbed, Quantity, SetPoint, Step};
+use crate::format;
+
+/// What a page is made from.
+#[derive(Debug, Clone, Copy)]
+pub struct ControlSources<'a> {
+    /// File name of the model, without its directory.
+    pub model_file: &'a str,
+    /// The model, as simulated.
+    pub model: &'a Model,
+    /// The law.
+    pub controller: &'a Controller,
+    /// Its loop on the model.
+    pub run: &'a Run,
+    /// The perturbed plants, with the standard deviations (SI) of their parameters.
+    pub family: Option<(&'a Family, &'a [(String, f64)])>,
+    /// Version and seed.
+    pub producer: &'a Producer,
+    /// The files beside the page and what they hold.
+    pub files: &'a [(&'static str, &'static str)],
+}
+
+/// The page of a controller.
+pub fn page(sources: &ControlSources<'_>) -> ControlPage {
+    let ControlSources { model, controller, run, .. } = *sources;
+    let plant = controller.plant();
+    let names = plant.state_names();
+    let quantity = |name: &str, primes: u8, shown: &str| Quantity {
+        name: shown.to_owned(),
+        unit: model
+            .state(name)
+            .map_or_else(String::new, |i| per_second(&coherent(&model.states[i].unit), primes)),
+    };
+    let states: Vec<LawState> = plant
+        .symbols()
+        .iter()
+        .zip(&names)
+        .zip(plant.sizes().iter().zip(controller.gains()))
+        .map(|(((name, primes), shown), (size, gain))| LawState {
+            quantity: quantity(name, *primes, shown),
+            size: *size,
+            gain: *gain,
+        })
+        .collect();
+    let input = Quantity {
+        name: plant.input_name().to_owned(),
+        unit: model.input(plant.input_name()).map_or_else(String::new, |i| coherent(&model.inputs[i].unit)),
+    };
+    let pole = |p: &greybox_control::Pole| [p.re, p.im];
+    let set_points = controller.checks().iter().map(|c| SetPoint {
+        value: c.set_point,
+        // What is rounding is not shown.
+        state: c.equilibrium.state.iter().zip(plant.sizes()).map(|(x, size)| rounded(*x, *size)).collect(),
+        command: rounded(c.equilibrium.input, plant.input_size()),
+        poles: c.poles.iter().map(pole).collect(),
+        held_poles: c.held_poles.iter().map(pole).collect(),
+    });
+    let symbols = model
+        .states
+        .iter()
+        .flat_map(|s| (0..s.order).map(|p| (s.name.as_str(), u8::try_from(p).unwrap_or(u8::MAX))));
+    let series = symbols
+        .zip(&run.x)
+        .map(|((name, primes), x)| {
+            (quantity(name, primes, &Expr::prime(name, primes).to_string()), x.clone())
+        })
+        .collect();
+    let (low, high) = controller.limits();
+    ControlPage {
+        title: format!(
+            "Controller of {}",
+            if model.name.is_empty() { sources.model_file } else { &model.name }
+        ),
+        producer: sources.producer.clone(),
+        model: ModelId { name: model.name.clone(), file: sources.model_file.to_owned() },
+        verdict: run.verdict(sources.family.map(|(f, _)| f)),
+        method: match controller.method() {
+            Method::Lqr => LawKind::Lqr,
+            Method::Hjb { .. } => LawKind::Hjb,
+            Method::Smc { .. } => LawKind::Smc,
+        },
+        settings: settings(controller, &input),
+        limits: [low, high],
+        dt: controller.dt(),
+        tracked: controller.tracked(),
+        reference: controller.reference().to_owned(),
+        law: controller.law().first().map(ToString::to_string).unwrap_or_default(),
+        left_out: plant.dropped().iter().map(|d| (d.equation.clone(), d.term.to_string())).collect(),
+        set_points: set_points.collect(),
+        steps: run.metrics.iter().map(step).collect(),
+        family: sources.family.map(|(family, deviations)| {
+            let unit = states.get(controller.tracked()).map_or("", |s| s.quantity.unit.as_str());
+            perturbed(family, deviations, model, &run.metrics, [unit, &input.unit])
+        }),
+        run: LoopRun {
+            t: run.t.clone(),
+            reference: run.r.clone(),
+            command: run.u.clone(),
+            states: series,
+            tracked: run.tracked,
+            diverged: run.diverged.and_then(|k| run.t.get(k).copied()),
+        },
+        files: sources.files.to_vec(),
+        states,
+        input,
+    }
+}
+
+/// Zero where a value is nothing against its size.
+fn rounded(value: f64, size: f64) -> f64 {
+    if value.abs() < 1e-12 * size { 0.0 } else { value }
+}
+
+/// `rad` → `rad/s^2`
+fn per_second(unit: &str, primes: u8) -> String {
+    match (unit, primes) {
+        ("", _) | (_, 0) => unit.to_owned(),
+        (unit, 1) => format!("{unit}/s"),
+        (unit, n) => format!("{unit}/s^{n}"),
+    }
+}
+
+fn settings(controller: &Controller, input: &Quantity) -> Vec<(&'static str, String)> {
+    let plant = controller.plant();
+    let of_input = |value: f64| format::with_unit(&format::plain(value), &input.unit);
+    let mut out = Vec::new();
+    match controller.method() {
+        Method::Lqr => {}
+        Method::Hjb { degree, .. } => out.push(("Degree of the value function", degree.to_string())),
+        Method::Smc { lambda, eta, phi } => {
+            out.push(("Poles on the surface", format!("{} 1/s", format::plain(-lambda))));
+            out.push(("Pole towards the surface", format!("{} 1/s", format::plain(-eta / phi))));
+            out.push(("Reaching rate η", of_input(*eta)));
+        }
+    }
+    out.push(("Typical size of the command", of_input(plant.input_size())));
+    if plant.dead_zone() > 0.0 {
+        out.push(("Dead zone made up for", of_input(plant.dead_zone())));
+    }
+    out
+}
+
+fn step(m: &Metrics) -> Step {
+    Step {
+        set_point: m.set_point,
+        size: m.step,
+        settling: m.settling,
+        overshoot: m.overshoot,
+        final_error: m.final_error,
+        rms_error: m.rms_error,
+        largest_command: m.largest_command,
+        saturated: m.saturated,
+        effort: m.effort,
+    }
+}
+
+fn perturbed(
+    family: &Family,
+    deviations: &[(String, f64)],
+    model: &Model,
+    own: &[Metrics],
+    [tracked, input]: [&str; 2],
+) -> Perturbed {
+    let own = |of: fn(&Metrics) -> f64| own.iter().map(of).fold(0.0, f64::max);
+    let figure = |name, unit: &str, own: f64, spread: Spread| Figure {
+        name,
+        unit: unit.to_owned(),
+        own,
+        median: spread.median,
+        worst: spread.worst,
+    };
+    let parameters = deviations.iter().filter_map(|(name, deviation)| {
+        let parameter = &model.parameters[model.parameter(name)?];
+        let unit = parameter.unit.as_ref().map(coherent).unwrap_or_default();
+        Some((Quantity { name: name.clone(), unit }, parameter.value, *deviation))
+    });
+    Perturbed {
+        members: family.members,
+        diverged: family.diverged,
+        settled: family.settled,
+        deviations: parameters.collect(),
+        figures: vec![
+            figure("Settling", "s", own(|m| m.settling.unwrap_or(f64::INFINITY)), family.settling),
+            figure("Overshoot", "%", own(|m| m.overshoot), family.overshoot),
+            figure("Final error", tracked, own(|m| m.final_error.abs()), family.final_error),
+            figure("Largest command", input, own(|m| m.largest_command), family.largest_command),
+        ],
+        tracked: [family.tracked.lowest.clone(), family.tracked.highest.clone()],
+        command: [family.command.lowest.clone(), family.command.highest.clone()],
+    }
+}

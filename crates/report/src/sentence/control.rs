@@ -1,0 +1,71 @@
+//! What a control engineer wants to know first, in plain language.
+
+use greybox_control::Verdict;
+
+use crate::control::ControlPage;
+use crate::{expression, format};
+
+/// The conclusion, most important first: how the loop settles, then what holds on perturbed plants, then the command.
+pub fn summary(page: &ControlPage) -> Vec<String> {
+    let tracked = page.states.get(page.tracked).map(|s| &s.quantity);
+    let unit = tracked.map_or("", |q| q.unit.as_str());
+    let name = tracked.map_or_else(|| "The tracked state".to_owned(), |q| expression::text(&q.name));
+    let mut out = vec![reached(page, &name, unit)];
+    out.push(match &page.family {
+        None => "No perturbed plants were tried: nothing is said about a plant that is not quite the model.".into(),
+        Some(family) => {
+            let diverged = match family.diverged {
+                0 => "none diverges".to_owned(),
+                1 => "one diverges".to_owned(),
+                n => format!("{n} diverge"),
+            };
+            format!(
+                "Of {} plants with parameters drawn around the model's, {} settle at every set point; {diverged}.",
+                family.members, family.settled
+            )
+        }
+    });
+    out.push(command(page));
+    out
+}
+
+fn reached(page: &ControlPage, name: &str, unit: &str) -> String {
+    if let Some(t) = page.run.diverged {
+        return format!("{name} leaves every bound after {} s.", format::plain(t));
+    }
+    let worst = |of: fn(&crate::control::Step) -> f64| page.steps.iter().map(of).fold(0.0, f64::max);
+    let missed = page.steps.iter().filter(|s| s.settling.is_none()).count();
+    let left = format::with_unit(&format::number(worst(|s| s.final_error.abs())), unit);
+    if page.verdict == Verdict::Unsettled || missed > 0 {
+        return format!(
+            "{name} does not come to stay within 2 % of the step at {missed} of {} set points; it ends up to {left} off.",
+            page.steps.len()
+        );
+    }
+    format!(
+        "{name} stays within 2 % of every step after at most {} s, overshoots by {} at most and ends within {left} of its \
+         set point.",
+        format::number(worst(|s| s.settling.unwrap_or(f64::NAN))),
+        format::percent_short(worst(|s| s.overshoot)),
+    )
+}
+
+fn command(page: &ControlPage) -> String {
+    let largest = page.steps.iter().map(|s| s.largest_command).fold(0.0, f64::max);
+    let reaches = format!(
+        "{} reaches {}",
+        expression::text(&page.input.name),
+        format::with_unit(&format::number(largest), &page.input.unit)
+    );
+    let saturated = page.steps.iter().map(|s| s.saturated).fold(0.0, f64::max);
+    if page.limits.iter().all(|l| l.is_infinite()) {
+        format!("{reaches}; no limit of the actuator was stated.")
+    } else if saturated > 0.0 {
+        format!(
+            "{reaches}, its limit, and is there for {} of a step at most.",
+            format::percent_short(saturated)
+        )
+    } else {
+        format!("{reaches} and stays within its limits.")
+    }
+}
