@@ -33,7 +33,7 @@ const SLOWEST: f64 = 10.0;
 const MOST_SAMPLES: usize = 5000;
 /// Work after which nothing more is looked for: laws that the library lacks are pieced together from mechanisms with
 /// memories and delays, each slower to simulate than the one before.
-pub const MOST_WORK: u64 = 60_000_000_000;
+pub const MOST_WORK: u64 = 80_000_000_000;
 /// Most mechanisms that are looked for.
 const MOST_MECHANISMS: usize = 4;
 /// Most candidates that are fitted per round.

@@ -654,22 +654,14 @@ impl Tape {
             }
             let v = |r: Reg| regs[r as usize];
             let row = |r: Reg| &lower[r as usize * lanes..][..lanes];
-            let scaled = |o: &mut [f64], a: Reg, k: f64| {
-                for (o, x) in o.iter_mut().zip(row(a)) {
-                    *o = k * x;
-                }
-            };
+            let scaled = |o: &mut [f64], a: Reg, k: f64| scale(o, row(a), k);
             let blended = |o: &mut [f64], a: Reg, ka: f64, b: Reg, kb: f64| match (
                 active[a as usize],
                 active[b as usize],
             ) {
-                (true, false) => scaled(o, a, ka),
-                (false, true) => scaled(o, b, kb),
-                _ => {
-                    for ((o, x), y) in o.iter_mut().zip(row(a)).zip(row(b)) {
-                        *o = ka * x + kb * y;
-                    }
-                }
+                (true, false) => scale(o, row(a), ka),
+                (false, true) => scale(o, row(b), kb),
+                _ => blend(o, row(a), ka, row(b), kb),
             };
             match *op {
                 Op::Neg(a) => scaled(o, a, -1.0),
@@ -801,6 +793,24 @@ pub enum Column<'a> {
     Value(f64),
     /// One value per point.
     Series(&'a [f64]),
+}
+
+/// o = k x.
+#[inline(always)]
+fn scale(o: &mut [f64], x: &[f64], k: f64) {
+    let x = &x[..o.len()];
+    for l in 0..o.len() {
+        o[l] = k * x[l];
+    }
+}
+
+/// o = a x + b y.
+#[inline(always)]
+fn blend(o: &mut [f64], x: &[f64], a: f64, y: &[f64], b: f64) {
+    let (x, y) = (&x[..o.len()], &y[..o.len()]);
+    for l in 0..o.len() {
+        o[l] = a * x[l] + b * y[l];
+    }
 }
 
 #[inline]

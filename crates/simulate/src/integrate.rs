@@ -179,14 +179,35 @@ struct Stage {
     s: f64,
     mid: f64,
     lambda: Vec<f64>,
-    /// For each sticking switch: gradient of its argument (nx), and f(λ=1) − f(λ=0) (nx).
+    held: Held,
+}
+
+/// What holds the sticking switches of a stage: ġ = a + Bλ = 0.
+#[derive(Default)]
+struct Held {
+    /// For each: gradient of its argument (nx), and f(λ=1) − f(λ=0) (nx).
     gradient: Vec<f64>,
     pull: Vec<f64>,
-    /// B of the sticking switches, factored.
+    a: Vec<f64>,
+    /// B, factored.
     b: Vec<f64>,
-    b_pivots: Vec<usize>,
-    b_diagonal: Vec<f64>,
-    b_ok: bool,
+    pivots: Vec<usize>,
+    diagonal: Vec<f64>,
+    ok: bool,
+    /// f(λ=0).
+    f0: Vec<f64>,
+}
+
+impl Held {
+    fn resize(&mut self, switches: usize, states: usize) {
+        self.gradient.resize(switches * states, 0.0);
+        self.pull.resize(switches * states, 0.0);
+        self.a.resize(switches, 0.0);
+        self.b.resize(switches * switches, 0.0);
+        self.pivots.resize(switches, 0);
+        self.diagonal.resize(switches, 0.0);
+        self.f0.resize(states, 0.0);
+    }
 }
 
 /// Past values of a delayed expression.
@@ -579,6 +600,8 @@ struct Core<'a> {
     active: Vec<bool>,
     b: Vec<f64>,
     dlambda: Vec<f64>,
+    /// Tangents of what holds the sticking switches.
+    dl: Vec<f64>,
     gd: Vec<f64>,
     gactive: Vec<bool>,
     h_next: f64,
@@ -624,12 +647,7 @@ impl<'a> Core<'a> {
             s: 0.0,
             mid: 0.0,
             lambda: vec![0.0; tape.switches.len()],
-            gradient: Vec::new(),
-            pull: Vec::new(),
-            b: Vec::new(),
-            b_pivots: Vec::new(),
-            b_diagonal: Vec::new(),
-            b_ok: true,
+            held: Held { ok: true, ..Held::default() },
         };
         let mut stages: Vec<Stage> = (0..=tableau.b.len()).map(|_| stage(&regs)).collect();
         if system.mass_is_fixed {
@@ -719,6 +737,7 @@ impl<'a> Core<'a> {
             active,
             b: vec![0.0; nz * lanes.max(1)],
             dlambda: vec![0.0; tape.switches.len() * lanes],
+            dl: Vec::new(),
             gd: Vec::new(),
             gactive,
             h_next: env.dt,
@@ -969,7 +988,7 @@ impl<'a> Core<'a> {
     fn eval_sticking(&mut self, b: usize) {
         let tape = &self.system.rhs;
         let nx = self.system.nx;
-        let sticking = self.sticking.clone();
+        let sticking = std::mem::take(&mut self.sticking);
         let m = sticking.len();
         let evaluate = |core: &mut Self| {
             let st = &mut core.stages[b];
@@ -981,44 +1000,43 @@ impl<'a> Core<'a> {
             self.stages[b].lambda[k] = 0.0;
         }
         evaluate(self);
-        let f0 = self.stages[b].f.clone();
         // Gradient of the arguments with respect to the state; the last lane collects explicit time.
         self.rates(b, true);
         let lanes = nx + 1;
-        let mut gradient = vec![0.0; m * nx];
-        let mut a = vec![0.0; m];
+        let mut held = std::mem::take(&mut self.stages[b].held);
+        held.resize(m, nx);
+        let f0 = &mut held.f0;
+        f0.copy_from_slice(&self.stages[b].f);
         for (i, &k) in sticking.iter().enumerate() {
             let row = &self.gd[tape.switches[k].a as usize * lanes..][..lanes];
-            gradient[i * nx..(i + 1) * nx].copy_from_slice(&row[..nx]);
-            a[i] = -(row[nx] + row[..nx].iter().zip(&f0).map(|(g, f)| g * f).sum::<f64>());
+            held.gradient[i * nx..(i + 1) * nx].copy_from_slice(&row[..nx]);
+            held.a[i] = -(row[nx] + row[..nx].iter().zip(&*f0).map(|(g, f)| g * f).sum::<f64>());
         }
-        let mut pull = vec![0.0; m * nx];
         for (i, &k) in sticking.iter().enumerate() {
             self.stages[b].lambda[k] = 1.0;
             evaluate(self);
             self.stages[b].lambda[k] = 0.0;
-            for ((p, f1), f0) in pull[i * nx..].iter_mut().zip(&self.stages[b].f).zip(&f0) {
+            for ((p, f1), f0) in held.pull[i * nx..].iter_mut().zip(&self.stages[b].f).zip(&*f0) {
                 *p = f1 - f0;
             }
         }
-        let mut bm = vec![0.0; m * m];
         for i in 0..m {
             for j in 0..m {
-                bm[i * m + j] = (0..nx).map(|r| gradient[i * nx + r] * pull[j * nx + r]).sum();
+                let (g, p) = (&held.gradient[i * nx..(i + 1) * nx], &held.pull[j * nx..(j + 1) * nx]);
+                held.b[i * m + j] = g.iter().zip(p).map(|(g, p)| g * p).sum();
             }
+            held.diagonal[i] = held.b[i * m + i];
         }
-        let diagonal = (0..m).map(|i| bm[i * m + i]).collect();
-        let mut pivots = vec![0; m];
-        let ok = small::factor(&mut bm, &mut pivots, m);
-        if ok {
-            small::solve(&bm, &pivots, m, &mut a, 1);
+        held.ok = small::factor(&mut held.b, &mut held.pivots, m);
+        if held.ok {
+            small::solve(&held.b, &held.pivots, m, &mut held.a, 1);
             for (i, &k) in sticking.iter().enumerate() {
-                self.stages[b].lambda[k] = a[i];
+                self.stages[b].lambda[k] = held.a[i];
             }
         }
         evaluate(self);
         let st = &mut self.stages[b];
-        if ok {
+        if held.ok {
             // A velocity that is held does not change, not even by rounding: relative error control
             // would chase that noise with ever smaller steps.
             for &k in &sticking {
@@ -1028,12 +1046,8 @@ impl<'a> Core<'a> {
                 }
             }
         }
-        st.gradient = gradient;
-        st.pull = pull;
-        st.b = bm;
-        st.b_pivots = pivots;
-        st.b_diagonal = diagonal;
-        st.b_ok = ok;
+        st.held = held;
+        self.sticking = sticking;
     }
 
     /// Time derivatives of the registers at stage `b` into `self.gd`: with `split` one lane per state
@@ -1452,12 +1466,14 @@ impl<'a> Core<'a> {
             dk[r * lanes..(r + 1) * lanes].copy_from_slice(&self.b[j * lanes..(j + 1) * lanes]);
         }
         let m = self.sticking.len();
-        if m > 0 && st.b_ok {
+        if m > 0 && st.held.ok {
             // dλ keeps the derivative of ġ zero: ∇g·(dẋ + Σ pull dλ) = 0.
-            let mut dl = vec![0.0; m * lanes];
+            let mut dl = std::mem::take(&mut self.dl);
+            dl.clear();
+            dl.resize(m * lanes, 0.0);
             for i in 0..m {
                 for r in 0..nx {
-                    let g = st.gradient[i * nx + r];
+                    let g = st.held.gradient[i * nx + r];
                     if g != 0.0 {
                         for l in 0..lanes {
                             dl[i * lanes + l] -= g * dk[r * lanes + l];
@@ -1465,10 +1481,10 @@ impl<'a> Core<'a> {
                     }
                 }
             }
-            small::solve(&st.b, &st.b_pivots, m, &mut dl, lanes);
+            small::solve(&st.held.b, &st.held.pivots, m, &mut dl, lanes);
             for i in 0..m {
                 for r in 0..nx {
-                    let p = st.pull[i * nx + r];
+                    let p = st.held.pull[i * nx + r];
                     if p != 0.0 {
                         for l in 0..lanes {
                             dk[r * lanes + l] += p * dl[i * lanes + l];
@@ -1478,6 +1494,7 @@ impl<'a> Core<'a> {
                 let k = self.sticking[i];
                 self.dlambda[k * lanes..(k + 1) * lanes].copy_from_slice(&dl[i * lanes..(i + 1) * lanes]);
             }
+            self.dl = dl;
         }
         self.dxs = dxs;
     }
@@ -1583,8 +1600,8 @@ impl<'a> Core<'a> {
         let at = self.sticking.iter().position(|&j| j == k).unwrap_or(0);
         self.eval(0, self.s, self.s + ahead);
         let st = &self.stages[0];
-        let (lambda, slope) = (st.lambda[k], st.b_diagonal.get(at).copied().unwrap_or(0.0));
-        if st.b_ok && slope < 0.0 {
+        let (lambda, slope) = (st.lambda[k], st.held.diagonal.get(at).copied().unwrap_or(0.0));
+        if st.held.ok && slope < 0.0 {
             if lambda.abs() <= 1.0 {
                 let leaf = self.system.rhs.switches[k].a as usize;
                 if (System::STATES..System::STATES + self.system.nx).contains(&leaf) {

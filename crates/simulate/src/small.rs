@@ -37,36 +37,63 @@ pub fn solve(a: &[f64], pivots: &[usize], n: usize, b: &mut [f64], lanes: usize)
         b[..lanes].iter_mut().for_each(|x| *x *= inverse);
         return;
     }
-    for k in 0..n {
-        let p = pivots[k];
+    if lanes == 1 {
+        return solve_one(a, pivots, n, b);
+    }
+    for (k, &p) in pivots[..n].iter().enumerate() {
         if p != k {
-            for l in 0..lanes {
-                b.swap(k * lanes + l, p * lanes + l);
-            }
+            let (low, high) = b.split_at_mut(k.max(p) * lanes);
+            low[k.min(p) * lanes..][..lanes].swap_with_slice(&mut high[..lanes]);
         }
+    }
+    for k in 0..n {
+        for i in k + 1..n {
+            let (above, below) = b.split_at_mut(i * lanes);
+            less(&mut below[..lanes], a[i * n + k], &above[k * lanes..][..lanes]);
+        }
+    }
+    for k in (0..n).rev() {
+        let (above, below) = b.split_at_mut(k * lanes);
+        let known = &mut below[..lanes];
+        let inverse = 1.0 / a[k * n + k];
+        known.iter_mut().for_each(|x| *x *= inverse);
+        for i in 0..k {
+            less(&mut above[i * lanes..][..lanes], a[i * n + k], known);
+        }
+    }
+}
+
+fn solve_one(a: &[f64], pivots: &[usize], n: usize, b: &mut [f64]) {
+    let b = &mut b[..n];
+    for (k, &p) in pivots[..n].iter().enumerate() {
+        b.swap(k, p);
     }
     for k in 0..n {
         for i in k + 1..n {
             let m = a[i * n + k];
             if m != 0.0 {
-                for l in 0..lanes {
-                    b[i * lanes + l] -= m * b[k * lanes + l];
-                }
+                b[i] -= m * b[k];
             }
         }
     }
     for k in (0..n).rev() {
-        let inverse = 1.0 / a[k * n + k];
-        for l in 0..lanes {
-            b[k * lanes + l] *= inverse;
-        }
+        b[k] *= 1.0 / a[k * n + k];
         for i in 0..k {
             let m = a[i * n + k];
             if m != 0.0 {
-                for l in 0..lanes {
-                    b[i * lanes + l] -= m * b[k * lanes + l];
-                }
+                b[i] -= m * b[k];
             }
+        }
+    }
+}
+
+/// row − m·known, where m is not zero.
+#[inline(always)]
+fn less(row: &mut [f64], m: f64, known: &[f64]) {
+    if m != 0.0 {
+        let known = &known[..row.len()];
+        for l in 0..row.len() {
+            row[l] -= m * known[l];
         }
     }
 }
