@@ -436,7 +436,7 @@ impl Setup {
                 let n = problem.segments[i].range.len();
                 let few = n.min(ONE_SIDED);
                 let first: f64 = (0..ny).map(|c| squares(&rows[i].r[c * n..c * n + few])).sum();
-                !(first <= BADLY_STARTED * mean * few as f64)
+                first > BADLY_STARTED * mean * few as f64
             })
             .map(|i| {
                 let segment = &problem.segments[i];
@@ -453,7 +453,7 @@ impl Setup {
         }
         let anew = problem.rows(&point, false, None);
         for (i, _) in grown {
-            if !(squares(&anew[i].r) < squares(&rows[i].r)) {
+            if squares(&anew[i].r).total_cmp(&squares(&rows[i].r)).is_ge() {
                 point.starts[i].clone_from(&before.starts[i]);
             }
         }

@@ -1190,6 +1190,11 @@ mod tests {
                 "must enclose the grid",
             ),
             (
+                "force = \"k*d/x\"\nlinear = [\"k\"]\n[inner]\nx = { grid = [5], carrier = \"d\" }",
+                7,
+                "`carrier` is what a law with a `spectral` variable is multiplied by",
+            ),
+            (
                 "force = \"k*d/x\"\nlinear = [\"k\"]\n[inner]\nx = { grid = [5], scal = \"1\" }",
                 7,
                 "unknown field `scal`",
