@@ -178,7 +178,13 @@ impl Bench<'_> {
                         samples.extend(ours);
                         let with = peer.name.to_owned();
                         let agreement = Some(agreement);
-                        comparisons.push(Comparison::new(with, Some(theirs), theirs / mine, peer.goal, agreement));
+                        comparisons.push(Comparison::new(
+                            with,
+                            Some(theirs),
+                            theirs / mine,
+                            peer.goal,
+                            agreement,
+                        ));
                     }
                 }
                 if samples.is_empty() {

@@ -359,7 +359,9 @@ impl<'a> Descent<'a> {
                 }
             }
             if share < 1.0 {
-                for ((&j, &sign), &x) in self.active.columns.iter().zip(&self.active.signs).zip(&self.solution) {
+                for ((&j, &sign), &x) in
+                    self.active.columns.iter().zip(&self.active.signs).zip(&self.solution)
+                {
                     let b = self.beta[j];
                     // Those that reach zero first are zero exactly.
                     let reaches = x * sign <= 0.0 && (b == 0.0 || b / (b - x) <= share);

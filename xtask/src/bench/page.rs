@@ -13,7 +13,8 @@ const END: &str = "<!-- End of the table. -->";
 /// Puts the table between the markers of `docs/src/speed.md`.
 pub(crate) fn write(root: &Path, report: &Report) -> Result<()> {
     let path = root.join("docs").join("src").join("speed.md");
-    let page = std::fs::read_to_string(&path).with_context(|| format!("{} cannot be read", path.display()))?;
+    let page =
+        std::fs::read_to_string(&path).with_context(|| format!("{} cannot be read", path.display()))?;
     let page = between(&page, &table(report)).with_context(|| path.display().to_string())?;
     std::fs::write(&path, page).with_context(|| format!("{} cannot be written", path.display()))
 }
@@ -25,10 +26,7 @@ fn between(page: &str, table: &str) -> Result<String> {
 }
 
 fn table(report: &Report) -> String {
-    let mut text = format!(
-        "Machine: {}, {} cores.\n",
-        report.machine.processor, report.machine.cores
-    );
+    let mut text = format!("Machine: {}, {} cores.\n", report.machine.processor, report.machine.cores);
     if let Some(peak) = report.peak {
         let _ = writeln!(text, "Peak of one core: {:.0}·10⁹ operations a second.", 1e-9 * peak);
     }
@@ -42,8 +40,12 @@ fn table(report: &Report) -> String {
             let (what, ours) = if i == 0 { (row.what.as_str(), ours.as_str()) } else { ("", "") };
             let theirs = c.theirs.map_or_else(String::new, duration);
             let (ratio, goal) = (c.times(c.ratio), c.times(c.goal));
-            let _ =
-                writeln!(text, "| {what} | {ours} | {} | {theirs} | {ratio} | {goal} | {} |", c.with, c.verdict());
+            let _ = writeln!(
+                text,
+                "| {what} | {ours} | {} | {theirs} | {ratio} | {goal} | {} |",
+                c.with,
+                c.verdict()
+            );
         }
     }
     text

@@ -16,7 +16,8 @@ impl WithSimd for Chains {
     fn with_simd<S: Simd>(self, simd: S) -> (f64, f64) {
         let (factor, term) = (simd.splat_f64s(0.999_999), simd.splat_f64s(1e-6));
         // Values the compiler cannot know, or equal chains would become one.
-        let mut sums: [S::f64s; SUMS] = std::array::from_fn(|k| simd.splat_f64s(std::hint::black_box(k as f64)));
+        let mut sums: [S::f64s; SUMS] =
+            std::array::from_fn(|k| simd.splat_f64s(std::hint::black_box(k as f64)));
         for _ in 0..ROUNDS {
             for sum in &mut sums {
                 *sum = simd.mul_add_f64s(*sum, factor, term);

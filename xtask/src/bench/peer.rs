@@ -33,7 +33,8 @@ pub(crate) fn environment(root: &Path, target: &Path) -> Result<PathBuf> {
 
 fn succeed(command: &mut Command) -> Result<()> {
     let text = format!("{command:?}");
-    let status = command.stdin(Stdio::null()).status().with_context(|| format!("{text} could not be started"))?;
+    let status =
+        command.stdin(Stdio::null()).status().with_context(|| format!("{text} could not be started"))?;
     if !status.success() {
         bail!("{text} failed ({status})");
     }

@@ -19,8 +19,7 @@ use crate::root;
 
 /// The rows.
 pub(crate) fn rows() -> Vec<Row> {
-    let row =
-        |name, what, unit, make| Row { name, what, unit, against: Against::Peers(&[]), make };
+    let row = |name, what, unit, make| Row { name, what, unit, against: Against::Peers(&[]), make };
     vec![
         row("signals", "windows of 1 s on 40 000 samples, one every 20, 3 columns", "record", signals),
         row("smoothing", "smoothing of 40 000 samples with two derivatives", "record", smoothing),
