@@ -265,8 +265,7 @@ impl Bench<'_> {
 
 /// One call in a pool of threads.
 fn on(pool: &rayon::ThreadPool, case: &mut Case) -> Result<Answer> {
-    let work = &mut case.work;
-    pool.install(move || work())
+    pool.install(&mut case.work)
 }
 
 /// Wall-clock time of one call, s.

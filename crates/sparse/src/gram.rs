@@ -10,6 +10,9 @@ use crate::rows::{Rows, check_ranges, count, first_not_finite};
 /// Rows of a panel: its columns stay in the caches while they are multiplied.
 pub(crate) const PANEL: usize = 256;
 
+/// Rows from which samples are drawn at a time: they stay in the second-level cache for all samples.
+const DRAWN: usize = 1024;
+
 /// The panels of row ranges.
 pub(crate) fn panels(ranges: &[Range<usize>]) -> impl Iterator<Item = Range<usize>> + '_ {
     ranges.iter().flat_map(|r| r.clone().step_by(PANEL).map(|start| start..(start + PANEL).min(r.end)))
@@ -126,34 +129,49 @@ impl Gram {
     /// # Errors
     /// [`SparseError::Length`] if there is not one weight per row.
     pub fn of_weighted_rows(rows: &Rows<'_>, weights: &[u32]) -> Result<Self, SparseError> {
-        if weights.len() != rows.rows() {
+        let gram = Self::of_samples(rows, &[weights])?.pop();
+        gram.ok_or(SparseError::Empty { what: "samples" })
+    }
+
+    /// [`Gram::of_weighted_rows`] of several samples, each with its weights; the rows are read once for all of them.
+    ///
+    /// # Errors
+    /// As [`Gram::of_weighted_rows`].
+    pub fn of_samples(rows: &Rows<'_>, samples: &[&[u32]]) -> Result<Vec<Self>, SparseError> {
+        if let Some(bad) = samples.iter().find(|w| w.len() != rows.rows()) {
             return Err(SparseError::Length {
                 what: "the list of row weights".into(),
-                found: weights.len(),
+                found: bad.len(),
                 expected: rows.rows(),
             });
         }
-        let taken: Vec<(usize, f64)> = weights
-            .iter()
-            .enumerate()
-            .filter(|&(_, &w)| w > 0)
-            .map(|(i, &w)| (i, f64::from(w).sqrt()))
-            .collect();
         let m = rows.columns() + 1;
-        let mut sums = vec![0.0; m * m];
-        let mut panel = vec![0.0; PANEL * m];
-        for chunk in taken.chunks(PANEL) {
-            let n = chunk.len();
-            for (j, to) in panel[..n * m].chunks_exact_mut(n).enumerate() {
-                let from = if j < rows.columns() { rows.column(j) } else { rows.target() };
-                for (to, &(i, w)) in to.iter_mut().zip(chunk) {
-                    *to = w * from[i];
+        let mut sums = vec![vec![0.0; m * m]; samples.len()];
+        let mut taken: Vec<(usize, f64)> = Vec::with_capacity(DRAWN);
+        let mut panel = vec![0.0; DRAWN * m];
+        for start in (0..rows.rows()).step_by(DRAWN) {
+            let end = (start + DRAWN).min(rows.rows());
+            for (weights, sums) in samples.iter().zip(&mut sums) {
+                taken.clear();
+                let drawn = weights[start..end].iter().enumerate().filter(|&(_, &w)| w > 0);
+                taken.extend(drawn.map(|(i, &w)| (i, f64::from(w).sqrt())));
+                let n = taken.len();
+                if n == 0 {
+                    continue;
                 }
+                for (j, to) in panel[..n * m].chunks_exact_mut(n).enumerate() {
+                    let from = if j < rows.columns() { rows.column(j) } else { rows.target() };
+                    let from = &from[start..end];
+                    for (to, &(i, w)) in to.iter_mut().zip(&taken) {
+                        *to = w * from[i];
+                    }
+                }
+                let columns: Vec<&[f64]> = panel[..n * m].chunks_exact(n).collect();
+                add_products(&columns, sums);
             }
-            let columns: Vec<&[f64]> = panel[..n * m].chunks_exact(n).collect();
-            add_products(&columns, &mut sums);
         }
-        Ok(Self::from_lower(sums, rows.columns(), weights.iter().map(|&w| w as usize).sum()))
+        let counts = samples.iter().map(|weights| weights.iter().map(|&w| w as usize).sum());
+        Ok(sums.into_iter().zip(counts).map(|(s, n)| Self::from_lower(s, rows.columns(), n)).collect())
     }
 
     /// Adds the rows of another Gram matrix over the same columns.
@@ -317,5 +335,8 @@ mod tests {
         assert!((weighted.moment(0) - truth).abs() < 1e-13);
         assert_eq!(weighted.rows(), 6);
         assert!(Gram::of_weighted_rows(&rows, &[1]).is_err());
+        let both = Gram::of_samples(&rows, &[&[1; 5], &[2, 0, 1, 0, 3]]).unwrap();
+        assert_eq!(both[1], weighted);
+        assert_eq!(both[0].rows(), 5);
     }
 }

@@ -261,13 +261,17 @@ fn algorithm2() -> Result<Case> {
     let work = move || {
         let rows = Rows::from_vecs(&columns, &record.acceleration)?;
         let mut found = Vec::new();
-        let mut taken = vec![0_u32; ROWS];
-        for draw in &draws {
-            taken.fill(0);
-            for &i in draw {
-                taken[i] += 1;
-            }
-            let triangle = Triangle::of_gram(&Gram::of_weighted_rows(&rows, &taken)?)?;
+        let taken: Vec<Vec<u32>> = draws
+            .iter()
+            .map(|draw| {
+                let mut taken = vec![0; ROWS];
+                draw.iter().for_each(|&i| taken[i] += 1);
+                taken
+            })
+            .collect();
+        let samples: Vec<&[u32]> = taken.iter().map(Vec::as_slice).collect();
+        for gram in Gram::of_samples(&rows, &samples)? {
+            let triangle = Triangle::of_gram(&gram)?;
             for fit in lasso_path(&triangle, &weights, &lambdas(), &LassoOptions::default())? {
                 found.extend(fit.fit.coefficients);
             }
