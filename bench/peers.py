@@ -4,7 +4,7 @@
 
 FOLDER holds what both sides start from: `NAME.f64` (little-endian doubles) and `settings.json`. A function prepares
 its data and returns the work, a function without arguments whose result is the answer. The answer is printed once,
-after a first call that warms everything up; then every line of standard input, a number of seconds, runs the work until
+after a first call that warms everything up, with the CPU time of that call; then every line of standard input, a number of seconds, runs the work until
 so much CPU time has passed and prints {"calls": …, "seconds": …}.
 """
 
@@ -313,8 +313,11 @@ def main():
     row, folder = sys.argv[1:3]
     answers, sys.stdout = sys.stdout, sys.stderr
     work = globals()[row](Data(folder))
-    answer = {key: np.asarray(value).tolist() for key, value in work().items()}
-    print(json.dumps({"answer": answer}), file=answers, flush=True)
+    start = time.process_time()
+    found = work()
+    seconds = time.process_time() - start
+    answer = {key: np.asarray(value).tolist() for key, value in found.items()}
+    print(json.dumps({"answer": answer, "seconds": seconds}), file=answers, flush=True)
     for line in sys.stdin:
         wanted, calls = float(line), 0
         start = time.process_time()

@@ -49,11 +49,14 @@ pub(crate) struct Worker {
     reports: BufReader<ChildStdout>,
     /// What its first call came to.
     pub(crate) answer: Answer,
+    /// CPU seconds of the first call, compilation included.
+    pub(crate) first: f64,
 }
 
 #[derive(Deserialize)]
 struct First {
     answer: Answer,
+    seconds: f64,
 }
 
 #[derive(Deserialize)]
@@ -90,8 +93,9 @@ impl Worker {
         let orders = child.stdin.take();
         let reports = BufReader::new(child.stdout.take().context("the peer has no output")?);
         let mut worker =
-            Self { function: function.to_owned(), child, orders, reports, answer: Answer::new() };
-        worker.answer = worker.read::<First>()?.answer;
+            Self { function: function.to_owned(), child, orders, reports, answer: Answer::new(), first: 0.0 };
+        let first: First = worker.read()?;
+        (worker.answer, worker.first) = (first.answer, first.seconds);
         Ok(worker)
     }
 
