@@ -1,8 +1,9 @@
-//! Developer commands: `cargo xtask prove | reproduce | docs | ci`.
+//! Developer commands: `cargo xtask prove | reproduce | bench | docs | ci`.
 
 // This is a command: its answers go to standard output, its complaints to standard error.
 #![allow(clippy::print_stdout, clippy::print_stderr)]
 
+mod bench;
 mod docs;
 mod process;
 mod prove;
@@ -30,6 +31,8 @@ enum Task {
     Prove(prove::Arguments),
     /// Make the tables and figures of the thesis again, beside its numbers
     Reproduce(reproduce::Arguments),
+    /// Measure the hot paths, beside the tools that people use today
+    Bench(bench::Arguments),
     /// Write the generated pages of the book
     Docs {
         /// Change nothing; exit 1 when a page is stale
@@ -60,6 +63,7 @@ fn main() -> ExitCode {
     let ending = match Arguments::parse().command {
         Task::Prove(arguments) => prove::run(&root(), &arguments),
         Task::Reproduce(arguments) => reproduce::run(&root(), &arguments),
+        Task::Bench(arguments) => bench::run(&root(), &arguments),
         Task::Docs { check } => docs::run(&root(), check),
         Task::Ci => ci(&root()),
         Task::ReadmeCommand { marker } => print_command(&root(), &marker),

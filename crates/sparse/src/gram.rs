@@ -2,14 +2,21 @@
 
 use std::ops::Range;
 
-use faer::linalg::matmul::matmul;
-use faer::{Accum, Mat, Par};
-
 use crate::error::SparseError;
-use crate::rows::{Rows, check_ranges, count};
+use crate::library::Library;
+use crate::product::add_products;
+use crate::rows::{Rows, check_ranges, count, first_not_finite};
 
-/// Rows of a panel: its columns stay in the second-level cache while they are multiplied.
-const PANEL: usize = 1024;
+/// Rows of a panel: its columns stay in the caches while they are multiplied.
+pub(crate) const PANEL: usize = 256;
+
+/// Rows from which samples are drawn at a time: they stay in the second-level cache for all samples.
+const DRAWN: usize = 1024;
+
+/// The panels of row ranges.
+pub(crate) fn panels(ranges: &[Range<usize>]) -> impl Iterator<Item = Range<usize>> + '_ {
+    ranges.iter().flat_map(|r| r.clone().step_by(PANEL).map(|start| start..(start + PANEL).min(r.end)))
+}
 
 /// The Gram matrix of `[P p]` for n rows and k columns: PᵀP, Pᵀp and pᵀp, additive over rows.
 ///
@@ -47,17 +54,74 @@ impl Gram {
     /// [`SparseError::RowRange`], [`SparseError::Empty`].
     pub fn of_rows(rows: &Rows<'_>, ranges: &[Range<usize>]) -> Result<Self, SparseError> {
         check_ranges(ranges, rows.rows())?;
-        let panels = ranges
-            .iter()
-            .flat_map(|r| r.clone().step_by(PANEL).map(|start| (start, (start + PANEL).min(r.end))));
-        Ok(Self::accumulate(rows.columns(), panels, |panel, (start, end)| {
-            for j in 0..=rows.columns() {
-                let from = if j < rows.columns() { rows.column(j) } else { rows.target() };
-                panel[j * (end - start)..(j + 1) * (end - start)].copy_from_slice(&from[start..end]);
+        let m = rows.columns() + 1;
+        let mut sums = vec![0.0; m * m];
+        let mut columns: Vec<&[f64]> = Vec::with_capacity(m);
+        for panel in panels(ranges) {
+            columns.clear();
+            columns.extend((0..rows.columns()).map(|j| &rows.column(j)[panel.clone()]));
+            columns.push(&rows.target()[panel]);
+            add_products(&columns, &mut sums);
+        }
+        Ok(Self::from_lower(sums, rows.columns(), count(ranges)))
+    }
+
+    /// The Gram matrix of a library's terms and a target on the rows in `ranges`: as [`Library::evaluate`] and
+    /// [`Gram::of_rows`], but a panel of the terms is multiplied while it is in the cache, and never stored.
+    ///
+    /// ```
+    /// use greybox_sparse::{Gram, Library, Rows};
+    /// let (x, y) = ([1.0, 2.0, 3.0], [2.0, 4.0, 6.0]);
+    /// let library = Library::separate_powers(&["x"], 2);
+    /// let whole = std::iter::once(0..3).collect::<Vec<_>>();
+    /// let gram = Gram::of_library(&library, &[&x], &[], &y, &whole)?;
+    /// assert_eq!(gram, Gram::of_rows(&Rows::from_vecs(&library.evaluate(&[&x], &[])?, &y)?, &whole)?);
+    /// # Ok::<(), greybox_sparse::SparseError>(())
+    /// ```
+    ///
+    /// # Errors
+    /// Those of [`Library::evaluate`] and [`Rows::new`]; [`SparseError::RowRange`], [`SparseError::Empty`].
+    pub fn of_library(
+        library: &Library,
+        variables: &[&[f64]],
+        expressions: &[(&str, &[f64])],
+        target: &[f64],
+        ranges: &[Range<usize>],
+    ) -> Result<Self, SparseError> {
+        let plan = library.plan(variables, expressions)?;
+        let k = library.len();
+        if k == 0 {
+            return Err(SparseError::Empty { what: "columns" });
+        }
+        if target.len() != plan.rows() {
+            let what = "the target".to_owned();
+            return Err(SparseError::Length { what, found: target.len(), expected: plan.rows() });
+        }
+        if let Some(row) = first_not_finite(target) {
+            return Err(SparseError::NotFinite { what: "the target".into(), row });
+        }
+        check_ranges(ranges, target.len())?;
+        let mut sums = vec![0.0; (k + 1) * (k + 1)];
+        let mut terms = vec![0.0; k * PANEL];
+        for panel in panels(ranges) {
+            let n = panel.len();
+            plan.evaluate(panel.clone(), &mut terms[..k * n])?;
+            let mut columns: Vec<&[f64]> = terms[..k * n].chunks_exact(n).collect();
+            columns.push(&target[panel]);
+            add_products(&columns, &mut sums);
+        }
+        Ok(Self::from_lower(sums, k, count(ranges)))
+    }
+
+    /// Mirrors the lower triangle.
+    pub(crate) fn from_lower(mut values: Vec<f64>, columns: usize, rows: usize) -> Self {
+        let m = columns + 1;
+        for j in 0..m {
+            for i in j + 1..m {
+                values[i * m + j] = values[j * m + i];
             }
-            end - start
-        })
-        .with_rows(count(ranges)))
+        }
+        Self { columns, rows, values }
     }
 
     /// The Gram matrix of rows taken `weights[i]` times each (a bootstrap sample): Σ wᵢ rowᵢ rowᵢᵀ.
@@ -65,58 +129,49 @@ impl Gram {
     /// # Errors
     /// [`SparseError::Length`] if there is not one weight per row.
     pub fn of_weighted_rows(rows: &Rows<'_>, weights: &[u32]) -> Result<Self, SparseError> {
-        if weights.len() != rows.rows() {
+        let gram = Self::of_samples(rows, &[weights])?.pop();
+        gram.ok_or(SparseError::Empty { what: "samples" })
+    }
+
+    /// [`Gram::of_weighted_rows`] of several samples, each with its weights; the rows are read once for all of them.
+    ///
+    /// # Errors
+    /// As [`Gram::of_weighted_rows`].
+    pub fn of_samples(rows: &Rows<'_>, samples: &[&[u32]]) -> Result<Vec<Self>, SparseError> {
+        if let Some(bad) = samples.iter().find(|w| w.len() != rows.rows()) {
             return Err(SparseError::Length {
                 what: "the list of row weights".into(),
-                found: weights.len(),
+                found: bad.len(),
                 expected: rows.rows(),
             });
         }
-        let taken: Vec<(usize, f64)> = weights
-            .iter()
-            .enumerate()
-            .filter(|&(_, &w)| w > 0)
-            .map(|(i, &w)| (i, f64::from(w).sqrt()))
-            .collect();
-        let gram = Self::accumulate(rows.columns(), taken.chunks(PANEL), |panel, chunk| {
-            for j in 0..=rows.columns() {
-                let from = if j < rows.columns() { rows.column(j) } else { rows.target() };
-                for (to, &(i, w)) in panel[j * chunk.len()..].iter_mut().zip(chunk) {
-                    *to = w * from[i];
+        let m = rows.columns() + 1;
+        let mut sums = vec![vec![0.0; m * m]; samples.len()];
+        let mut taken: Vec<(usize, f64)> = Vec::with_capacity(DRAWN);
+        let mut panel = vec![0.0; DRAWN * m];
+        for start in (0..rows.rows()).step_by(DRAWN) {
+            let end = (start + DRAWN).min(rows.rows());
+            for (weights, sums) in samples.iter().zip(&mut sums) {
+                taken.clear();
+                let drawn = weights[start..end].iter().enumerate().filter(|&(_, &w)| w > 0);
+                taken.extend(drawn.map(|(i, &w)| (i, f64::from(w).sqrt())));
+                let n = taken.len();
+                if n == 0 {
+                    continue;
                 }
-            }
-            chunk.len()
-        });
-        Ok(gram.with_rows(weights.iter().map(|&w| w as usize).sum()))
-    }
-
-    /// Sums panelᵀ panel; `fill` writes a panel column-major and returns its rows.
-    fn accumulate<P>(
-        columns: usize,
-        panels: impl Iterator<Item = P>,
-        mut fill: impl FnMut(&mut [f64], P) -> usize,
-    ) -> Self {
-        let m = columns + 1;
-        let mut panel = vec![0.0; PANEL * m];
-        let mut sum = Mat::<f64>::zeros(m, m);
-        for source in panels {
-            let n = fill(&mut panel, source);
-            let a = faer::MatRef::from_column_major_slice(&panel[..n * m], n, m);
-            matmul(sum.as_mut(), Accum::Add, a.transpose(), a, 1.0, Par::Seq);
-        }
-        let mut values = vec![0.0; m * m];
-        for j in 0..m {
-            for i in 0..=j {
-                values[j * m + i] = sum[(i, j)];
-                values[i * m + j] = sum[(i, j)];
+                for (j, to) in panel[..n * m].chunks_exact_mut(n).enumerate() {
+                    let from = if j < rows.columns() { rows.column(j) } else { rows.target() };
+                    let from = &from[start..end];
+                    for (to, &(i, w)) in to.iter_mut().zip(&taken) {
+                        *to = w * from[i];
+                    }
+                }
+                let columns: Vec<&[f64]> = panel[..n * m].chunks_exact(n).collect();
+                add_products(&columns, sums);
             }
         }
-        Self { columns, rows: 0, values }
-    }
-
-    fn with_rows(mut self, rows: usize) -> Self {
-        self.rows = rows;
-        self
+        let counts = samples.iter().map(|weights| weights.iter().map(|&w| w as usize).sum());
+        Ok(sums.into_iter().zip(counts).map(|(s, n)| Self::from_lower(s, rows.columns(), n)).collect())
     }
 
     /// Adds the rows of another Gram matrix over the same columns.
@@ -280,5 +335,8 @@ mod tests {
         assert!((weighted.moment(0) - truth).abs() < 1e-13);
         assert_eq!(weighted.rows(), 6);
         assert!(Gram::of_weighted_rows(&rows, &[1]).is_err());
+        let both = Gram::of_samples(&rows, &[&[1; 5], &[2, 0, 1, 0, 3]]).unwrap();
+        assert_eq!(both[1], weighted);
+        assert_eq!(both[0].rows(), 5);
     }
 }

@@ -8,6 +8,7 @@ pub mod folds;
 pub mod gram;
 pub mod lasso;
 pub mod library;
+mod product;
 mod protect;
 pub mod rows;
 pub mod select;

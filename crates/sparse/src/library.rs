@@ -5,6 +5,7 @@
 
 use std::collections::BTreeMap;
 use std::fmt;
+use std::ops::Range;
 
 use crate::error::SparseError;
 use crate::rows::first_not_finite;
@@ -326,31 +327,41 @@ impl Library {
         variables: &[&[f64]],
         expressions: &[(&str, &[f64])],
     ) -> Result<Vec<Vec<f64>>, SparseError> {
-        let n = self.check_variables(variables)?;
+        let plan = self.plan(variables, expressions)?;
+        let n = plan.rows();
         let mut columns: Vec<Vec<f64>> = Vec::with_capacity(self.terms.len());
-        let mut known: BTreeMap<&[u32], usize> = BTreeMap::new();
-        for (index, term) in self.terms.iter().enumerate() {
-            let mut column = match (&term.function, lowered(&term.powers)) {
-                (None, Some((parent, by))) => match known.get(parent.as_slice()) {
-                    Some(&at) => product(&columns[at], variables[by]),
-                    None => monomial(&term.powers, variables, n),
-                },
-                _ => monomial(&term.powers, variables, n),
-            };
-            if let Some(function) = &term.function {
-                multiply_by(&mut column, function, variables, expressions)?;
-            } else {
-                known.insert(&term.powers, index);
-            }
-            if let Some(row) = first_not_finite(&column) {
-                return Err(SparseError::NotFinite {
-                    what: format!("term {}", term.label(&self.variables)),
-                    row,
-                });
-            }
+        for index in 0..self.terms.len() {
+            let mut column = vec![0.0; n];
+            plan.monomial(index, 0..n, |at| &columns[at], &mut column);
+            plan.finish(index, 0..n, &mut column)?;
             columns.push(column);
         }
         Ok(columns)
+    }
+
+    /// How every term follows from those before it; checks the variables and the expressions.
+    pub(crate) fn plan<'a>(
+        &'a self,
+        variables: &'a [&'a [f64]],
+        expressions: &'a [(&'a str, &'a [f64])],
+    ) -> Result<Plan<'a>, SparseError> {
+        let rows = self.check_variables(variables)?;
+        let mut known: BTreeMap<&[u32], usize> = BTreeMap::new();
+        let mut steps = Vec::with_capacity(self.terms.len());
+        for (index, term) in self.terms.iter().enumerate() {
+            let parent = lowered(&term.powers).filter(|_| term.function.is_none());
+            let parent = parent.and_then(|(parent, by)| Some((*known.get(parent.as_slice())?, by)));
+            let values = match &term.function {
+                Some(Function::Expression(name)) => Some(named(name, expressions, rows)?),
+                Some(_) => None,
+                None => {
+                    known.insert(&term.powers, index);
+                    None
+                }
+            };
+            steps.push(Step { parent, values });
+        }
+        Ok(Plan { library: self, variables, steps, rows })
     }
 
     fn check_variables(&self, variables: &[&[f64]]) -> Result<usize, SparseError> {
@@ -447,65 +458,109 @@ fn lowered(powers: &[u32]) -> Option<(Vec<u32>, usize)> {
     Some((parent, by))
 }
 
-fn product(a: &[f64], b: &[f64]) -> Vec<f64> {
-    a.iter().zip(b).map(|(a, b)| a * b).collect()
-}
-
-fn monomial(powers: &[u32], variables: &[&[f64]], n: usize) -> Vec<f64> {
-    let mut column: Option<Vec<f64>> = None;
-    for (&p, &v) in powers.iter().zip(variables) {
-        for _ in 0..p {
-            column = Some(match column {
-                None => v.to_vec(),
-                Some(c) => product(&c, v),
-            });
-        }
+/// The samples of a named expression.
+fn named<'a>(
+    name: &str,
+    expressions: &'a [(&'a str, &'a [f64])],
+    rows: usize,
+) -> Result<&'a [f64], SparseError> {
+    let found = expressions.iter().find(|(n, _)| *n == name).map(|&(_, v)| v);
+    let values = found.ok_or_else(|| SparseError::UnknownExpression { name: name.to_owned() })?;
+    if values.len() == rows {
+        Ok(values)
+    } else {
+        let what = format!("the expression '{name}'");
+        Err(SparseError::Length { what, found: values.len(), expected: rows })
     }
-    column.unwrap_or_else(|| vec![1.0; n])
 }
 
-fn multiply_by(
-    column: &mut [f64],
-    function: &Function,
-    variables: &[&[f64]],
-    expressions: &[(&str, &[f64])],
-) -> Result<(), SparseError> {
-    let rows = column.len();
-    let mut apply = |values: &[f64], f: &dyn Fn(f64) -> f64| {
-        for (c, &v) in column.iter_mut().zip(values) {
-            *c *= f(v);
+/// How one term is computed.
+struct Step<'a> {
+    /// A term before it, and the variable that it is to be multiplied by.
+    parent: Option<(usize, usize)>,
+    /// The samples of its named expression.
+    values: Option<&'a [f64]>,
+}
+
+/// A library with the samples of its variables, ready to be evaluated on any rows.
+pub(crate) struct Plan<'a> {
+    library: &'a Library,
+    variables: &'a [&'a [f64]],
+    steps: Vec<Step<'a>>,
+    rows: usize,
+}
+
+impl<'a> Plan<'a> {
+    /// Number of rows.
+    pub(crate) fn rows(&self) -> usize {
+        self.rows
+    }
+
+    /// All terms on the rows of `range`, one after the other; allocates nothing.
+    pub(crate) fn evaluate(&self, range: Range<usize>, out: &mut [f64]) -> Result<(), SparseError> {
+        let n = range.len();
+        for index in 0..self.steps.len() {
+            let (done, rest) = out.split_at_mut(index * n);
+            let column = &mut rest[..n];
+            self.monomial(index, range.clone(), |at| &done[at * n..(at + 1) * n], column);
+            self.finish(index, range.clone(), column)?;
         }
-    };
-    match function {
-        Function::Sin { variable, harmonic } => {
-            let h = f64::from(*harmonic);
-            apply(variables[*variable], &|v| (h * v).sin());
+        Ok(())
+    }
+
+    /// The monomial of a term from one of the terms `before` it, or from the variables.
+    fn monomial<'b>(
+        &self,
+        index: usize,
+        range: Range<usize>,
+        before: impl Fn(usize) -> &'b [f64],
+        column: &mut [f64],
+    ) {
+        if let Some((parent, by)) = self.steps[index].parent {
+            let factors = before(parent).iter().zip(&self.variables[by][range]);
+            column.iter_mut().zip(factors).for_each(|(c, (a, b))| *c = a * b);
+            return;
         }
-        Function::Cos { variable, harmonic } => {
-            let h = f64::from(*harmonic);
-            apply(variables[*variable], &|v| (h * v).cos());
-        }
-        Function::Sign { variable } => {
-            apply(variables[*variable], &|v| if v == 0.0 { 0.0 } else { v.signum() });
-        }
-        Function::Abs { variable } => apply(variables[*variable], &f64::abs),
-        Function::Expression(name) => {
-            let values = expressions
-                .iter()
-                .find(|(n, _)| n == name)
-                .map(|&(_, v)| v)
-                .ok_or_else(|| SparseError::UnknownExpression { name: name.clone() })?;
-            if values.len() != rows {
-                return Err(SparseError::Length {
-                    what: format!("the expression '{name}'"),
-                    found: values.len(),
-                    expected: rows,
-                });
+        column.fill(1.0);
+        for (&p, variable) in self.library.terms[index].powers.iter().zip(self.variables) {
+            for _ in 0..p {
+                column.iter_mut().zip(&variable[range.clone()]).for_each(|(c, v)| *c *= v);
             }
-            apply(values, &|v| v);
         }
     }
-    Ok(())
+
+    /// Multiplies by the term's function, and checks that the values are finite.
+    fn finish(&self, index: usize, range: Range<usize>, column: &mut [f64]) -> Result<(), SparseError> {
+        let mut apply = |values: &[f64], f: &dyn Fn(f64) -> f64| {
+            column.iter_mut().zip(&values[range.clone()]).for_each(|(c, &v)| *c *= f(v));
+        };
+        let term = &self.library.terms[index];
+        match &term.function {
+            Some(Function::Sin { variable, harmonic }) => {
+                let h = f64::from(*harmonic);
+                apply(self.variables[*variable], &|v| (h * v).sin());
+            }
+            Some(Function::Cos { variable, harmonic }) => {
+                let h = f64::from(*harmonic);
+                apply(self.variables[*variable], &|v| (h * v).cos());
+            }
+            Some(Function::Sign { variable }) => {
+                apply(self.variables[*variable], &|v| if v == 0.0 { 0.0 } else { v.signum() });
+            }
+            Some(Function::Abs { variable }) => apply(self.variables[*variable], &f64::abs),
+            Some(Function::Expression(_)) => apply(self.steps[index].values.unwrap_or(&[]), &|v| v),
+            None => {}
+        }
+        // Without an early end the check runs on vectors.
+        let finite = column.iter().fold(true, |all, v| all & v.is_finite());
+        match if finite { None } else { first_not_finite(column) } {
+            None => Ok(()),
+            Some(row) => {
+                let what = format!("term {}", term.label(&self.library.variables));
+                Err(SparseError::NotFinite { what, row: range.start + row })
+            }
+        }
+    }
 }
 
 #[cfg(test)]

@@ -92,6 +92,28 @@ impl<'a> Rows<'a> {
         Self { columns: self.columns[..count.clamp(1, self.columns.len())].to_vec(), target: self.target }
     }
 
+    /// ‖p − P c‖² over the given ranges for each of several c, the rows read once; as [`Rows::residuals`] else.
+    pub(crate) fn squares(&self, models: &[&[f64]], ranges: &[Range<usize>]) -> Vec<f64> {
+        let mut sums = vec![0.0; models.len()];
+        let mut left = Vec::with_capacity(PANEL);
+        for range in ranges {
+            for start in range.clone().step_by(PANEL) {
+                let panel = start..(start + PANEL).min(range.end);
+                for (sum, coefficients) in sums.iter_mut().zip(models) {
+                    left.clear();
+                    left.extend_from_slice(&self.target[panel.clone()]);
+                    for (column, &c) in self.columns.iter().zip(*coefficients) {
+                        if c != 0.0 {
+                            left.iter_mut().zip(&column[panel.clone()]).for_each(|(r, v)| *r -= c * v);
+                        }
+                    }
+                    *sum += left.iter().map(|r| r * r).sum::<f64>();
+                }
+            }
+        }
+        sums
+    }
+
     /// Residuals p − P c over the given ranges, in their order; columns with zero coefficient are skipped.
     /// Ranges and coefficients beyond the data are ignored.
     #[must_use]
@@ -112,6 +134,9 @@ impl<'a> Rows<'a> {
         out
     }
 }
+
+/// Rows whose columns stay in the second-level cache.
+const PANEL: usize = 1024;
 
 /// Number of rows in a set of ranges.
 #[must_use]
@@ -171,5 +196,6 @@ mod tests {
         let (x, y) = ([1.0, 2.0, 3.0, 4.0], [2.0, 4.0, 6.0, 9.0]);
         let rows = Rows::new(&[&x], &y).unwrap();
         assert_eq!(rows.residuals(&[2.0], &[0..1, 2..4]), vec![0.0, 0.0, 1.0]);
+        assert_eq!(rows.squares(&[&[2.0], &[]], &[0..1, 2..4]), [1.0, 121.0]);
     }
 }

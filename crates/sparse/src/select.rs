@@ -355,7 +355,16 @@ pub fn search(problem: &Problem<'_>, options: &Options) -> Result<Search, Sparse
         .into_par_iter()
         .map(|r| order_model(problem, options, r, &pairs, &whole))
         .collect::<Result<_, _>>()?;
-    let test_rows = count(&problem.split.test);
+    let test = &problem.split.test;
+    let test_rows = count(test);
+    let mut all: Vec<&[f64]> = models.iter().map(|m| &m.coefficients[..]).collect();
+    // Without a model: the target itself.
+    all.push(&[]);
+    let mut squares = problem.rows.squares(&all, test);
+    let floor = ROUNDING * ROUNDING * squares.pop().unwrap_or(0.0);
+    for (model, rss) in models.iter_mut().zip(squares) {
+        model.test_rss = rss.max(floor);
+    }
     let effective_rows = effective(problem, options, &models, test_rows)?;
     for model in &mut models {
         let value = |criterion: Criterion| {
@@ -410,9 +419,6 @@ fn order_model(
         path(options.selector, &whole.first_columns(candidates), &problem.protected, &grid[chosen..=chosen])?
             .pop()
             .ok_or(SparseError::Empty { what: "values of λ" })?;
-    let test = &problem.split.test;
-    let floor = ROUNDING * ROUNDING * sum_of_squares(&problem.rows.residuals(&[], test));
-    let test_rss = sum_of_squares(&problem.rows.residuals(&fit.coefficients, test)).max(floor);
     let mut coefficients = fit.coefficients;
     coefficients.resize(problem.rows.columns(), 0.0);
     Ok(OrderModel {
@@ -425,7 +431,7 @@ fn order_model(
         support: support(&coefficients),
         coefficients,
         train_rss: fit.rss,
-        test_rss,
+        test_rss: f64::NAN,
         aic: f64::NAN,
         aicc: f64::NAN,
         bic: f64::NAN,
@@ -455,10 +461,6 @@ fn mean_and_error(values: impl Iterator<Item = f64> + Clone) -> (f64, f64) {
     let mean = values.clone().sum::<f64>() / n;
     let variance = values.map(|v| (v - mean).powi(2)).sum::<f64>() / (n - 1.0).max(1.0);
     (mean, (variance / n).sqrt())
-}
-
-fn sum_of_squares(values: &[f64]) -> f64 {
-    values.iter().map(|v| v * v).sum()
 }
 
 #[cfg(test)]

@@ -1,0 +1,117 @@
+//! Rows of optimal control, observers and control laws.
+
+use anyhow::Result;
+use greybox_eso::{Design, Observer, Scheme};
+use greybox_hjb::{AdamaxOptions, Domain, Linear, Monomials, Problem, adamax, lqr};
+use greybox_smc::thesis::LinkTangent;
+use greybox_smc::{BoundaryLayer, FlatOutput, Law, Rate, Surface, Target};
+use nalgebra::{DMatrix, dmatrix};
+use serde_json::{Value, json};
+
+use super::case::{Against, Answer, Case, Peer, Row, close};
+
+/// Steps of a call: the clock is coarse beside one of them.
+const STEPS: usize = 20_000;
+
+/// The rows.
+pub(crate) fn rows() -> Vec<Row> {
+    let alone = || Against::Peers(&[]);
+    let row = |name, what, unit, against, make| Row { name, what, unit, against, make };
+    vec![
+        row(
+            "adamax",
+            "Algorithm 3 on the F16's grid of 500 points",
+            "iteration",
+            Against::Peers(&[Peer { function: "adamax", name: "NumPy, vectorised", goal: 10.0 }]),
+            training,
+        ),
+        row(
+            "riccati",
+            "linear-quadratic regulator of the F16",
+            "design",
+            Against::Peers(&[
+                Peer { function: "riccati_scipy", name: "SciPy solve_continuous_are", goal: 10.0 },
+                Peer { function: "riccati_slycot", name: "python-control lqr on SLICOT", goal: 1.5 },
+            ]),
+            regulator,
+        ),
+        row("observer", "state observer of the thesis, 2 states", "sample", alone(), observer),
+        row("control_law", "sliding-mode law of the flexible link, 4 states", "step", alone(), law),
+    ]
+}
+
+/// The F16 of thesis equation 4.40.
+fn f16() -> Linear {
+    Linear {
+        a: dmatrix![-1.01887, 0.90506, -0.00215; 0.82225, -1.07741, -0.17555; 0.0, 0.0, -1.0],
+        b: dmatrix![0.0; 0.0; 1.0],
+    }
+}
+
+fn training() -> Result<Case> {
+    const ITERATIONS: usize = 6000;
+    let points = Domain::symmetric(&[5.0, 10.0, 10.0])?.grid(&[10, 10, 5])?;
+    let one = DMatrix::identity(3, 3);
+    let problem = Problem::new(&f16(), &one, &dmatrix![1.0], Monomials::even(3, 2)?, &points)?;
+    let options = AdamaxOptions { iterations: ITERATIONS, patience: None, ..AdamaxOptions::default() };
+    let work = move || {
+        let trained = adamax(&problem, &[1.0; 6], &options)?;
+        Ok(Answer::from([("weights".to_owned(), trained.weights)]))
+    };
+    Ok(Case {
+        data: vec![("points", points.concat())],
+        settings: json!({"iterations": ITERATIONS}),
+        work: Box::new(work),
+        units: ITERATIONS as f64,
+        agree: Box::new(|_, ours, theirs| {
+            // Ours are the best weights met, the peer's the last; a constant step keeps both in motion.
+            close(ours, theirs, "weights", 1e-3)
+        }),
+    })
+}
+
+fn regulator() -> Result<Case> {
+    let (plant, q, r) = (f16(), DMatrix::identity(3, 3), dmatrix![1.0]);
+    let work = move || {
+        let found = lqr(&plant.a, &plant.b, &q, &r)?;
+        Ok(Answer::from([("solution".to_owned(), found.solution.as_slice().to_vec())]))
+    };
+    Ok(Case {
+        data: vec![],
+        settings: Value::Null,
+        work: Box::new(work),
+        units: 1.0,
+        agree: Box::new(|_, ours, theirs| close(ours, theirs, "solution", 1e-12)),
+    })
+}
+
+fn observer() -> Result<Case> {
+    let mut observer = Observer::new(Design::thesis(), 1e-3, Scheme::Euler)?;
+    Ok(Case::alone(STEPS as f64, move || {
+        let mut z = [0.0; 2];
+        for k in 0..STEPS {
+            z = observer.update((1e-3 * k as f64).fract(), 0.0);
+        }
+        Ok(Answer::from([("state".to_owned(), z.to_vec())]))
+    }))
+}
+
+fn law() -> Result<Case> {
+    let link = LinkTangent::IDENTIFIED.tangent();
+    let law = Law::new(
+        FlatOutput::new(&link)?,
+        Surface::repeated(16.0)?,
+        BoundaryLayer::new(590.0, 5.9)?,
+        10.0,
+        Rate::Model,
+    )?;
+    let target = Target::rest([0.1; 4]);
+    Ok(Case::alone(STEPS as f64, move || {
+        let mut x = [0.0; 4];
+        for _ in 0..STEPS {
+            // The next state depends on the command, so that steps do not overlap.
+            x[0] = 1e-3 * law.step(&x, &[0.3; 4], &link.b, &target)?.u;
+        }
+        Ok(Answer::from([("state".to_owned(), x.to_vec())]))
+    }))
+}
