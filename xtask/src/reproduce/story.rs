@@ -184,9 +184,9 @@ fn story(_: &Fixture) -> Result<Piece> {
          recordings, with its true friction and all else that the models lack, and is given the true state, so that \
          what differs comes from the model alone. Nothing is tuned: typical sizes by Bryson's rule, and λ = 16, \
          η/φ = 100 of the thesis. On steps of 40° both designs settle on the improved model and end nearer than on \
-         the others. On steps of 20° friction decides: a regulator has no answer to it, and the one of the calibrated \
-         model ends as near as that of the improved; the sliding mode, which takes the friction found out of the \
-         motion, settles on the improved model alone. The RMS error is mostly the way there and differs little.",
+         the others. On steps of 20° friction decides: a regulator has no answer to it and does not settle on any \
+         model; the sliding mode, which takes the friction found out of the motion, ends nearest, and how near \
+         depends on how well the friction was found. The RMS error is mostly the way there and differs little.",
     );
     let found: Vec<Vec<String>> = diagnosis
         .mechanisms
