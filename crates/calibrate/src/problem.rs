@@ -409,7 +409,8 @@ impl Problem<'_> {
         self.cost_of(&rows, point)
     }
 
-    fn cost_of(&self, rows: &[SegmentRows], point: &Point) -> f64 {
+    /// [`cost`](Self::cost) of a point whose rows are known.
+    pub(crate) fn cost_of(&self, rows: &[SegmentRows], point: &Point) -> f64 {
         rows.iter().map(|s| qr::dot(&s.r, &s.r)).sum::<f64>() + self.prior_cost(&point.parameters)
     }
 

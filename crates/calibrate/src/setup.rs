@@ -8,7 +8,7 @@ use rayon::prelude::*;
 
 use crate::data::{Data, Hats};
 use crate::noise_model::{Autoregression, MOST};
-use crate::problem::{Fit, Free, Limits, Point, Problem, Segment, StartPrior, Work, segments};
+use crate::problem::{Fit, Free, Limits, Point, Problem, Segment, SegmentRows, StartPrior, Work, segments};
 
 /// Shortest segment, samples.
 const LEAST: usize = 40;
@@ -406,30 +406,27 @@ impl Setup {
     /// Fits from the cheapest of several starting points.
     pub fn fit(&self, level: &Level, scale: &[f64], points: &[Point], limits: Limits) -> Fit {
         self.with_problem(level, scale, |problem| {
-            let best = points
-                .iter()
-                .map(|p| (problem.cost(p), p))
-                .min_by(|a, b| a.0.total_cmp(&b.0))
-                .map(|(_, p)| p.clone())
-                .unwrap_or_else(|| Point { parameters: self.values(), starts: Vec::new() });
-            problem.fit(self.with_fresh_starts(problem, best), limits)
+            let simulated = points.iter().map(|p| (problem.rows(p, false, None), p));
+            let priced = simulated.map(|(rows, p)| (problem.cost_of(&rows, p), rows, p));
+            let best = match priced.min_by(|a, b| a.0.total_cmp(&b.0)) {
+                Some((_, rows, point)) => self.with_fresh_starts(problem, &rows, point.clone()),
+                None => Point { parameters: self.values(), starts: Vec::new() },
+            };
+            problem.fit(best, limits)
         })
     }
 
     /// A point whose pieces' first samples fit worse than the rest of its level (the wrong physics of an earlier fit
     /// may have led the start of a free decay into another minimum) gets those starts anew where they are better.
-    fn with_fresh_starts(&self, problem: &Problem<'_>, mut point: Point) -> Point {
-        let firsts: Vec<usize> =
-            (0..problem.segments.len()).filter(|&i| problem.segments[i].range.start == 0).collect();
-        if firsts.is_empty() || point.starts.len() != problem.segments.len() {
-            return point;
-        }
+    /// `rows` are those of the point.
+    fn with_fresh_starts(&self, problem: &Problem<'_>, rows: &[SegmentRows], mut point: Point) -> Point {
         let ny = self.system.ny;
-        let rows = problem.rows(&point, false, None);
         let squares = |r: &[f64]| r.iter().map(|v| v * v).sum::<f64>();
         let samples: usize = problem.segments.iter().map(|s| s.range.len()).sum();
         let mean =
             rows.iter().map(|s| squares(&s.r[..s.rows - self.system.nx])).sum::<f64>() / samples as f64;
+        let firsts: Vec<usize> =
+            (0..problem.segments.len()).filter(|&i| problem.segments[i].range.start == 0).collect();
         let grown: Vec<(usize, Vec<f64>)> = firsts
             .into_par_iter()
             .filter(|&i| {
