@@ -5,18 +5,10 @@ use std::ops::Range;
 use crate::error::SparseError;
 use crate::library::Library;
 use crate::product::add_products;
-use crate::rows::{Rows, check_ranges, count, first_not_finite};
+use crate::rows::{CACHED, Rows, check_finite, check_ranges, count, panels};
 
 /// Rows of a panel: its columns stay in the caches while they are multiplied.
 pub(crate) const PANEL: usize = 256;
-
-/// Rows from which samples are drawn at a time: they stay in the second-level cache for all samples.
-const DRAWN: usize = 1024;
-
-/// The panels of row ranges.
-pub(crate) fn panels(ranges: &[Range<usize>]) -> impl Iterator<Item = Range<usize>> + '_ {
-    ranges.iter().flat_map(|r| r.clone().step_by(PANEL).map(|start| start..(start + PANEL).min(r.end)))
-}
 
 /// The Gram matrix of `[P p]` for n rows and k columns: PᵀP, Pᵀp and pᵀp, additive over rows.
 ///
@@ -57,7 +49,7 @@ impl Gram {
         let m = rows.columns() + 1;
         let mut sums = vec![0.0; m * m];
         let mut columns: Vec<&[f64]> = Vec::with_capacity(m);
-        for panel in panels(ranges) {
+        for panel in panels(ranges, PANEL) {
             columns.clear();
             columns.extend((0..rows.columns()).map(|j| &rows.column(j)[panel.clone()]));
             columns.push(&rows.target()[panel]);
@@ -97,13 +89,11 @@ impl Gram {
             let what = "the target".to_owned();
             return Err(SparseError::Length { what, found: target.len(), expected: plan.rows() });
         }
-        if let Some(row) = first_not_finite(target) {
-            return Err(SparseError::NotFinite { what: "the target".into(), row });
-        }
+        check_finite(target, || "the target".into())?;
         check_ranges(ranges, target.len())?;
         let mut sums = vec![0.0; (k + 1) * (k + 1)];
         let mut terms = vec![0.0; k * PANEL];
-        for panel in panels(ranges) {
+        for panel in panels(ranges, PANEL) {
             let n = panel.len();
             plan.evaluate(panel.clone(), &mut terms[..k * n])?;
             let mut columns: Vec<&[f64]> = terms[..k * n].chunks_exact(n).collect();
@@ -147,10 +137,10 @@ impl Gram {
         }
         let m = rows.columns() + 1;
         let mut sums = vec![vec![0.0; m * m]; samples.len()];
-        let mut taken: Vec<(usize, f64)> = Vec::with_capacity(DRAWN);
-        let mut panel = vec![0.0; DRAWN * m];
-        for start in (0..rows.rows()).step_by(DRAWN) {
-            let end = (start + DRAWN).min(rows.rows());
+        let mut taken: Vec<(usize, f64)> = Vec::with_capacity(CACHED);
+        let mut panel = vec![0.0; CACHED * m];
+        for start in (0..rows.rows()).step_by(CACHED) {
+            let end = (start + CACHED).min(rows.rows());
             for (weights, sums) in samples.iter().zip(&mut sums) {
                 taken.clear();
                 let drawn = weights[start..end].iter().enumerate().filter(|&(_, &w)| w > 0);

@@ -14,8 +14,9 @@
 //! changes by few columns, so that its Cholesky factor is kept and the steps are exact (feature-sign search). Where the
 //! columns are too dependent for that, coordinate descent takes over.
 //!
-//! References: Lee, Battle, Raina & Ng, NIPS 19 (2006), feature-sign search; Friedman, Hastie & Tibshirani, J. Stat. Softw. 33 (2010), covariance updates; the stopping rule
-//! is the duality gap (Kim et al., IEEE J. Sel. Top. Signal Process. 1 (2007)).
+//! References: Lee, Battle, Raina & Ng, NIPS 19 (2006), feature-sign search; Friedman, Hastie & Tibshirani, J. Stat.
+//! Softw. 33 (2010), covariance updates; the stopping rule is the duality gap (Kim et al., IEEE J. Sel. Top. Signal
+//! Process. 1 (2007)).
 
 use crate::error::{SparseError, check_range};
 use crate::triangle::{Fit, RANK_TOLERANCE, Triangle};

@@ -34,9 +34,7 @@ impl<'a> Rows<'a> {
         if target.is_empty() {
             return Err(SparseError::Empty { what: "rows" });
         }
-        if let Some(row) = first_not_finite(target) {
-            return Err(SparseError::NotFinite { what: "the target".into(), row });
-        }
+        check_finite(target, || "the target".into())?;
         for (j, column) in columns.iter().enumerate() {
             let what = || format!("column {j}");
             if column.len() != target.len() {
@@ -46,9 +44,7 @@ impl<'a> Rows<'a> {
                     expected: target.len(),
                 });
             }
-            if let Some(row) = first_not_finite(column) {
-                return Err(SparseError::NotFinite { what: what(), row });
-            }
+            check_finite(column, what)?;
         }
         Ok(Self { columns, target })
     }
@@ -92,23 +88,13 @@ impl<'a> Rows<'a> {
         Self { columns: self.columns[..count.clamp(1, self.columns.len())].to_vec(), target: self.target }
     }
 
-    /// ‖p − P c‖² over the given ranges for each of several c, the rows read once; as [`Rows::residuals`] else.
+    /// Σ of the squares of [`Rows::residuals`] for each of several c, the rows read once.
     pub(crate) fn squares(&self, models: &[&[f64]], ranges: &[Range<usize>]) -> Vec<f64> {
         let mut sums = vec![0.0; models.len()];
-        let mut left = Vec::with_capacity(PANEL);
-        for range in ranges {
-            for start in range.clone().step_by(PANEL) {
-                let panel = start..(start + PANEL).min(range.end);
-                for (sum, coefficients) in sums.iter_mut().zip(models) {
-                    left.clear();
-                    left.extend_from_slice(&self.target[panel.clone()]);
-                    for (column, &c) in self.columns.iter().zip(*coefficients) {
-                        if c != 0.0 {
-                            left.iter_mut().zip(&column[panel.clone()]).for_each(|(r, v)| *r -= c * v);
-                        }
-                    }
-                    *sum += left.iter().map(|r| r * r).sum::<f64>();
-                }
+        for panel in panels(ranges, CACHED) {
+            for (sum, coefficients) in sums.iter_mut().zip(models) {
+                let left = self.residuals(coefficients, std::slice::from_ref(&panel));
+                *sum += left.iter().map(|r| r * r).sum::<f64>();
             }
         }
         sums
@@ -136,7 +122,14 @@ impl<'a> Rows<'a> {
 }
 
 /// Rows whose columns stay in the second-level cache.
-const PANEL: usize = 1024;
+pub(crate) const CACHED: usize = 1024;
+
+/// Row ranges cut into panels of at most `most` rows.
+pub(crate) fn panels(ranges: &[Range<usize>], most: usize) -> impl Iterator<Item = Range<usize>> + '_ {
+    ranges
+        .iter()
+        .flat_map(move |r| r.clone().step_by(most).map(move |start| start..(start + most).min(r.end)))
+}
 
 /// Number of rows in a set of ranges.
 #[must_use]
@@ -160,6 +153,14 @@ pub fn check_ranges(ranges: &[Range<usize>], rows: usize) -> Result<(), SparseEr
         last = r.end;
     }
     Ok(())
+}
+
+/// An error that names the first value that is not finite.
+pub(crate) fn check_finite(values: &[f64], what: impl FnOnce() -> String) -> Result<(), SparseError> {
+    match first_not_finite(values) {
+        None => Ok(()),
+        Some(row) => Err(SparseError::NotFinite { what: what(), row }),
+    }
 }
 
 pub(crate) fn first_not_finite(values: &[f64]) -> Option<usize> {

@@ -12,9 +12,9 @@ use faer::linalg::qr::no_pivoting::factor::{qr_in_place, qr_in_place_scratch, re
 use faer::{Mat, Par};
 
 use crate::error::SparseError;
-use crate::gram::{Gram, PANEL, panels};
+use crate::gram::{Gram, PANEL};
 use crate::product::{add_products, divide};
-use crate::rows::{Rows, count};
+use crate::rows::{Rows, count, panels};
 
 /// A column whose part orthogonal to its predecessors is below this fraction of its norm is dependent.
 pub const RANK_TOLERANCE: f64 = 1e-12;
@@ -121,7 +121,7 @@ impl Triangle {
         let mut sums = vec![0.0; order * order];
         let mut panel = vec![0.0; order * PANEL.min(n)];
         let mut columns: Vec<&[f64]> = Vec::with_capacity(order);
-        for range in panels(ranges) {
+        for range in panels(ranges, PANEL) {
             let count = range.len();
             columns.clear();
             columns.extend((0..k).map(|j| &rows.column(j)[range.clone()]));
