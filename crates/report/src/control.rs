@@ -3,7 +3,7 @@
 //! Plain data, filled by the caller ([`crate::convert::control`]). All numbers are SI; units are those of
 //! [`Quantity::unit`]. A number that is not finite is shown as unknown.
 
-use greybox_control::Verdict;
+use greybox_control::{Metrics, Verdict};
 
 use crate::contract::{ModelId, Producer};
 
@@ -41,7 +41,7 @@ pub struct ControlPage {
     /// The tangent of the loop at each set point.
     pub set_points: Vec<SetPoint>,
     /// What the simulated loop reached, set point by set point.
-    pub steps: Vec<Step>,
+    pub steps: Vec<Metrics>,
     /// The same law on perturbed plants.
     pub family: Option<Perturbed>,
     /// The simulated loop.
@@ -94,29 +94,6 @@ pub struct SetPoint {
     pub poles: Vec<[f64; 2]>,
     /// Poles in z with the command held over the sample time.
     pub held_poles: Vec<[f64; 2]>,
-}
-
-/// What one step of the simulated loop reached.
-#[derive(Debug, Clone, Copy, PartialEq)]
-pub struct Step {
-    /// The set point.
-    pub set_point: f64,
-    /// Its distance from where the tracked state was.
-    pub size: f64,
-    /// Time after which the tracked state stays within 2 % of the step, s; none where it does not.
-    pub settling: Option<f64>,
-    /// Largest excursion beyond the set point, relative to the step.
-    pub overshoot: f64,
-    /// Tracked state minus set point at the end.
-    pub final_error: f64,
-    /// Root mean square of tracked state minus set point.
-    pub rms_error: f64,
-    /// Largest |command|.
-    pub largest_command: f64,
-    /// Share of the samples with the command at its limit.
-    pub saturated: f64,
-    /// ∫ u² dt.
-    pub effort: f64,
 }
 
 /// One law on perturbed plants.

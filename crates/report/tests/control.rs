@@ -1,10 +1,10 @@
 //! The page of a controller: its structure, its words, that nothing escapes from its place, and a browser.
 #![allow(clippy::unwrap_used, reason = "helpers of tests panic like the tests themselves")]
 
-use greybox_control::Verdict;
+use greybox_control::{Metrics, Verdict};
 use greybox_report::ControlPage;
 use greybox_report::contract::{ModelId, Producer};
-use greybox_report::control::{Figure, LawKind, LawState, LoopRun, Perturbed, Quantity, SetPoint, Step};
+use greybox_report::control::{Figure, LawKind, LawState, LoopRun, Perturbed, Quantity, SetPoint};
 
 #[path = "common/browser.rs"]
 mod browser;
@@ -18,9 +18,9 @@ fn page() -> ControlPage {
     let t: Vec<f64> = (0..400).map(|k| f64::from(k) * 0.01).collect();
     let wanted = |t: f64| if t < 2.0 { 0.5 } else { -0.5 };
     let theta: Vec<f64> = t.iter().map(|t| wanted(*t) * (1.0 - (-8.0 * (t % 2.0)).exp())).collect();
-    let step = |set_point: f64| Step {
+    let step = |set_point: f64| Metrics {
         set_point,
-        size: 2.0 * set_point,
+        step: 2.0 * set_point,
         settling: Some(0.489),
         overshoot: 0.0123,
         final_error: 0.00213,

@@ -5,7 +5,7 @@ use greybox_model::{Expr, Model};
 
 use super::coherent;
 use crate::contract::{ModelId, Producer};
-use crate::control::{ControlPage, Figure, LawKind, LawState, LoopRun, Perturbed, Quantity, SetPoint, Step};
+use crate::control::{ControlPage, Figure, LawKind, LawState, LoopRun, Perturbed, Quantity, SetPoint};
 use crate::format;
 
 /// What a page is made from.
@@ -94,7 +94,7 @@ pub fn page(sources: &ControlSources<'_>) -> ControlPage {
         law: controller.law().first().map(ToString::to_string).unwrap_or_default(),
         left_out: plant.dropped().iter().map(|d| (d.equation.clone(), d.term.to_string())).collect(),
         set_points: set_points.collect(),
-        steps: run.metrics.iter().map(step).collect(),
+        steps: run.metrics.clone(),
         family: sources.family.map(|(family, deviations)| {
             let unit = states.get(controller.tracked()).map_or("", |s| s.quantity.unit.as_str());
             perturbed(family, deviations, model, &run.metrics, [unit, &input.unit])
@@ -145,20 +145,6 @@ fn settings(controller: &Controller, input: &Quantity) -> Vec<(&'static str, Str
         out.push(("Dead zone made up for", of_input(plant.dead_zone())));
     }
     out
-}
-
-fn step(m: &Metrics) -> Step {
-    Step {
-        set_point: m.set_point,
-        size: m.step,
-        settling: m.settling,
-        overshoot: m.overshoot,
-        final_error: m.final_error,
-        rms_error: m.rms_error,
-        largest_command: m.largest_command,
-        saturated: m.saturated,
-        effort: m.effort,
-    }
 }
 
 fn perturbed(

@@ -1,7 +1,7 @@
 //! The page of a controller: what its loop reached, the law, its poles, and what it does not promise.
 
 use askama::Template;
-use greybox_control::Verdict;
+use greybox_control::{Metrics, Verdict};
 
 use super::{Assets, Common, Island, PlotData, PlotView, SeriesData, extent, quantity_html, series, span};
 use crate::control::{ControlPage, LawKind, Quantity};
@@ -204,7 +204,7 @@ fn formula(kind: LawKind) -> &'static str {
 
 /// The headline figures: name, value, what it is.
 fn figures(page: &ControlPage, unit: &str) -> Vec<[String; 3]> {
-    let worst = |of: fn(&crate::control::Step) -> f64| page.steps.iter().map(of).fold(0.0, f64::max);
+    let worst = |of: fn(&Metrics) -> f64| page.steps.iter().map(of).fold(0.0, f64::max);
     let number = |v: f64, unit: &str| format::with_unit(&format::number(v), unit);
     let mut out = Vec::new();
     let mut push =
@@ -313,10 +313,10 @@ fn step_heads(tracked: &Quantity, input: &Quantity) -> Vec<(&'static str, String
 }
 
 fn steps(page: &ControlPage) -> Vec<Vec<String>> {
-    let row = |s: &crate::control::Step| {
+    let row = |s: &Metrics| {
         vec![
             format::plain(s.set_point),
-            format::number(s.size),
+            format::number(s.step),
             s.settling.map_or_else(|| "not reached".to_owned(), format::number),
             format::percent_short(s.overshoot),
             format::number(s.final_error),

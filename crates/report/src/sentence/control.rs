@@ -1,6 +1,6 @@
 //! What a control engineer wants to know first, in plain language.
 
-use greybox_control::Verdict;
+use greybox_control::{Metrics, Verdict};
 
 use crate::control::ControlPage;
 use crate::{expression, format};
@@ -33,7 +33,7 @@ fn reached(page: &ControlPage, name: &str, unit: &str) -> String {
     if let Some(t) = page.run.diverged {
         return format!("{name} leaves every bound after {} s.", format::plain(t));
     }
-    let worst = |of: fn(&crate::control::Step) -> f64| page.steps.iter().map(of).fold(0.0, f64::max);
+    let worst = |of: fn(&Metrics) -> f64| page.steps.iter().map(of).fold(0.0, f64::max);
     let missed = page.steps.iter().filter(|s| s.settling.is_none()).count();
     let left = format::with_unit(&format::number(worst(|s| s.final_error.abs())), unit);
     if page.verdict == Verdict::Unsettled || missed > 0 {
