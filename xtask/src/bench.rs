@@ -21,7 +21,8 @@ use cpu_time::ProcessTime;
 use serde::Serialize;
 
 use self::case::{Against, Answer, Case, Row};
-use crate::Ending;
+use crate::reproduce::median;
+use crate::{Ending, process};
 
 /// What `bench` takes.
 #[derive(Debug, clap::Args)]
@@ -109,7 +110,7 @@ pub(crate) fn run(root: &Path, arguments: &Arguments) -> Result<Ending> {
     if !(arguments.seconds > 0.0 && arguments.seconds <= 60.0) {
         bail!("--seconds {} is not in 0..60", arguments.seconds);
     }
-    let target = target(root);
+    let target = process::target(root);
     let python = if arguments.peers { Some(peer::environment(root, &target)?) } else { None };
     let one = rayon::ThreadPoolBuilder::new().num_threads(1).build()?;
     let bench = Bench { root, target: &target, python: python.as_deref(), arguments, one };
@@ -143,11 +144,6 @@ pub(crate) fn run(root: &Path, arguments: &Arguments) -> Result<Ending> {
         println!("{missed} goals missed");
     }
     Ok(if missed == 0 { Ending::Done } else { Ending::Missed })
-}
-
-/// Where cargo builds.
-fn target(root: &Path) -> PathBuf {
-    std::env::var_os("CARGO_TARGET_DIR").map_or_else(|| root.join("target"), |d| root.join(d))
 }
 
 struct Bench<'a> {
@@ -184,7 +180,7 @@ impl Bench<'_> {
                                 theirs.push(worker.measure(self.arguments.seconds)? / case.units);
                             }
                         }
-                        let (mine, theirs) = (median(&mut ours.clone()), median(&mut theirs));
+                        let (mine, theirs) = (median(ours.clone()), median(theirs));
                         samples.extend(ours);
                         let with = peer.name.to_owned();
                         let note = if slow { "; theirs is one call, slow as it is" } else { "" };
@@ -208,9 +204,9 @@ impl Bench<'_> {
                     samples.push(self.ours(&mut case)?);
                     rates.push(self.peak());
                 }
-                let rate = median(&mut rates);
+                let rate = median(rates);
                 *peak = Some(rate);
-                let share = operations / median(&mut samples.clone()) / rate;
+                let share = operations / median(samples.clone()) / rate;
                 comparisons.push(Comparison::new("the core's peak".to_owned(), None, share, *goal, None));
             }
             Against::TwoCores { goal } => {
@@ -230,7 +226,7 @@ impl Bench<'_> {
             name: row.name.to_owned(),
             what: row.what.to_owned(),
             unit: row.unit.to_owned(),
-            ours: median(&mut samples),
+            ours: median(samples),
             comparisons,
         })
     }
@@ -286,13 +282,6 @@ fn wall(pool: &rayon::ThreadPool, case: &mut Case) -> Result<f64> {
     Ok(start.elapsed().as_secs_f64())
 }
 
-/// The middle value; of an even number the mean of the two. NaN without values.
-fn median(values: &mut [f64]) -> f64 {
-    values.sort_by(f64::total_cmp);
-    let n = values.len();
-    if n == 0 { f64::NAN } else { 0.5 * (values[(n - 1) / 2] + values[n / 2]) }
-}
-
 impl Comparison {
     fn new(with: String, theirs: Option<f64>, ratio: f64, goal: f64, agreement: Option<String>) -> Self {
         Self { with, theirs, ratio, goal, met: ratio >= goal, agreement }
@@ -338,8 +327,7 @@ fn duration(seconds: f64) -> String {
         _ => (1e9, "ns"),
     };
     let value = factor * seconds;
-    let digits = if value >= 99.95 { 0 } else { usize::from(value >= 9.995) };
-    let digits = if value >= 99.95 { 0 } else { 2 - digits };
+    let digits = [9.995, 99.95].iter().filter(|&&bound| value < bound).count();
     format!("{value:.digits$} {unit}")
 }
 
@@ -365,9 +353,6 @@ mod tests {
         assert_eq!(duration(0.1999), "200 ms");
         assert_eq!(duration(12.34), "12.3 s");
         assert_eq!(duration(3.0e-9), "3.00 ns");
-        assert_eq!(median(&mut [3.0, 1.0, 2.0]), 2.0);
-        assert_eq!(median(&mut [4.0, 1.0, 2.0, 3.0]), 2.5);
-        assert!(median(&mut []).is_nan());
     }
 
     #[test]

@@ -132,7 +132,7 @@ pub(crate) fn run(root: &Path, arguments: &Arguments) -> Result<Ending> {
     let mut outcomes = Vec::new();
     for case in &cases {
         eprintln!("{} …", case.name);
-        let out = target(root).join("prove").join(&case.name);
+        let out = process::target(root).join("prove").join(&case.name);
         outcomes.push(measure(&binary, &folder, case, &out, Duration::from_secs(arguments.timeout))?);
     }
     conclude(&outcomes, arguments.json.as_deref())
@@ -140,7 +140,8 @@ pub(crate) fn run(root: &Path, arguments: &Arguments) -> Result<Ending> {
 
 /// Runs the concealed suite.
 fn conceal(root: &Path, arguments: &Arguments) -> Result<Ending> {
-    let folder = arguments.keep.clone().unwrap_or_else(|| target(root).join("prove").join("concealed"));
+    let folder =
+        arguments.keep.clone().unwrap_or_else(|| process::target(root).join("prove").join("concealed"));
     std::fs::create_dir_all(&folder).with_context(|| format!("{} cannot be made", folder.display()))?;
     let options = concealed::Options {
         seed: arguments.seed,
@@ -181,10 +182,6 @@ fn select(cases: Vec<Case>, only: Option<&str>) -> Result<Vec<Case>> {
     Ok(chosen)
 }
 
-fn target(root: &Path) -> PathBuf {
-    std::env::var_os("CARGO_TARGET_DIR").map_or_else(|| root.join("target"), |d| root.join(d))
-}
-
 fn build(root: &Path) -> Result<PathBuf> {
     let cargo = std::env::var_os("CARGO").unwrap_or_else(|| "cargo".into());
     let status = Command::new(cargo)
@@ -195,7 +192,8 @@ fn build(root: &Path) -> Result<PathBuf> {
     if !status.success() {
         bail!("greybox does not build");
     }
-    let binary = target(root).join("release").join(format!("greybox{}", std::env::consts::EXE_SUFFIX));
+    let binary =
+        process::target(root).join("release").join(format!("greybox{}", std::env::consts::EXE_SUFFIX));
     if !binary.is_file() {
         bail!("the build left no {}", binary.display());
     }

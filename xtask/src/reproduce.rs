@@ -25,6 +25,7 @@ use std::path::{Path, PathBuf};
 
 use anyhow::{Context, Result};
 
+pub(crate) use self::optimal::F16;
 use crate::Ending;
 use fixture::Fixture;
 
@@ -234,7 +235,8 @@ pub(crate) fn run(root: &Path, arguments: &Arguments) -> Result<Ending> {
 }
 
 /// The median; of an even number the mean of the middle two.
-fn median(mut values: Vec<f64>) -> f64 {
+/// The middle value; of an even number the mean of the two. NaN without values.
+pub(crate) fn median(mut values: Vec<f64>) -> f64 {
     values.sort_by(f64::total_cmp);
     let middle = values.len() / 2;
     match values.len() {

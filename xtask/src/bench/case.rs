@@ -66,6 +66,11 @@ pub(crate) enum Against {
     },
 }
 
+impl Against {
+    /// Nothing.
+    pub(crate) const NOTHING: Self = Self::Peers(&[]);
+}
+
 /// A row of the table.
 pub(crate) struct Row {
     /// Its name on the command line.
@@ -78,6 +83,18 @@ pub(crate) struct Row {
     pub(crate) against: Against,
     /// Prepares it.
     pub(crate) make: fn() -> Result<Case>,
+}
+
+impl Row {
+    pub(crate) const fn new(
+        name: &'static str,
+        what: &'static str,
+        unit: &'static str,
+        against: Against,
+        make: fn() -> Result<Case>,
+    ) -> Self {
+        Self { name, what, unit, against, make }
+    }
 }
 
 /// The array of a name; its values are finite, since NaN would agree with everything.

@@ -2,30 +2,29 @@
 
 use anyhow::Result;
 use greybox_eso::{Design, Observer, Scheme};
-use greybox_hjb::{AdamaxOptions, Domain, Linear, Monomials, Problem, adamax, lqr};
+use greybox_hjb::{AdamaxOptions, adamax, lqr};
 use greybox_smc::thesis::LinkTangent;
 use greybox_smc::{BoundaryLayer, FlatOutput, Law, Rate, Surface, Target};
 use nalgebra::{DMatrix, dmatrix};
 use serde_json::{Value, json};
 
 use super::case::{Against, Answer, Case, Peer, Row, close};
+use crate::reproduce::F16;
 
 /// Steps of a call: the clock is coarse beside one of them.
 const STEPS: usize = 20_000;
 
 /// The rows.
 pub(crate) fn rows() -> Vec<Row> {
-    let alone = || Against::Peers(&[]);
-    let row = |name, what, unit, against, make| Row { name, what, unit, against, make };
     vec![
-        row(
+        Row::new(
             "adamax",
             "Algorithm 3 on the F16's grid of 500 points",
             "iteration",
             Against::Peers(&[Peer { function: "adamax", name: "NumPy, vectorised", goal: 10.0 }]),
             training,
         ),
-        row(
+        Row::new(
             "riccati",
             "linear-quadratic regulator of the F16",
             "design",
@@ -35,24 +34,20 @@ pub(crate) fn rows() -> Vec<Row> {
             ]),
             regulator,
         ),
-        row("observer", "state observer of the thesis, 2 states", "sample", alone(), observer),
-        row("control_law", "sliding-mode law of the flexible link, 4 states", "step", alone(), law),
+        Row::new("observer", "state observer of the thesis, 2 states", "sample", Against::NOTHING, observer),
+        Row::new(
+            "control_law",
+            "sliding-mode law of the flexible link, 4 states",
+            "step",
+            Against::NOTHING,
+            law,
+        ),
     ]
-}
-
-/// The F16 of thesis equation 4.40.
-fn f16() -> Linear {
-    Linear {
-        a: dmatrix![-1.01887, 0.90506, -0.00215; 0.82225, -1.07741, -0.17555; 0.0, 0.0, -1.0],
-        b: dmatrix![0.0; 0.0; 1.0],
-    }
 }
 
 fn training() -> Result<Case> {
     const ITERATIONS: usize = 6000;
-    let points = Domain::symmetric(&[5.0, 10.0, 10.0])?.grid(&[10, 10, 5])?;
-    let one = DMatrix::identity(3, 3);
-    let problem = Problem::new(&f16(), &one, &dmatrix![1.0], Monomials::even(3, 2)?, &points)?;
+    let F16 { problem, points, .. } = F16::new()?;
     let options = AdamaxOptions { iterations: ITERATIONS, patience: None, ..AdamaxOptions::default() };
     let work = move || {
         let trained = adamax(&problem, &[1.0; 6], &options)?;
@@ -71,7 +66,7 @@ fn training() -> Result<Case> {
 }
 
 fn regulator() -> Result<Case> {
-    let (plant, q, r) = (f16(), DMatrix::identity(3, 3), dmatrix![1.0]);
+    let (plant, q, r) = (F16::plant(), DMatrix::identity(3, 3), dmatrix![1.0]);
     let work = move || {
         let found = lqr(&plant.a, &plant.b, &q, &r)?;
         Ok(Answer::from([("solution".to_owned(), found.solution.as_slice().to_vec())]))

@@ -67,17 +67,15 @@ const GUESS: [f64; 6] = [1.2, 0.7, 1.3, 0.8, 0.9, 1.1];
 
 /// The rows.
 pub(crate) fn rows() -> Vec<Row> {
-    let alone = || Against::Peers(&[]);
-    let row = |name, what, unit, against, make| Row { name, what, unit, against, make };
     vec![
-        row(
+        Row::new(
             "tape",
             "right-hand side of the oscillator, compiled from the model",
             "evaluation",
-            alone(),
+            Against::NOTHING,
             tape,
         ),
-        row(
+        Row::new(
             "simulation",
             "the oscillator for 1 000 s to 1e-8, from the model's equations",
             "run",
@@ -87,14 +85,14 @@ pub(crate) fn rows() -> Vec<Row> {
             ]),
             simulation,
         ),
-        row(
+        Row::new(
             "sensitivities",
             "4 000 samples with 8 sensitivities, one RK4 step each",
             "sample",
-            alone(),
+            Against::NOTHING,
             sensitivities,
         ),
-        row(
+        Row::new(
             "calibration",
             "output-error fit of six parameters and the start, 4 000 samples",
             "fit",

@@ -29,39 +29,37 @@ const GRAM_OPERATIONS: f64 = 2.0 * (ROWS * 49 * 49) as f64;
 
 /// The rows.
 pub(crate) fn rows() -> Vec<Row> {
-    let alone = || Against::Peers(&[]);
-    let row = |name, what, unit, against, make| Row { name, what, unit, against, make };
     vec![
-        row(
+        Row::new(
             "gram",
             "Gram matrix of 40 000 × 49, library evaluated",
             "matrix",
             Against::Peak { operations: GRAM_OPERATIONS, goal: 0.6 },
             gram,
         ),
-        row(
+        Row::new(
             "gram_two_cores",
             "the same of two recordings",
             "pair",
             Against::TwoCores { goal: 1.7 },
             gram_pair,
         ),
-        row("lasso_path", "LASSO, 16 terms, 50 λ, from the triangle", "path", alone(), path),
-        row(
+        Row::new("lasso_path", "LASSO, 16 terms, 50 λ, from the triangle", "path", Against::NOTHING, path),
+        Row::new(
             "algorithm1",
             "Algorithm 1: orders 1–6, 5 folds, 50 λ, 40 000 rows",
             "search",
             Against::Peers(&[Peer { function: "algorithm1", name: "scikit-learn LassoCV", goal: 100.0 }]),
             algorithm1,
         ),
-        row(
+        Row::new(
             "algorithm2",
             "Algorithm 2: 30 bootstraps × 50 λ, order 3",
             "search",
             Against::Peers(&[Peer { function: "algorithm2", name: "scikit-learn lasso_path", goal: 60.0 }]),
             algorithm2,
         ),
-        row(
+        Row::new(
             "stlsq",
             "one sparse fit, order 3, 40 000 rows",
             "fit",

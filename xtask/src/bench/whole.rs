@@ -1,25 +1,23 @@
 //! Rows of signals, of the candidates' score test and of a diagnosis from beginning to end.
 
-use std::path::PathBuf;
 use std::sync::Arc;
 
 use anyhow::Result;
 use greybox_algebraic::{Column, Hold, Kernel};
 use greybox_calibrate::{Data, Limits, Point, Setup, free_parameters};
+use greybox_diagnose::built_in;
 use greybox_diagnose::candidate::candidates;
 use greybox_diagnose::place::places;
 use greybox_diagnose::screen::screen;
-use greybox_diagnose::{Options, Quiet, built_in, diagnose};
-use greybox_model::Model;
-use greybox_recording::{Recording, read_csv, smooth};
+use greybox_recording::smooth;
 
 use super::case::{Against, Answer, Case, Row};
 use super::sparse::Record;
-use crate::root;
+use crate::demo::Demo;
 
 /// The rows.
 pub(crate) fn rows() -> Vec<Row> {
-    let row = |name, what, unit, make| Row { name, what, unit, against: Against::Peers(&[]), make };
+    let row = |name, what, unit, make| Row::new(name, what, unit, Against::NOTHING, make);
     vec![
         row("signals", "windows of 1 s on 40 000 samples, one every 20, 3 columns", "record", signals),
         row("smoothing", "smoothing of 40 000 samples with two derivatives", "record", smoothing),
@@ -47,22 +45,9 @@ fn smoothing() -> Result<Case> {
     }))
 }
 
-fn demo() -> PathBuf {
-    root().join("crates").join("cli").join("demo")
-}
-
-fn model() -> Result<Model> {
-    let text = std::fs::read_to_string(demo().join("rotary_link.toml"))?;
-    Ok(Model::from_toml(&text, "rotary_link.toml")?)
-}
-
-fn recording(name: &str) -> Result<Recording> {
-    Ok(read_csv(demo().join(name))?)
-}
-
 fn screening() -> Result<Case> {
-    let (model, library) = (model()?, built_in()?);
-    let data = Arc::new(Data::new(&model, &[recording("rotary_link_train.csv")?])?);
+    let (Demo { model, train, .. }, library) = (Demo::read()?, built_in()?);
+    let data = Arc::new(Data::new(&model, &train)?);
     let setup = Setup::new(&model, data, free_parameters(&model))?;
     let level = setup.windows(200, 20_000);
     let scale = setup.data.spread.clone();
@@ -76,11 +61,9 @@ fn screening() -> Result<Case> {
 }
 
 fn diagnosis() -> Result<Case> {
-    let model = model()?;
-    let train = [recording("rotary_link_train.csv")?];
-    let test = [recording("rotary_link_test.csv")?];
+    let demo = Demo::read()?;
     Ok(Case::alone(1.0, move || {
-        let found = diagnose(&model, &train, &test, &Options::default(), &Quiet)?;
+        let found = demo.diagnose()?;
         Ok(Answer::from([("mechanisms".to_owned(), vec![found.mechanisms.len() as f64])]))
     }))
 }

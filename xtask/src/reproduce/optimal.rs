@@ -85,25 +85,31 @@ pub(crate) fn figure_4_3(_: &Fixture) -> Result<Piece> {
 }
 
 /// The F16 of section 4.3.3.1.
-struct F16 {
+pub(crate) struct F16 {
     plant: Linear,
-    problem: Problem,
+    pub(crate) points: Vec<Vec<f64>>,
+    pub(crate) problem: Problem,
     exact: Vec<f64>,
 }
 
 impl F16 {
-    fn new() -> Result<Self> {
-        let plant = Linear {
+    /// Equation 4.40.
+    pub(crate) fn plant() -> Linear {
+        Linear {
             a: dmatrix![-1.01887, 0.90506, -0.00215; 0.82225, -1.07741, -0.17555; 0.0, 0.0, -1.0],
             b: dmatrix![0.0; 0.0; 1.0],
-        };
+        }
+    }
+
+    pub(crate) fn new() -> Result<Self> {
+        let plant = Self::plant();
         let (q, r) = (DMatrix::identity(3, 3), dmatrix![1.0]);
         let basis = Monomials::even(3, 2)?;
         let riccati = lqr(&plant.a, &plant.b, &q, &r)?;
         let exact = basis.quadratic(|i, j| riccati.solution[(i, j)]);
         let points = Domain::symmetric(&[5.0, 10.0, 10.0])?.grid(&[10, 10, 5])?;
         let problem = Problem::new(&plant, &q, &r, basis, &points)?;
-        Ok(Self { plant, problem, exact })
+        Ok(Self { plant, points, problem, exact })
     }
 }
 

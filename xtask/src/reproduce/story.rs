@@ -3,9 +3,7 @@
 
 use anyhow::{Context, Result};
 use greybox_control::{Controller, DesignOptions, Method, Metrics, Plant, PlantOptions, design};
-use greybox_diagnose::{Diagnosis, Options, Quiet, diagnose};
 use greybox_model::Model;
-use greybox_recording::parse_csv;
 use greybox_simulate::rigs::{LinkRun, RigError, RotaryFlexibleLink, Sampling};
 
 use super::chapter2::draw;
@@ -13,6 +11,7 @@ use super::figure::{Axis, Series, Style};
 use super::fixture::Fixture;
 use super::index::number;
 use super::{Check, Entry, Piece, Status, Table};
+use crate::demo::Demo;
 
 const RIG: RotaryFlexibleLink = RotaryFlexibleLink::IDENTIFIED;
 /// Sample time of the laws, s.
@@ -35,19 +34,6 @@ const MODELS: [&str; 3] = ["nominal", "calibrated", "improved"];
 /// The piece.
 pub(crate) fn entry() -> Entry {
     Entry::new("Story", story).slow()
-}
-
-/// `greybox demo`: the embedded model and recordings, diagnosed.
-fn diagnosed() -> Result<Diagnosis> {
-    let folder = crate::root().join("crates").join("cli").join("demo");
-    let read = |name: &str| {
-        let path = folder.join(name);
-        std::fs::read(&path).with_context(|| format!("{} cannot be read", path.display()))
-    };
-    let recording = |name: &str| -> Result<_> { Ok([parse_csv(read(name)?.as_slice(), name)?]) };
-    let model = Model::from_toml(&String::from_utf8(read("rotary_link.toml")?)?, "rotary_link.toml")?;
-    let (train, holdout) = (recording("rotary_link_train.csv")?, recording("rotary_link_test.csv")?);
-    Ok(diagnose(&model, &train, &holdout, &Options::default(), &Quiet)?)
 }
 
 /// One way to design.
@@ -175,7 +161,7 @@ fn curves(run: &LinkRun, amplitude: f64) -> [Vec<[f64; 2]>; 2] {
 }
 
 fn story(_: &Fixture) -> Result<Piece> {
-    let diagnosis = diagnosed()?;
+    let diagnosis = Demo::read()?.diagnose()?;
     let models = [&diagnosis.nominal, &diagnosis.calibrated, &diagnosis.improved];
     let mut piece = Piece::new(
         Status::VirtualRig,
@@ -184,9 +170,9 @@ fn story(_: &Fixture) -> Result<Piece> {
          recordings, with its true friction and all else that the models lack, and is given the true state, so that \
          what differs comes from the model alone. Nothing is tuned: typical sizes by Bryson's rule, and λ = 16, \
          η/φ = 100 of the thesis. On steps of 40° both designs settle on the improved model and end nearer than on \
-         the others. On steps of 20° friction decides: a regulator has no answer to it and does not settle on any \
-         model; the sliding mode, which takes the friction found out of the motion, ends nearest, and how near \
-         depends on how well the friction was found. The RMS error is mostly the way there and differs little.",
+         the others. On steps of 20° friction decides: a regulator has no answer to it; the sliding mode, which takes \
+         the friction found out of the motion, ends nearer, and how near depends on how well the friction was \
+         found. The RMS error is mostly the way there.",
     );
     let found: Vec<Vec<String>> = diagnosis
         .mechanisms
