@@ -18,7 +18,9 @@ use crate::library::{Mechanism, MechanismError, built_in};
 use crate::locate::{Location, force, locate};
 use crate::place::{Motion, Place};
 use crate::screen::project;
-use crate::search::{Fitted, Found, Part, Search, UNDECIDED, log_likelihood_gain, raw_rms, raw_rss, rms};
+use crate::search::{
+    Fitted, Found, Part, Rival, Search, UNDECIDED, log_likelihood_gain, raw_rms, raw_rss, rms,
+};
 use crate::surface::{Surface, Variable, held_out};
 use crate::{Observer, Stage};
 
@@ -943,7 +945,13 @@ fn findings(
             // Posterior weights of the explanations tried; equivalent ones share their weight.
             let rivals = accepted.map_or(&[][..], |a| &a.rivals[..]);
             let weight = |score: f64| (0.5 * (score - evidence.score)).clamp(-60.0, 0.0).exp();
-            let others: f64 = rivals.iter().filter(|r| !r.equivalent).map(|r| weight(r.evidence.score)).sum();
+            // A wider law at the same place does not speak against a special case of it.
+            let wider = |r: &&Rival| {
+                let kind = &library[r.candidate.mechanism].kind;
+                r.candidate.place == part.candidate.place && mechanism.wider().any(|k| k == kind)
+            };
+            let against = rivals.iter().filter(|r| !r.equivalent && !wider(r));
+            let others: f64 = against.map(|r| weight(r.evidence.score)).sum();
             let nothing = weight(0.0);
             let confidence = (1.0 / (1.0 + others + nothing)).clamp(0.01, 0.99);
             let mut alternatives: Vec<Alternative> = rivals
@@ -966,6 +974,17 @@ fn findings(
                 .filter(|a| a.equivalent || a.confidence > 0.001)
                 .collect();
             twins(&mut alternatives, mechanism, part.candidate.clone(), &setup, confidence);
+            for kind in mechanism.wider() {
+                alternatives.retain(|a| a.kind != kind);
+                let separate = library.iter().find(|m| m.kind == kind).map(|m| m.about.separate.clone());
+                alternatives.push(Alternative {
+                    kind: kind.to_string(),
+                    confidence,
+                    equivalent: true,
+                    expression: part.instance.expression.to_string(),
+                    separate: separate.unwrap_or_default(),
+                });
+            }
             alternatives
                 .sort_by(|a, b| b.equivalent.cmp(&a.equivalent).then(b.confidence.total_cmp(&a.confidence)));
             let parameters = part

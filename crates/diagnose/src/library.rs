@@ -270,6 +270,9 @@ pub struct Mechanism {
     /// expression in this mechanism's parameters). Where all of them are candidates, it is reported as
     /// that sum, with itself as an equivalent alternative.
     pub equals: Vec<(String, String, Expr)>,
+    /// Kinds of other physics whose law is this one at some values of their parameters, in the same form: they are
+    /// equivalent alternatives wherever this one is found.
+    pub special_case: Vec<(String, String, Expr)>,
     /// Prose.
     pub about: About,
 }
@@ -367,6 +370,8 @@ struct File {
     #[serde(default)]
     equals: toml::map::Map<String, toml::Value>,
     #[serde(default)]
+    special_case: toml::map::Map<String, toml::Value>,
+    #[serde(default)]
     about: About,
 }
 
@@ -405,7 +410,7 @@ impl Mechanism {
     ///
     /// # Errors
     /// [`MechanismError`] names the file, the line, and what is wrong with the mend. What depends on other
-    /// files (`refines`, `[equals]`) is checked by [`combine`].
+    /// files (`refines`, `doubts`, `[equals]`, `[special_case]`) is checked by [`combine`].
     pub fn from_toml(text: &str, file: &str) -> Result<Mechanism, MechanismError> {
         let raw: File = toml::from_str(text).map_err(|e| MechanismError {
             file: file.to_string(),
@@ -437,15 +442,6 @@ impl Mechanism {
         }
         if !(raw.surcharge.is_finite() && raw.surcharge >= 0.0) {
             return Err(Fault::new("", "surcharge", "`surcharge` must be zero or positive"));
-        }
-        let mut equals = Vec::new();
-        for (kind, value) in raw.equals {
-            let table: BTreeMap<String, String> = value.try_into().map_err(|e: toml::de::Error| {
-                Fault::new("equals", &kind, format!("[equals] {kind}: {}", e.message()))
-            })?;
-            for (parameter, text) in table {
-                equals.push((kind.clone(), parameter, expression(&text, "equals", &kind)?));
-            }
         }
         let formula = |section: &str, name: &str, value: &toml::Value| match value.as_str() {
             Some(text) => Ok(text.to_string()),
@@ -494,7 +490,8 @@ impl Mechanism {
             require: raw.require.iter().map(|t| expression(t, "", "require")).collect::<Result<_, _>>()?,
             surcharge: raw.surcharge,
             region: raw.location.map(region).transpose()?,
-            equals,
+            equals: of_others("equals", raw.equals)?,
+            special_case: of_others("special_case", raw.special_case)?,
             about: raw.about,
         };
         mechanism.own = mechanism.named().filter(|n| mechanism.uses(n)).map(str::to_string).collect();
@@ -638,8 +635,8 @@ impl Mechanism {
         let own = |n: &str| n == "pi" || self.own.iter().any(|p| p == n);
         let figures = self.report.iter().map(|(name, e)| ("report", name.as_str(), e));
         let require = self.require.iter().map(|e| ("", "require", e));
-        let equals = self.equals.iter().map(|(kind, _, e)| ("equals", kind.as_str(), e));
-        for (section, key, e) in figures.chain(require).chain(equals) {
+        let others = self.of_others().map(|(section, kind, _, e)| (section, kind, e));
+        for (section, key, e) in figures.chain(require).chain(others) {
             if let Some(n) = stranger(e, own) {
                 let place =
                     if section.is_empty() { format!("`{key}`") } else { format!("[{section}] {key}") };
@@ -829,23 +826,68 @@ impl Mechanism {
                 }
             }
         }
-        for (kind, parameter, _) in &self.equals {
+        for (section, kind, parameter, _) in self.of_others() {
+            let fault = |message: String| Err(Fault::new(section, kind, format!("[{section}] {message}")));
             if !all().any(|m| m.kind == *kind) {
-                return Err(Fault::new(
-                    "equals",
-                    kind,
-                    format!("[equals] names `{kind}`, a kind that the library does not have"),
-                ));
+                return fault(format!("names `{kind}`, a kind that the library does not have"));
             }
-            if !all().any(|m| m.kind == *kind && m.own.contains(parameter)) {
+            if !all().any(|m| m.kind == *kind && m.own.iter().any(|n| n == parameter)) {
+                return fault(format!("{kind}: it has no parameter `{parameter}`"));
+            }
+        }
+        for kind in self.wider() {
+            if !all().any(|m| m.kind == kind && self.is_special_case_of(m)) {
                 return Err(Fault::new(
-                    "equals",
+                    "special_case",
                     kind,
-                    format!("[equals] {kind}: it has no parameter `{parameter}`"),
+                    format!(
+                        "[special_case] {kind}: at these values its `force` or its states' equations are not those of `{}`; give each of its parameters a value, and name the states alike",
+                        self.kind
+                    ),
                 ));
             }
         }
         Ok(())
+    }
+
+    /// What `[equals]` and `[special_case]` say: section, kind, parameter, its value.
+    fn of_others(&self) -> impl Iterator<Item = (&'static str, &str, &str, &Expr)> {
+        let equals = self.equals.iter().map(|e| ("equals", e));
+        let special = self.special_case.iter().map(|e| ("special_case", e));
+        equals.chain(special).map(|(section, (kind, parameter, e))| (section, &**kind, &**parameter, e))
+    }
+
+    /// The kinds of which it is a special case.
+    pub fn wider(&self) -> impl Iterator<Item = &str> {
+        let mut kinds: Vec<&str> = self.special_case.iter().map(|s| &*s.0).collect();
+        kinds.dedup();
+        kinds.into_iter()
+    }
+
+    /// Whether the law of `other` is this one at the values of `[special_case]`: by numbers, at several points.
+    fn is_special_case_of(&self, other: &Mechanism) -> bool {
+        let names = |m: &Mechanism| m.states.iter().map(|s| s.name.clone()).collect::<Vec<_>>();
+        let (mine, theirs): (Vec<&Expr>, Vec<&Expr>) =
+            (self.expressions().collect(), other.expressions().collect());
+        let alike = self.on == other.on && names(self) == names(other) && mine.len() == theirs.len();
+        // Any number will do for a signal, a different one for each, of either sign.
+        let signal = |k: u8, n: &str, primes: u8| {
+            let name: f64 = n.bytes().map(f64::from).sum();
+            (1.7 * f64::from(k) + 0.9 * f64::from(primes) + name).sin()
+        };
+        let own = |n: &str| self.own.iter().position(|p| p == n).map(|i| 0.7 + 0.31 * i as f64);
+        let given = |n: &str| {
+            let (.., e) = self.special_case.iter().find(|(kind, p, _)| *kind == other.kind && p == n)?;
+            e.eval(&|n, _| own(n))
+        };
+        let agree = |k: u8, a: &Expr, b: &Expr| {
+            let a = a.eval(&|n, primes| own(n).or_else(|| Some(signal(k, n, primes))));
+            let b = b.eval(&|n, primes| {
+                if other.own.iter().any(|p| p == n) { given(n) } else { Some(signal(k, n, primes)) }
+            });
+            a.zip(b).is_some_and(|(a, b)| (a - b).abs() <= 1e-9 * (a.abs() + b.abs()))
+        };
+        alike && (0..8).all(|k| mine.iter().zip(&theirs).all(|(a, b)| agree(k, a, b)))
     }
 
     /// The law's own parameters at values of the score test (linear ones, inner ones).
@@ -882,6 +924,23 @@ impl Mechanism {
     pub fn inner(&self, name: &str) -> Option<(usize, &Inner)> {
         self.inner.iter().enumerate().find(|i| i.1.name == name)
     }
+}
+
+/// A section that gives values to the parameters of other kinds: (kind, parameter, value).
+fn of_others(
+    section: &str,
+    raw: toml::map::Map<String, toml::Value>,
+) -> Result<Vec<(String, String, Expr)>, Fault> {
+    let mut all = Vec::new();
+    for (kind, value) in raw {
+        let table: BTreeMap<String, String> = value.try_into().map_err(|e: toml::de::Error| {
+            Fault::new(section, &kind, format!("[{section}] {kind}: {}", e.message()))
+        })?;
+        for (parameter, text) in table {
+            all.push((kind.clone(), parameter, expression(&text, section, &kind)?));
+        }
+    }
+    Ok(all)
 }
 
 fn expression(text: &str, section: &str, key: &str) -> Result<Expr, Fault> {
@@ -1054,8 +1113,8 @@ pub struct Library {
 /// ```
 ///
 /// # Errors
-/// As [`Mechanism::from_toml`]; and where `refines` or `[equals]` names a kind, or `[equals]` a parameter,
-/// that no mechanism of the whole library has.
+/// As [`Mechanism::from_toml`]; and where `refines`, `doubts`, `[equals]` or `[special_case]` names a kind or a parameter
+/// that no mechanism of the whole library has, or a special case is none.
 pub fn combine(own: &[(String, String)]) -> Result<Library, MechanismError> {
     let mut files: Vec<(&str, &str, Mechanism)> = Vec::new();
     for &(file, text) in BUILT_IN {
@@ -1288,6 +1347,12 @@ mod tests {
             ("doubts = [\"coulomb\"]", 6, "`doubts` names `coulomb`, a kind that the library does not have"),
             ("[equals]\ncoulomb = { fc = \"fc\" }", 7, "[equals] names `coulomb`"),
             ("[equals]\ncoulomb_friction = { fs = \"fc\" }", 7, "it has no parameter `fs`"),
+            ("[special_case]\nbouc = { kh = \"fc\" }", 7, "[special_case] names `bouc`"),
+            (
+                "[special_case]\nstribeck_friction = { fc = \"fc\", fs = \"2*fc\", vs = \"1\" }",
+                7,
+                "not those of",
+            ),
         ] {
             let e = own("x.toml", file(rest)).unwrap_err();
             assert!(e.message.contains(part), "{e}");
