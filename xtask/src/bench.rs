@@ -9,6 +9,7 @@ mod control;
 mod page;
 mod peak;
 mod peer;
+mod scale;
 mod simulation;
 mod sparse;
 mod whole;
@@ -42,8 +43,11 @@ pub(crate) struct Arguments {
     /// Write the measurements as JSON
     #[arg(long, value_name = "FILE")]
     json: Option<PathBuf>,
-    /// Write the table of docs/src/speed.md
-    #[arg(long, requires = "peers", conflicts_with = "only")]
+    /// Instead, identify recordings of 10⁴, 10⁵ … up to so many samples, in blocks
+    #[arg(long, value_name = "SAMPLES", conflicts_with_all = ["peers", "only"])]
+    scale: Option<usize>,
+    /// Write the table of docs/src/speed.md that --peers or --scale makes
+    #[arg(long, conflicts_with = "only")]
     write_docs: bool,
 }
 
@@ -111,6 +115,12 @@ pub(crate) fn run(root: &Path, arguments: &Arguments) -> Result<Ending> {
         bail!("--seconds {} is not in 0..60", arguments.seconds);
     }
     let target = process::target(root);
+    if let Some(most) = arguments.scale {
+        return scale(root, &target, most, arguments);
+    }
+    if arguments.write_docs && !arguments.peers {
+        bail!("--write-docs needs --peers or --scale");
+    }
     let python = if arguments.peers { Some(peer::environment(root, &target)?) } else { None };
     let one = rayon::ThreadPoolBuilder::new().num_threads(1).build()?;
     let bench = Bench { root, target: &target, python: python.as_deref(), arguments, one };
@@ -130,8 +140,7 @@ pub(crate) fn run(root: &Path, arguments: &Arguments) -> Result<Ending> {
         }
     }
     if let Some(path) = &arguments.json {
-        let text = serde_json::to_string_pretty(&report)? + "\n";
-        std::fs::write(path, text).with_context(|| format!("{} cannot be written", path.display()))?;
+        write_json(path, &report)?;
     }
     if failed {
         return Ok(Ending::Missed);
@@ -144,6 +153,23 @@ pub(crate) fn run(root: &Path, arguments: &Arguments) -> Result<Ending> {
         println!("{missed} goals missed");
     }
     Ok(if missed == 0 { Ending::Done } else { Ending::Missed })
+}
+
+/// `--scale`.
+fn scale(root: &Path, target: &Path, most: usize, arguments: &Arguments) -> Result<Ending> {
+    let lengths = scale::measure(root, target, most)?;
+    if let Some(path) = &arguments.json {
+        write_json(path, &lengths)?;
+    }
+    if arguments.write_docs {
+        page::write_scale(root, &lengths)?;
+    }
+    Ok(if scale::is_met(&lengths) { Ending::Done } else { Ending::Missed })
+}
+
+fn write_json(path: &Path, value: &impl Serialize) -> Result<()> {
+    let text = serde_json::to_string_pretty(value)? + "\n";
+    std::fs::write(path, text).with_context(|| format!("{} cannot be written", path.display()))
 }
 
 struct Bench<'a> {

@@ -5,11 +5,32 @@ use std::path::{Path, PathBuf};
 use std::process::{Command, ExitStatus, Stdio};
 use std::time::{Duration, Instant};
 
-use anyhow::{Context, Result};
+use anyhow::{Context, Result, bail};
 
 /// Where cargo builds.
 pub(crate) fn target(root: &Path) -> PathBuf {
     std::env::var_os("CARGO_TARGET_DIR").map_or_else(|| root.join("target"), |d| root.join(d))
+}
+
+/// Builds `greybox` and names it.
+///
+/// # Errors
+/// When it does not build.
+pub(crate) fn build(root: &Path) -> Result<PathBuf> {
+    let cargo = std::env::var_os("CARGO").unwrap_or_else(|| "cargo".into());
+    let status = Command::new(cargo)
+        .args(["build", "--release", "--locked", "--package", "greybox-cli"])
+        .current_dir(root)
+        .status()
+        .context("cargo could not be started")?;
+    if !status.success() {
+        bail!("greybox does not build");
+    }
+    let binary = target(root).join("release").join(format!("greybox{}", std::env::consts::EXE_SUFFIX));
+    if !binary.is_file() {
+        bail!("the build left no {}", binary.display());
+    }
+    Ok(binary)
 }
 
 /// How a command ran.

@@ -128,7 +128,7 @@ pub(crate) fn run(root: &Path, arguments: &Arguments) -> Result<Ending> {
             }
         }
     }
-    let binary = build(root)?;
+    let binary = process::build(root)?;
     let mut outcomes = Vec::new();
     for case in &cases {
         eprintln!("{} …", case.name);
@@ -156,7 +156,7 @@ fn conceal(root: &Path, arguments: &Arguments) -> Result<Ending> {
         limit: Duration::from_secs(arguments.timeout),
         rival: arguments.rival,
     };
-    concealed::run(&build(root)?, &options)
+    concealed::run(&process::build(root)?, &options)
 }
 
 /// Prints the table, writes the JSON, and judges.
@@ -180,24 +180,6 @@ fn select(cases: Vec<Case>, only: Option<&str>) -> Result<Vec<Case>> {
         bail!("no case is called `{wanted}`; there are {}", names.join(", "));
     }
     Ok(chosen)
-}
-
-fn build(root: &Path) -> Result<PathBuf> {
-    let cargo = std::env::var_os("CARGO").unwrap_or_else(|| "cargo".into());
-    let status = Command::new(cargo)
-        .args(["build", "--release", "--locked", "--package", "greybox-cli"])
-        .current_dir(root)
-        .status()
-        .context("cargo could not be started")?;
-    if !status.success() {
-        bail!("greybox does not build");
-    }
-    let binary =
-        process::target(root).join("release").join(format!("greybox{}", std::env::consts::EXE_SUFFIX));
-    if !binary.is_file() {
-        bail!("the build left no {}", binary.display());
-    }
-    Ok(binary)
 }
 
 /// Runs one case; a run that fails is a figure like any other.

@@ -25,6 +25,7 @@ use std::path::{Path, PathBuf};
 
 use anyhow::{Context, Result};
 
+pub(crate) use self::figure::{Axis, Plot, Series, Style};
 pub(crate) use self::optimal::F16;
 use crate::Ending;
 use fixture::Fixture;

@@ -122,6 +122,13 @@ impl Setup {
         Ok(Setup { model, system, hats, free, carried: Vec::new(), ..self.clone() })
     }
 
+    /// The same model, integrated in the same way, with other recordings of its channels.
+    pub fn with_data(&self, data: Arc<Data>) -> Setup {
+        let hats = Arc::new(Hats::new(&self.model, &data));
+        let environments = Arc::new(data.environments(&self.holds));
+        Setup { data, hats, environments, noise: None, ..self.clone() }
+    }
+
     /// The same with the states of these names (all entries of their chains) carried from segment to
     /// segment instead of free in each: the memory of a mechanism, which no sensor sees.
     ///

@@ -6,7 +6,7 @@ use std::path::{Path, PathBuf};
 
 use greybox_diagnose::library::{self, Library};
 use greybox_model::{Model, Problem};
-use greybox_recording::{Recording, read_csv};
+use greybox_recording::{CsvBlocks, Recording, RecordingError, read_csv};
 
 use crate::failure::Failure;
 use crate::output::same_file;
@@ -118,32 +118,56 @@ fn file_name(path: &Path) -> String {
 /// # Errors
 /// Bad input: a file that is missing, a model or a folder in its place, one named twice, or any fault in it.
 pub(crate) fn recordings(paths: &[PathBuf]) -> Result<Vec<Recording>, Failure> {
+    no_twins(paths)?;
     let mut read = Vec::with_capacity(paths.len());
-    for (i, path) in paths.iter().enumerate() {
-        if let Some(twin) = paths[..i].iter().find(|twin| *twin == path || same_file(twin, path)) {
-            return Err(Failure::file(
-                path,
-                format!("this recording is named twice (also as {})", twin.display()),
-            )
-            .mend("name each recording once, either for training or after `--holdout`"));
-        }
-        let mut recording = match read_csv(path) {
-            Ok(recording) => recording,
-            Err(_) if path.is_file() && looks_like_model(path) => {
-                return Err(Failure::file(
-                    path,
-                    "this is a model (TOML), but a recording (CSV) is needed here",
-                )
-                .mend("name the model once, before the recordings"));
-            }
-            Err(error) => return Err(error.into()),
-        };
+    for path in paths {
+        let mut recording = read_csv(path).map_err(|error| unreadable(path, error))?;
         if paths.iter().any(|other| other != path && file_name(other) == recording.name) {
             recording.name = path.display().to_string();
         }
         read.push(recording);
     }
     Ok(read)
+}
+
+/// An error where a recording is named twice.
+///
+/// # Errors
+/// Bad input: the second of the two.
+pub(crate) fn no_twins<'a>(paths: impl IntoIterator<Item = &'a PathBuf>) -> Result<(), Failure> {
+    let mut seen: Vec<&PathBuf> = Vec::new();
+    for path in paths {
+        if let Some(twin) = seen.iter().find(|twin| **twin == path || same_file(twin, path)) {
+            return Err(Failure::file(
+                path,
+                format!("this recording is named twice (also as {})", twin.display()),
+            )
+            .mend("name each recording once, either for training or after `--holdout`"));
+        }
+        seen.push(path);
+    }
+    Ok(())
+}
+
+fn unreadable(path: &Path, error: RecordingError) -> Failure {
+    if path.is_file() && looks_like_model(path) {
+        return Failure::file(path, "this is a model (TOML), but a recording (CSV) is needed here")
+            .mend("name the model once, before the recordings");
+    }
+    error.into()
+}
+
+/// The recordings at `paths` one after the other, in blocks of `rows` rows.
+///
+/// # Errors
+/// As [`recordings`]; what is wrong with a block comes in its place.
+pub(crate) fn blocks(
+    paths: &[PathBuf],
+    rows: usize,
+) -> Result<impl Iterator<Item = Result<Recording, Failure>>, Failure> {
+    let open = |path: &PathBuf| CsvBlocks::open(path, rows).map_err(|error| unreadable(path, error));
+    let files = paths.iter().map(open).collect::<Result<Vec<_>, _>>()?;
+    Ok(files.into_iter().flatten().map(|block| block.map_err(Failure::from)))
 }
 
 /// Reads the recordings for training and those held out, and sees that no recording is both.

@@ -92,6 +92,17 @@ pub enum IdentifyError {
         "no equation of this library follows the recordings: every fit diverged; try another library or a lower order"
     )]
     NoFit,
+    /// A delayed feedback and recordings read in blocks.
+    #[error(
+        "a delayed feedback is not looked for in blocks, whose starts do not know the past; read whole recordings"
+    )]
+    DelayInBlocks,
+    /// No block was given.
+    #[error("there is no block to identify anything from")]
+    NoBlocks,
+    /// Statistics made around different models.
+    #[error("statistics of blocks were made around different models: map all blocks around the same one")]
+    Mixed,
     /// The recordings do not fit the model that the request describes.
     #[error(transparent)]
     Data(#[from] DataError),

@@ -162,8 +162,25 @@ pub enum HoldoutSource {
     Given,
     /// The last fifth of each training recording.
     LastFifth,
+    /// The last block of recordings that were read in blocks.
+    LastBlock,
     /// None: the recordings are too short to cut.
     None,
+}
+
+/// Recordings that were read in blocks.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub struct Blocks {
+    /// Blocks that the equations were fitted to.
+    pub blocks: usize,
+    /// Their samples.
+    pub samples: usize,
+    /// Samples of blocks that could not be followed (the model diverges on them, or a channel is missing).
+    pub lost: usize,
+    /// Passes over the recordings.
+    pub passes: usize,
+    /// Whether the last pass moved no coefficient by more than a tenth of its interval's half-width.
+    pub settled: bool,
 }
 
 /// The identified equations.
@@ -193,6 +210,8 @@ pub struct Identification {
     pub rounds: usize,
     /// Number of shooting segments of the last fit; one per piece: an output-error fit of whole records.
     pub segments: usize,
+    /// How the recordings were read, where in blocks.
+    pub blocks: Option<Blocks>,
     /// Seed.
     pub seed: u64,
 }
@@ -219,12 +238,34 @@ pub fn identify(
     observer: &dyn Observer,
 ) -> Result<Identification, IdentifyError> {
     let (fit_on, held, source) = split(train, holdout);
-    let structure = structure(&fit_on, options)?;
+    let found = search(&fit_on, options, observer)?;
+    observer.stage("precision");
+    let Search { structure, data, first, refined } = &found;
+    let precision = precision::assess(structure, refined, &first.allowed, options);
+    conclude(structure, data, refined, &precision, first, &held, source, options)
+}
+
+/// What the two estimates came to.
+#[derive(Debug, Clone)]
+pub(crate) struct Search {
+    pub structure: Structure,
+    pub data: Arc<Data>,
+    pub first: First,
+    pub refined: Refined,
+}
+
+/// The weak form, then the output error.
+pub(crate) fn search(
+    fit_on: &[Recording],
+    options: &Options,
+    observer: &dyn Observer,
+) -> Result<Search, IdentifyError> {
+    let structure = structure(fit_on, options)?;
     let all = vec![true; structure.terms.len()];
     let ones: Vec<f64> = structure.terms.iter().map(|t| if t.optional { 0.0 } else { 1.0 }).collect();
     let extras: Vec<f64> = structure.extras.iter().flat_map(|e| &e.parameters).map(|p| p.1).collect();
     let whole = structure.model(&all, &ones, &extras)?;
-    let data = Arc::new(Data::new(&whole, &fit_on)?);
+    let data = Arc::new(Data::new(&whole, fit_on)?);
     let samples: usize = data.pieces.iter().map(|p| p.len).sum();
     if structure.terms.len() * 4 > samples {
         return Err(IdentifyError::TooManyTerms { candidates: structure.terms.len(), samples });
@@ -243,10 +284,7 @@ pub fn identify(
         Some(_) => (structure, refined),
         None => better_hold(structure, refined),
     };
-
-    observer.stage("precision");
-    let precision = precision::assess(&structure, &refined, &first.allowed, options);
-    conclude(&structure, &data, &refined, &precision, &first, &held, source, options)
+    Ok(Search { structure, data, first, refined })
 }
 
 fn split(train: &[Recording], holdout: &[Recording]) -> (Vec<Recording>, Vec<Recording>, HoldoutSource) {
@@ -383,6 +421,7 @@ fn check_term(term: &str, options: &Options) -> Result<(), IdentifyError> {
 }
 
 /// What the weak form says.
+#[derive(Debug, Clone)]
 pub(crate) struct First {
     /// Starting points, one per window length.
     pub starts: Vec<State>,
@@ -574,7 +613,7 @@ fn better_hold(structure: Structure, refined: Refined) -> (Structure, Refined) {
     }
 }
 
-fn conclude(
+pub(crate) fn conclude(
     structure: &Structure,
     data: &Arc<Data>,
     refined: &Refined,
@@ -678,6 +717,7 @@ fn conclude(
         misfit: refined.scale.iter().zip(&data.sigma).map(|(r, s)| r / s).collect(),
         rounds: refined.rounds,
         segments: refined.level.segments.len(),
+        blocks: None,
         seed: options.seed,
         model,
         train,

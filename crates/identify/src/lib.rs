@@ -1,17 +1,20 @@
 #![doc = include_str!("../README.md")]
 
 mod choose;
+mod correlation;
 mod error;
 mod identify;
 mod library;
 mod output_error;
 mod precision;
+mod stream;
 mod structure;
 mod weak;
 
 pub use error::IdentifyError;
 pub use identify::{
-    DelayedState, DoubtfulTerm, FoundDelay, FoundEquation, FoundTerm, HoldoutSource, Identification,
+    Blocks, DelayedState, DoubtfulTerm, FoundDelay, FoundEquation, FoundTerm, HoldoutSource, Identification,
     Observer, Options, OrderChoice, Quiet, Role, identify,
 };
 pub use library::{Library, Monomials};
+pub use stream::{Linearisation, Statistics, Streamed, identify_blocks};

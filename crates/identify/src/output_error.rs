@@ -9,10 +9,11 @@
 
 use std::sync::Arc;
 
-use greybox_calibrate::{Data, Fit, Free, Level, Limits, Point, SegmentRows, Setup, qr};
+use greybox_calibrate::{Data, Fit, Free, Level, Limits, Point, Segment, SegmentRows, Setup, qr};
 use rayon::prelude::*;
 
 use crate::choose::{Reduced, Roles};
+use crate::correlation::{LONGEST, Lagged};
 use crate::structure::Structure;
 
 /// Misfit, relative to a channel's spread, that counts as numerical: integration, rounding in the file.
@@ -46,7 +47,12 @@ pub(crate) struct Refined {
     pub rounds: usize,
 }
 
-fn setup(structure: &Structure, data: &Arc<Data>, state: &State, base: Option<&Setup>) -> Option<Setup> {
+pub(crate) fn setup(
+    structure: &Structure,
+    data: &Arc<Data>,
+    state: &State,
+    base: Option<&Setup>,
+) -> Option<Setup> {
     let model = structure.model(&state.active, &state.values, &state.extras).ok()?;
     let free = model
         .parameters
@@ -152,10 +158,102 @@ fn cholesky(a: &[f64], n: usize) -> Vec<f64> {
 }
 
 /// One segment with what its start can absorb projected off.
-struct Projected {
-    rows: usize,
-    j: Vec<f64>,
-    z: Vec<f64>,
+pub(crate) struct Projected {
+    /// Samples times channels.
+    pub rows: usize,
+    /// Sensitivities to the coefficients, a column each.
+    pub j: Vec<f64>,
+    /// Residual plus J θ₀.
+    pub z: Vec<f64>,
+}
+
+/// The segments of a model, wide: with all candidates that it may have.
+pub(crate) struct Wide {
+    /// The model with all of them.
+    pub setup: Setup,
+    /// Coefficients around which it is linearised.
+    pub theta: Vec<f64>,
+    /// Its segments.
+    pub segments: Vec<Projected>,
+}
+
+impl Wide {
+    /// Column of each candidate (none: it has no coefficient, or is not allowed).
+    pub(crate) fn columns(&self, structure: &Structure, wanted: &[bool]) -> Vec<Option<usize>> {
+        let free = &self.setup.free;
+        let of = |name: &str| {
+            self.setup.model.parameter(name).and_then(|i| free.iter().position(|f| f.index == i))
+        };
+        let wanted = structure.terms.iter().zip(wanted);
+        wanted.map(|(t, wanted)| if *wanted { of(&t.parameter) } else { None }).collect()
+    }
+}
+
+/// Both, term by term.
+pub(crate) fn either(active: &[bool], allowed: &[bool]) -> Vec<bool> {
+    active.iter().zip(allowed).map(|(a, b)| *a || *b).collect()
+}
+
+/// The sensitivities of `refined` to all candidates in `allowed`, and what they are held against.
+pub(crate) fn widen(structure: &Structure, refined: &Refined, allowed: &[bool]) -> Option<Wide> {
+    let active = either(&refined.state.active, allowed);
+    let wide = setup(
+        structure,
+        &refined.setup.data,
+        &State { active, ..refined.state.clone() },
+        Some(&refined.setup),
+    )?;
+    let point = Point { parameters: wide.values(), starts: refined.fit.point.starts.clone() };
+    let rows = wide.with_problem(&refined.level, &refined.scale, |p| p.rows(&point, true, None));
+    let theta: Vec<f64> = wide.free.iter().map(|f| point.parameters[f.index]).collect();
+    let segments: Vec<Projected> = rows
+        .into_par_iter()
+        .map(|s| {
+            let SegmentRows { rows, jx, jp, r: mut z, .. } = s;
+            let (q, j) = project_start(rows, jx, jp);
+            qr::project_off(&q, rows, &mut z);
+            for (column, theta) in j.chunks_exact(rows).zip(&theta) {
+                z.iter_mut().zip(column).for_each(|(z, v)| *z += theta * v);
+            }
+            Projected { rows, j, z }
+        })
+        .collect();
+    let finite = segments.iter().all(|s| s.z.iter().chain(&s.j).all(|v| v.is_finite()));
+    finite.then_some(Wide { setup: wide, theta, segments })
+}
+
+/// The triangle of [J | z] over segments of `stride − 1` coefficients.
+pub(crate) fn triangle_of(segments: &[Projected], stride: usize) -> Vec<f64> {
+    let triangles: Vec<Vec<f64>> = segments
+        .par_iter()
+        .map(|s| {
+            let mut a = Vec::with_capacity(stride * s.rows);
+            a.extend_from_slice(&s.j);
+            a.extend_from_slice(&s.z);
+            qr::triangle(&mut a, s.rows, stride)
+        })
+        .collect();
+    stack(&triangles, stride)
+}
+
+/// The triangle of all rows behind several triangles.
+pub(crate) fn stack(triangles: &[Vec<f64>], stride: usize) -> Vec<f64> {
+    let m = triangles.len() * stride;
+    let mut a = vec![0.0; m * stride];
+    for (s, t) in triangles.iter().enumerate() {
+        for i in 0..stride {
+            for j in i..stride {
+                a[j * m + s * stride + i] = t[i * stride + j];
+            }
+        }
+    }
+    qr::triangle(&mut a, m, stride)
+}
+
+/// Mean square of whitened rows below which a misfit is numerical.
+pub(crate) fn floor(spread: &[f64], scale: &[f64]) -> f64 {
+    let squares = spread.iter().zip(scale).map(|(spread, scale)| (NUMERICAL * spread / scale).powi(2));
+    squares.sum::<f64>() / spread.len() as f64
 }
 
 /// An orthonormal basis of what a segment's start can absorb, from `jx` in place, and `jp` with it projected
@@ -176,82 +274,31 @@ pub(crate) fn linearise(
     allowed: &[bool],
     blocks: usize,
 ) -> Option<Linearised> {
-    let active = refined.state.active.iter().zip(allowed).map(|(a, b)| *a || *b).collect();
-    let wide = setup(
-        structure,
-        &refined.setup.data,
-        &State { active, ..refined.state.clone() },
-        Some(&refined.setup),
-    )?;
-    let point = Point { parameters: wide.values(), starts: refined.fit.point.starts.clone() };
-    let rows = wide.with_problem(&refined.level, &refined.scale, |p| p.rows(&point, true, None));
-    let np = wide.free.len();
-    let theta: Vec<f64> = wide.free.iter().map(|f| point.parameters[f.index]).collect();
-    let projected: Vec<Projected> = rows
-        .into_par_iter()
-        .map(|s| {
-            let SegmentRows { rows, jx, jp, r: mut z, .. } = s;
-            let (q, j) = project_start(rows, jx, jp);
-            qr::project_off(&q, rows, &mut z);
-            for (column, theta) in j.chunks_exact(rows).zip(&theta) {
-                z.iter_mut().zip(column).for_each(|(z, v)| *z += theta * v);
-            }
-            Projected { rows, j, z }
-        })
-        .collect();
-    if projected.iter().any(|s| s.z.iter().chain(&s.j).any(|v| !v.is_finite())) {
-        return None;
-    }
-    let stride = np + 1;
-    let triangles: Vec<Vec<f64>> = projected
-        .par_iter()
-        .map(|s| {
-            let mut a = Vec::with_capacity(stride * s.rows);
-            a.extend_from_slice(&s.j);
-            a.extend_from_slice(&s.z);
-            qr::triangle(&mut a, s.rows, stride)
-        })
-        .collect();
-    let m = triangles.len() * stride;
-    let mut a = vec![0.0; m * stride];
-    for (s, t) in triangles.iter().enumerate() {
-        for i in 0..stride {
-            for j in i..stride {
-                a[j * m + s * stride + i] = t[i * stride + j];
-            }
-        }
-    }
-    let t = qr::triangle(&mut a, m, stride);
-    let of =
-        |name: &str| wide.model.parameter(name).and_then(|i| wide.free.iter().position(|f| f.index == i));
-    let column = structure
-        .terms
-        .iter()
-        .enumerate()
-        .map(|(i, t)| if allowed[i] || refined.state.active[i] { of(&t.parameter) } else { None })
-        .collect();
+    let wide = widen(structure, refined, allowed)?;
+    let np = wide.theta.len();
+    let t = triangle_of(&wide.segments, np + 1);
+    let column = wide.columns(structure, &either(&refined.state.active, allowed));
     let count: usize = refined.fit.count.iter().sum();
-    let data = &refined.setup.data;
-    let floor = data
-        .spread
-        .iter()
-        .zip(&refined.scale)
-        .map(|(spread, scale)| (NUMERICAL * spread / scale).powi(2))
-        .sum::<f64>()
-        / data.spread.len() as f64;
+    let floor = floor(&refined.setup.data.spread, &refined.scale);
+    let projected = &wide.segments;
     let reduced = Reduced::from_triangle(&t, np, count as f64, floor);
     // Correlated residuals: as many rows as are independent.
     let all: Vec<usize> = (0..np).collect();
     let best = reduced.solve(&all).values;
-    let share = 1.0 / correlation_time(&projected, &best, refined, wide.system.ny);
+    let share = 1.0 / correlation_time(projected, &best, refined, wide.setup.system.ny);
     let reduced = reduced.weighted(share);
-    let blocks = if blocks > 0 { block_grams(&projected, np, share, blocks) } else { Vec::new() };
+    let blocks = if blocks > 0 { block_grams(projected, np, share, blocks) } else { Vec::new() };
     Some(Linearised { reduced, column, blocks })
 }
 
-/// 1 + 2 Σ ρ of the residual with all candidates, summed over lags while ρ is beyond chance.
+/// Correlation time of the residual with coefficients `theta`, the longest of the channels.
 fn correlation_time(projected: &[Projected], theta: &[f64], refined: &Refined, ny: usize) -> f64 {
-    const LONGEST: usize = 400;
+    let lagged = lagged(projected, theta, &refined.level.segments, ny);
+    lagged.iter().map(Lagged::time).fold(1.0, f64::max)
+}
+
+/// Lagged products of the residual with coefficients `theta`, channel by channel.
+pub(crate) fn lagged(projected: &[Projected], theta: &[f64], segments: &[Segment], ny: usize) -> Vec<Lagged> {
     let residuals: Vec<Vec<f64>> = projected
         .par_iter()
         .map(|s| {
@@ -262,31 +309,14 @@ fn correlation_time(projected: &[Projected], theta: &[f64], refined: &Refined, n
             e
         })
         .collect();
-    (0..ny)
-        .map(|c| {
-            let sum = |lag: usize| -> (f64, usize) {
-                residuals.iter().zip(&refined.level.segments).fold((0.0, 0), |(sum, n), (e, segment)| {
-                    let m = segment.range.len();
-                    let e = &e[c * m..(c + 1) * m];
-                    if lag < m { (sum + qr::dot(&e[lag..], &e[..m - lag]), n + m - lag) } else { (sum, n) }
-                })
-            };
-            let (zero, n) = sum(0);
-            if zero <= 0.0 {
-                return 1.0;
-            }
-            let chance = 2.5 / (n as f64).sqrt();
-            let mut time = 1.0;
-            for lag in 1..LONGEST {
-                let rho = sum(lag).0 / zero;
-                if rho < chance {
-                    break;
-                }
-                time += 2.0 * rho;
-            }
-            time
-        })
-        .fold(1.0, f64::max)
+    let of_channel = |c: usize| {
+        let stretches = residuals.iter().zip(segments).map(move |(e, segment)| {
+            let m = segment.range.len();
+            &e[c * m..(c + 1) * m]
+        });
+        Lagged::of(stretches, LONGEST)
+    };
+    (0..ny).map(of_channel).collect()
 }
 
 fn block_grams(projected: &[Projected], np: usize, share: f64, blocks: usize) -> Vec<Vec<f64>> {

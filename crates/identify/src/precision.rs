@@ -5,8 +5,9 @@ use rand::RngExt;
 use rand_pcg::Pcg64Mcg;
 use rayon::prelude::*;
 
+use crate::correlation::Lagged;
 use crate::identify::Options;
-use crate::output_error::{self, Refined};
+use crate::output_error::{self, Linearised, Refined};
 use crate::structure::Structure;
 
 /// Standard errors and inclusion probabilities.
@@ -42,7 +43,7 @@ impl Precision {
 }
 
 /// Blocks of the sandwich and of the bootstrap.
-const BLOCKS: usize = 60;
+pub(crate) const BLOCKS: usize = 60;
 
 /// Covariances at the fit, and the bootstrap of the choice.
 pub(crate) fn assess(
@@ -73,34 +74,22 @@ pub(crate) fn assess(
         at += m;
     }
     let triangle = qr::triangle(&mut stacked, total, np);
-    let inverse = qr::invert_triangle(&triangle, np);
     let starts: usize = rows.len() * setup.system.nx;
     let count: usize = refined.fit.count.iter().sum();
     let freedom = (count as f64 - np as f64 - starts as f64).max(1.0);
     let rss: f64 = projected.iter().map(|p| qr::dot(p.1, p.1)).sum();
-    // Integration is right to about 10⁻⁶ of the signal; such errors repeat from sample to sample, so that they do
-    // not average out over rows.
-    let numerical = refined
-        .scale
-        .iter()
-        .zip(&setup.data.spread)
-        .map(|(scale, spread)| (1e-6 * spread / scale).powi(2))
-        .fold(0.0, f64::max);
-    let variance = rss / freedom + numerical * count as f64;
-    let covariance = |i: usize, j: usize| -> f64 {
-        variance * (0..np).map(|k| inverse[i * np + k] * inverse[j * np + k]).sum::<f64>()
+    let numerical = numerical(&setup.data.spread, &refined.scale);
+    let white = |c: usize| {
+        let stretches = rows.iter().zip(&refined.level.segments).map(|(s, segment)| {
+            let m = segment.range.len();
+            &s.r[c * m..(c + 1) * m]
+        });
+        Lagged::of(stretches, 20).is_white()
     };
-    let gauss: Vec<f64> = (0..np).map(|i| covariance(i, i).sqrt()).collect();
-    let correlated = (0..setup.system.ny).any(|c| !white(&rows, &refined.level, c));
-    let width = if correlated {
-        sandwich(&projected, &inverse, np)
-            .iter()
-            .zip(&gauss)
-            .map(|(s, g)| quantile(BLOCKS as f64 - 1.0) * s.max(*g))
-            .collect()
-    } else {
-        gauss.iter().map(|g| quantile(freedom) * g).collect::<Vec<f64>>()
-    };
+    let correlated = !(0..setup.system.ny).all(white);
+    let gradients = if correlated { gradients(&projected, np) } else { Vec::new() };
+    let spread = Spread::new(&triangle, np, rss / freedom + numerical * count as f64, freedom, &gradients);
+    let gauss: Vec<f64> = (0..np).map(|i| spread.covariance(i, i).sqrt()).collect();
     let position =
         |name: &str| setup.model.parameter(name).and_then(|i| setup.free.iter().position(|f| f.index == i));
     let of_terms = |values: &[f64]| -> Vec<Option<f64>> {
@@ -111,19 +100,20 @@ pub(crate) fn assess(
             .map(|(t, active)| if *active { position(&t.parameter).map(|i| values[i]) } else { None })
             .collect()
     };
+    let width = &spread.half;
     let extras: Vec<Option<usize>> =
         structure.extras.iter().flat_map(|e| &e.parameters).map(|p| position(&p.0)).collect();
     let of_extras = |values: &[f64]| extras.iter().map(|i| i.map(|i| values[i])).collect();
     let extra_correlation = match extras.as_slice() {
-        [Some(a), Some(b), ..] => Some(covariance(*a, *b) / (gauss[*a] * gauss[*b])),
+        [Some(a), Some(b), ..] => Some(spread.covariance(*a, *b) / (gauss[*a] * gauss[*b])),
         _ => None,
     };
     Precision {
-        half: of_terms(&width),
-        extra_half: of_extras(&width),
+        half: of_terms(width),
+        extra_half: of_extras(width),
         extra_bound: of_extras(&gauss),
         extra_correlation,
-        inclusion: inclusion(structure, refined, allowed, options),
+        inclusion: resampling(structure, refined, allowed, options),
     }
 }
 
@@ -132,46 +122,9 @@ fn quantile(freedom: f64) -> f64 {
     StudentsT::new(0.0, 1.0, freedom.max(1.0)).map_or(1.96, |t| t.inverse_cdf(0.975))
 }
 
-/// Whether a channel's residual is white: Ljung–Box over twenty lags at the 0.1 % level.
-fn white(rows: &[greybox_calibrate::SegmentRows], level: &greybox_calibrate::Level, channel: usize) -> bool {
-    const LAGS: usize = 20;
-    let (mut zero, mut n) = (0.0, 0usize);
-    let mut lagged = [0.0; LAGS];
-    for (s, segment) in rows.iter().zip(&level.segments) {
-        let m = segment.range.len();
-        let r = &s.r[channel * m..(channel + 1) * m];
-        zero += qr::dot(r, r);
-        n += m;
-        for (l, sum) in lagged.iter_mut().enumerate() {
-            if l + 1 < m {
-                *sum += qr::dot(&r[l + 1..], &r[..m - l - 1]);
-            }
-        }
-    }
-    let n = n as f64;
-    let q: f64 = lagged
-        .iter()
-        .enumerate()
-        .map(|(l, c)| (c / zero).powi(2) / (n - l as f64 - 1.0).max(1.0))
-        .sum::<f64>()
-        * n
-        * (n + 2.0);
-    // Upper 0.1 % point of χ² with twenty degrees of freedom.
-    q < 45.315
-}
-
 /// Standard deviations by the cluster-robust sandwich (RᵀR)⁻¹ Σ g gᵀ (RᵀR)⁻¹, g the gradients summed over
 /// blocks of consecutive rows.
-fn sandwich(projected: &[(Vec<f64>, &[f64], usize)], inverse: &[f64], np: usize) -> Vec<f64> {
-    let total: usize = projected.iter().map(|p| p.2).sum();
-    let length = total.div_ceil(BLOCKS).max(1);
-    let mut gradients: Vec<Vec<f64>> = Vec::new();
-    for (j, r, m) in projected {
-        for from in (0..*m).step_by(length) {
-            let to = (from + length).min(*m);
-            gradients.push((0..np).map(|c| qr::dot(&j[c * m + from..c * m + to], &r[from..to])).collect());
-        }
-    }
+fn sandwich(gradients: &[Vec<f64>], inverse: &[f64], np: usize) -> Vec<f64> {
     let blocks = gradients.len() as f64;
     let correction = (blocks / (blocks - 1.0).max(1.0)).sqrt();
     (0..np)
@@ -184,13 +137,82 @@ fn sandwich(projected: &[(Vec<f64>, &[f64], usize)], inverse: &[f64], np: usize)
         .collect()
 }
 
-/// Share of block-bootstrap replicates of the linearised problem that choose each candidate.
-fn inclusion(structure: &Structure, refined: &Refined, allowed: &[bool], options: &Options) -> Vec<f64> {
-    let none = Vec::new();
-    if options.replicates == 0 {
-        return none;
+/// Gradients Jᵀr over blocks of consecutive rows.
+fn gradients(projected: &[(Vec<f64>, &[f64], usize)], np: usize) -> Vec<Vec<f64>> {
+    let total: usize = projected.iter().map(|p| p.2).sum();
+    let length = total.div_ceil(BLOCKS).max(1);
+    let mut gradients: Vec<Vec<f64>> = Vec::new();
+    for (j, r, m) in projected {
+        for from in (0..*m).step_by(length) {
+            let to = (from + length).min(*m);
+            gradients.push((0..np).map(|c| qr::dot(&j[c * m + from..c * m + to], &r[from..to])).collect());
+        }
     }
-    let Some(linear) = output_error::linearise(structure, refined, allowed, BLOCKS) else { return none };
+    gradients
+}
+
+/// Mean square of whitened rows that integration may add: it is right to about 10⁻⁶ of the signal, and such errors
+/// repeat from sample to sample, so that they do not average out over rows.
+pub(crate) fn numerical(spread: &[f64], scale: &[f64]) -> f64 {
+    spread.iter().zip(scale).map(|(spread, scale)| (1e-6 * spread / scale).powi(2)).fold(0.0, f64::max)
+}
+
+/// How far estimates may be off.
+pub(crate) struct Spread {
+    inverse: Vec<f64>,
+    variance: f64,
+    /// Half-widths of the 95 % intervals.
+    pub half: Vec<f64>,
+}
+
+impl Spread {
+    /// From the triangle of the sensitivities and the variance of the rows; where these are correlated, with the
+    /// gradients of blocks.
+    pub(crate) fn new(
+        triangle: &[f64],
+        np: usize,
+        variance: f64,
+        freedom: f64,
+        gradients: &[Vec<f64>],
+    ) -> Spread {
+        let mut spread = Spread { inverse: qr::invert_triangle(triangle, np), variance, half: Vec::new() };
+        let gauss = (0..np).map(|i| spread.covariance(i, i).sqrt());
+        spread.half = if gradients.is_empty() {
+            gauss.map(|g| quantile(freedom) * g).collect()
+        } else {
+            let robust = sandwich(gradients, &spread.inverse, np);
+            gauss.zip(robust).map(|(g, s)| quantile(BLOCKS as f64 - 1.0) * s.max(g)).collect()
+        };
+        spread
+    }
+
+    /// variance · (RᵀR)⁻¹.
+    fn covariance(&self, i: usize, j: usize) -> f64 {
+        let np = self.inverse.len().isqrt();
+        let row = |i: usize| &self.inverse[i * np..(i + 1) * np];
+        self.variance * row(i).iter().zip(row(j)).map(|(a, b)| a * b).sum::<f64>()
+    }
+}
+
+/// [`inclusion`] of a fit in memory.
+fn resampling(structure: &Structure, refined: &Refined, allowed: &[bool], options: &Options) -> Vec<f64> {
+    if options.replicates == 0 {
+        return Vec::new();
+    }
+    let linear = output_error::linearise(structure, refined, allowed, BLOCKS);
+    linear.map_or_else(Vec::new, |linear| inclusion(structure, &linear, allowed, options))
+}
+
+/// Share of block-bootstrap replicates of the linearised problem that choose each candidate.
+pub(crate) fn inclusion(
+    structure: &Structure,
+    linear: &Linearised,
+    allowed: &[bool],
+    options: &Options,
+) -> Vec<f64> {
+    if options.replicates == 0 {
+        return Vec::new();
+    }
     let roles = linear.roles(structure, allowed);
     let counts: Vec<Vec<usize>> = (0..options.replicates as u64)
         .into_par_iter()

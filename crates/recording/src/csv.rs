@@ -9,7 +9,7 @@ use crate::error::{Place, RecordingError};
 use crate::recording::{Channel, Recording};
 use ::csv::{ByteRecord, ReaderBuilder, WriterBuilder};
 use std::fs;
-use std::io::{ErrorKind, Read, Write};
+use std::io::{BufRead, BufReader, ErrorKind, Read, Write};
 use std::path::Path;
 
 /// Reads the recording in the file at `path`.
@@ -18,17 +18,154 @@ use std::path::Path;
 /// Any [`RecordingError`]; its place names the file as given, the line and the column.
 pub fn read_csv(path: impl AsRef<Path>) -> Result<Recording, RecordingError> {
     let path = path.as_ref();
+    let (label, name) = check_file(path)?;
+    let bytes = fs::read(path).map_err(|source| unread(&label, source))?;
+    parse(&bytes, &label, &name, 0)
+}
+
+/// What errors call the file at `path`, and its name; an error where there is no file.
+fn check_file(path: &Path) -> Result<(String, String), RecordingError> {
     let label = path.display().to_string();
-    let failed = |source: std::io::Error| match source.kind() {
-        ErrorKind::NotFound => RecordingError::NotFound { place: Place::file(&label) },
-        _ => RecordingError::Io { place: Place::file(&label), action: "read", source },
-    };
-    if fs::metadata(path).map_err(failed)?.is_dir() {
+    if fs::metadata(path).map_err(|source| unread(&label, source))?.is_dir() {
         return Err(RecordingError::IsDirectory { place: Place::file(&label) });
     }
-    let bytes = fs::read(path).map_err(failed)?;
     let name = path.file_name().map_or_else(|| label.clone(), |name| name.to_string_lossy().into_owned());
-    parse(&bytes, &label, &name)
+    Ok((label, name))
+}
+
+fn unread(label: &str, source: std::io::Error) -> RecordingError {
+    match source.kind() {
+        ErrorKind::NotFound => RecordingError::NotFound { place: Place::file(label) },
+        _ => RecordingError::Io { place: Place::file(label), action: "read", source },
+    }
+}
+
+/// A CSV file read block by block, for recordings larger than memory: an iterator of recordings of about `rows` rows,
+/// each with the file's header. What is left at the end and shorter than half a block goes to the last one.
+///
+/// The file is what [`read_csv`] reads, but for line breaks within quoted cells. A gap between two blocks does not
+/// matter, since each is a recording of its own.
+///
+/// ```
+/// use greybox_recording::{CsvBlocks, write_csv_file};
+/// let path = std::env::temp_dir().join(format!("blocks_{}.csv", std::process::id()));
+/// let time: Vec<f64> = (0..250).map(|k| 0.01 * f64::from(k)).collect();
+/// write_csv_file(&path, &time, &[("x [m]", &time)])?;
+/// let lengths: Vec<usize> = CsvBlocks::open(&path, 100)?
+///     .map(|block| Ok(block?.time.len()))
+///     .collect::<Result<_, greybox_recording::RecordingError>>()?;
+/// assert_eq!(lengths, [100, 100, 50]);
+/// # std::fs::remove_file(path).ok();
+/// # Ok::<(), greybox_recording::RecordingError>(())
+/// ```
+#[derive(Debug)]
+pub struct CsvBlocks {
+    reader: BufReader<fs::File>,
+    label: String,
+    name: String,
+    rows: usize,
+    /// The file up to the end of its header, and its lines.
+    header: Vec<u8>,
+    header_lines: u64,
+    /// Rows of the next block, their number and the lines of the file before them.
+    next: Vec<u8>,
+    next_rows: usize,
+    before: u64,
+    /// Last time of the block before, s.
+    last: Option<f64>,
+    over: bool,
+}
+
+impl CsvBlocks {
+    /// Opens the file at `path`; blocks have at least 8 rows.
+    ///
+    /// # Errors
+    /// [`RecordingError`] where the file cannot be read or is empty. Faults of header and rows come with their block.
+    pub fn open(path: impl AsRef<Path>, rows: usize) -> Result<Self, RecordingError> {
+        let path = path.as_ref();
+        let (label, name) = check_file(path)?;
+        let file = fs::File::open(path).map_err(|source| unread(&label, source))?;
+        let mut blocks = Self {
+            reader: BufReader::with_capacity(1 << 20, file),
+            label,
+            name,
+            rows: rows.max(crate::recording::MIN_SAMPLES),
+            header: Vec::new(),
+            header_lines: 0,
+            next: Vec::new(),
+            next_rows: 0,
+            before: 0,
+            last: None,
+            over: false,
+        };
+        let mut line = Vec::new();
+        while blocks.line(&mut line)? {
+            blocks.header_lines += 1;
+            blocks.header.append(&mut line);
+            if !blocks.header.trim_ascii().is_empty() {
+                break;
+            }
+        }
+        if blocks.header.trim_ascii().is_empty() {
+            return Err(RecordingError::Empty { place: Place::file(&blocks.label) });
+        }
+        blocks.before = blocks.header_lines;
+        (blocks.next, blocks.next_rows) = blocks.read_rows()?;
+        Ok(blocks)
+    }
+
+    fn line(&mut self, into: &mut Vec<u8>) -> Result<bool, RecordingError> {
+        let read = self.reader.read_until(b'\n', into).map_err(|source| unread(&self.label, source))?;
+        Ok(read > 0)
+    }
+
+    fn read_rows(&mut self) -> Result<(Vec<u8>, usize), RecordingError> {
+        let (mut text, mut rows) = (Vec::with_capacity(self.next.capacity()), 0);
+        while rows < self.rows && self.line(&mut text)? {
+            rows += 1;
+        }
+        Ok((text, rows))
+    }
+
+    fn block(&mut self) -> Result<Recording, RecordingError> {
+        let mut text = self.header.clone();
+        let mut rows = self.next_rows;
+        text.append(&mut self.next);
+        (self.next, self.next_rows) = self.read_rows()?;
+        if self.next_rows < self.rows.div_ceil(2) {
+            rows += self.next_rows;
+            text.append(&mut self.next);
+            self.next_rows = 0;
+        }
+        let recording = parse(&text, &self.label, &self.name, self.before - self.header_lines)?;
+        if let (Some(previous), Some(&found)) = (self.last, recording.time.first())
+            && found <= previous
+        {
+            return Err(RecordingError::TimeNotIncreasing {
+                place: Place::line(&self.label, self.before + 1).column(0, "t"),
+                found,
+                previous,
+                mend: "one file holds one continuous experiment: split the file here, or sort the rows",
+            });
+        }
+        self.last = recording.time.last().copied();
+        self.before += rows as u64;
+        Ok(recording)
+    }
+}
+
+impl Iterator for CsvBlocks {
+    type Item = Result<Recording, RecordingError>;
+
+    /// The next block; after an error there is none.
+    fn next(&mut self) -> Option<Self::Item> {
+        if self.over {
+            return None;
+        }
+        let block = self.block();
+        self.over = block.is_err() || self.next_rows == 0;
+        Some(block)
+    }
 }
 
 /// Reads a recording called `name` from anything that yields the bytes of a CSV file.
@@ -42,7 +179,7 @@ pub fn parse_csv(mut reader: impl Read, name: &str) -> Result<Recording, Recordi
         action: "read",
         source,
     })?;
-    parse(&bytes, name, name)
+    parse(&bytes, name, name, 0)
 }
 
 /// Writes a time and columns of the same length as CSV: header `t` and the given headers (`name` or
@@ -143,6 +280,8 @@ fn cell(value: f64) -> String {
 struct Source<'a> {
     text: &'a [u8],
     label: &'a str,
+    /// Lines of the file that stand before the text, for rows; its header is another line.
+    above: u64,
 }
 
 impl Source<'_> {
@@ -158,7 +297,7 @@ impl Source<'_> {
             .iter()
             .enumerate()
             .filter(|&(i, &b)| b == b'\n' || (b == b'\r' && before.get(i + 1) != Some(&b'\n')));
-        1 + ends.count() as u64
+        self.above + 1 + ends.count() as u64
     }
 
     fn place(&self, record: &ByteRecord) -> Place {
@@ -166,9 +305,10 @@ impl Source<'_> {
     }
 }
 
-fn parse(bytes: &[u8], label: &str, name: &str) -> Result<Recording, RecordingError> {
-    let text = check_text(bytes, label)?;
-    let source = Source { text, label };
+/// Parses a header and rows; `above` lines of the file stand before them.
+fn parse(bytes: &[u8], label: &str, name: &str, above: u64) -> Result<Recording, RecordingError> {
+    let text = check_text(bytes, label, above)?;
+    let source = Source { text, label, above };
     let mut reader = ReaderBuilder::new().has_headers(false).flexible(true).from_reader(text);
     let mut record = ByteRecord::new();
     let mut next = |record: &mut ByteRecord| {
@@ -262,9 +402,9 @@ fn parse(bytes: &[u8], label: &str, name: &str) -> Result<Recording, RecordingEr
 }
 
 /// Drops the byte order mark and makes sure that the rest is UTF-8 text.
-fn check_text<'a>(bytes: &'a [u8], label: &str) -> Result<&'a [u8], RecordingError> {
+fn check_text<'a>(bytes: &'a [u8], label: &str, above: u64) -> Result<&'a [u8], RecordingError> {
     let refuse =
-        |line: u64, found: String| RecordingError::NotUtf8 { place: Place::line(label, line), found };
+        |line: u64, found: String| RecordingError::NotUtf8 { place: Place::line(label, above + line), found };
     if bytes.starts_with(&[0xff, 0xfe]) || bytes.starts_with(&[0xfe, 0xff]) {
         return Err(refuse(1, "it is UTF-16, as spreadsheets write under `Unicode text`".to_owned()));
     }

@@ -49,7 +49,7 @@ mod recording;
 pub mod smooth;
 mod spectrum;
 
-pub use crate::csv::{parse_csv, read_csv, write_csv, write_csv_file};
+pub use crate::csv::{CsvBlocks, parse_csv, read_csv, write_csv, write_csv_file};
 pub use crate::error::{Place, RecordingError};
 pub use crate::finding::{Finding, Severity};
 pub use crate::recording::{Channel, MIN_SAMPLES, Piece, Recording};

@@ -5,24 +5,37 @@ use std::path::Path;
 
 use anyhow::{Context, Result, bail};
 
-use super::{Report, duration};
+use super::{Report, duration, scale};
 
 const BEGIN: &str = "<!-- Made by `cargo xtask bench --peers --write-docs`; do not edit. -->";
+const SCALE: &str = "<!-- Made by `cargo xtask bench --scale --write-docs`; do not edit. -->";
 const END: &str = "<!-- End of the table. -->";
 
 /// Puts the table between the markers of `docs/src/speed.md`.
 pub(crate) fn write(root: &Path, report: &Report) -> Result<()> {
+    put(root, BEGIN, &table(report))
+}
+
+/// The same of cost against length, with its plot.
+pub(crate) fn write_scale(root: &Path, lengths: &[scale::Length]) -> Result<()> {
+    put(root, SCALE, &scale::table(lengths))?;
+    let path = root.join("docs").join("src").join("speed-scale.svg");
+    std::fs::write(&path, scale::plot(lengths)?)
+        .with_context(|| format!("{} cannot be written", path.display()))
+}
+
+fn put(root: &Path, begin: &str, table: &str) -> Result<()> {
     let path = root.join("docs").join("src").join("speed.md");
     let page =
         std::fs::read_to_string(&path).with_context(|| format!("{} cannot be read", path.display()))?;
-    let page = between(&page, &table(report)).with_context(|| path.display().to_string())?;
+    let page = between(&page, begin, table).with_context(|| path.display().to_string())?;
     std::fs::write(&path, page).with_context(|| format!("{} cannot be written", path.display()))
 }
 
-fn between(page: &str, table: &str) -> Result<String> {
-    let parts = page.split_once(BEGIN).and_then(|(head, rest)| Some((head, rest.split_once(END)?.1)));
+fn between(page: &str, begin: &str, table: &str) -> Result<String> {
+    let parts = page.split_once(begin).and_then(|(head, rest)| Some((head, rest.split_once(END)?.1)));
     let Some((head, tail)) = parts else { bail!("the markers of the table are missing") };
-    Ok(format!("{head}{BEGIN}\n\n{table}\n{END}{tail}"))
+    Ok(format!("{head}{begin}\n\n{table}\n{END}{tail}"))
 }
 
 fn table(report: &Report) -> String {
@@ -58,15 +71,15 @@ mod tests {
     #[test]
     fn the_table_stands_between_its_markers() {
         let page = format!("# Speed\n{BEGIN}\nold\n{END}\nrest\n");
-        let new = between(&page, "| new |\n").unwrap();
+        let new = between(&page, BEGIN, "| new |\n").unwrap();
         assert!(new.contains("| new |") && !new.contains("old") && new.ends_with("rest\n"));
-        assert_eq!(between(&new, "| new |\n").unwrap(), new);
-        assert!(between("# Speed\n", "").is_err());
+        assert_eq!(between(&new, BEGIN, "| new |\n").unwrap(), new);
+        assert!(between("# Speed\n", BEGIN, "").is_err());
     }
 
     #[test]
     fn the_page_has_its_markers() {
         let page = std::fs::read_to_string(crate::root().join("docs").join("src").join("speed.md")).unwrap();
-        assert!(between(&page, "").is_ok());
+        assert!(between(&page, BEGIN, "").is_ok() && between(&page, SCALE, "").is_ok());
     }
 }

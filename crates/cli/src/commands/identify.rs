@@ -1,7 +1,7 @@
 //! `greybox identify`: the governing equations, from recordings alone.
 
 use clap::{Args, ValueEnum};
-use greybox_identify::{DelayedState, Identification, Library, Monomials, Options};
+use greybox_identify::{DelayedState, Identification, Library, Monomials, Options, Streamed};
 use greybox_model::Hold;
 use greybox_report::ReportError;
 use greybox_report::convert::identification::{self as convert, MODEL_FILE, Sources};
@@ -9,6 +9,7 @@ use greybox_report::convert::identification::{self as convert, MODEL_FILE, Sourc
 use crate::answer::Answer;
 use crate::arguments::{Recordings, Study};
 use crate::failure::Failure;
+use crate::loading;
 use crate::progress::Progress;
 use crate::story;
 
@@ -18,6 +19,7 @@ use crate::story;
   greybox identify run1.csv --states x --inputs f --holdout run2.csv --out found
   greybox identify run1.csv run2.csv --states theta,alpha --inputs v --library separate,friction --out found
   greybox identify run1.csv --states x --inputs f --delay x --longest 0.5 --out found
+  greybox identify a_week.csv --states x --inputs f --block 20000 --out found
 
 DIR receives model.toml (runs in `greybox simulate` and `greybox diagnose`), report.json and report.html
 (self-contained, with plots). With no --holdout, the last fifth of each recording is held out. The same seed and
@@ -72,6 +74,11 @@ pub(crate) struct Arguments {
         allow_negative_numbers = true
     )]
     longest: f64,
+
+    /// Read the recordings in blocks of so many rows, in constant memory, whatever their length; without --holdout
+    /// the last block is held out
+    #[arg(long, value_name = "ROWS", value_parser = clap::value_parser!(u32).range(1000..))]
+    block: Option<u32>,
 
     /// Resampled data sets behind the inclusion probabilities
     #[arg(long, value_name = "N", default_value_t = 100, value_parser = clap::value_parser!(u16).range(1..))]
@@ -134,20 +141,40 @@ impl From<Between> for Hold {
 
 pub(crate) fn run(arguments: &Arguments) -> Result<Answer, Failure> {
     let options = options(arguments)?;
-    let recordings = arguments.study.recordings()?;
-    let out = arguments.study.folder(&["report.json", "report.html", MODEL_FILE], [])?;
-
-    let progress = Progress::open();
-    let Recordings { train, holdout } = &recordings;
-    let found = greybox_identify::identify(train, holdout, &options, &progress)?;
+    let (found, recordings, out, progress) = match arguments.block {
+        None => {
+            let recordings = arguments.study.recordings()?;
+            let out = arguments.study.folder(&FILES, [])?;
+            let progress = Progress::open();
+            let Recordings { train, holdout } = &recordings;
+            let found = greybox_identify::identify(train, holdout, &options, &progress)?;
+            (found, recordings, out, progress)
+        }
+        Some(rows) => {
+            let paths = &arguments.study.train;
+            loading::no_twins(paths.iter().chain(&arguments.study.holdout))?;
+            let holdout = loading::recordings(&arguments.study.holdout)?;
+            let open = || loading::blocks(paths, rows as usize);
+            // A file that is missing or empty is told before anything is written.
+            drop(open()?);
+            let out = arguments.study.folder(&FILES, [])?;
+            let progress = Progress::open();
+            let Streamed { found, first, holdout } =
+                greybox_identify::identify_blocks(open, &holdout, &options, &progress)?;
+            (found, Recordings { train: vec![first], holdout }, out, progress)
+        }
+    };
     progress.stage("writing the report");
-    let sources = Sources { train, holdout, hold: options.hold };
+    let sources = Sources { train: &recordings.train, holdout: &recordings.holdout, hold: options.hold };
     let (files, answer) = results(&found, &sources, &arguments.study)?;
     drop(progress);
     let files: Vec<(&str, &[u8])> = files.iter().map(|(name, text)| (*name, text.as_bytes())).collect();
     out.write(&files)?;
     Ok(answer)
 }
+
+/// What it writes.
+const FILES: [&str; 3] = ["report.json", "report.html", MODEL_FILE];
 
 /// Name and content of what a command writes.
 type Files = [(&'static str, String); 3];

@@ -3,14 +3,14 @@
 
 use std::sync::Arc;
 
-use greybox_identify::{FoundDelay, FoundEquation, HoldoutSource, Identification, Role as RoleRun};
+use greybox_identify::{Blocks, FoundDelay, FoundEquation, HoldoutSource, Identification, Role as RoleRun};
 use greybox_model::{Hold, Model, Unit, WriteOptions};
 use greybox_recording::Recording;
 
 use super::{
     coherent, health_findings, interval, names, recordings, residual, scores, spectra, state_map, times,
 };
-use crate::contract::{Fit, FitSet, InputHold, ModelId, Ordered, Producer, RecordingFit};
+use crate::contract::{Finding, Fit, FitSet, InputHold, ModelId, Ordered, Producer, RecordingFit, Severity};
 use crate::format;
 use crate::identified::{
     Delay, Doubtful, Equation, IdentifyReport, Order, OrderValue, Term, Variable, VariableRole,
@@ -76,8 +76,40 @@ pub fn report(found: &Identification, sources: &Sources<'_>) -> IdentifyReport {
             .collect(),
         findings: health_findings(&found.model, sources.train.iter().chain(sources.holdout)),
     };
+    report.findings.extend(found.blocks.iter().flat_map(blocks));
     report.summary = sentence::identified::summary(&report);
     report
+}
+
+/// What reading in blocks means for the report.
+fn blocks(found: &Blocks) -> Vec<Finding> {
+    let finding = |severity, code: &str, message: String, mend: Option<&str>| Finding {
+        severity,
+        code: code.to_owned(),
+        recording: None,
+        channel: None,
+        message,
+        mend: mend.map(str::to_owned),
+    };
+    let Blocks { blocks, samples, lost, passes, settled } = *found;
+    let read = format!(
+        "the equations were fitted to {samples} samples in {blocks} blocks, read {passes} times; training figures and \
+         plots show the first block"
+    );
+    let mut out = vec![finding(Severity::Info, "blocks", read, None)];
+    if lost > 0 {
+        let message =
+            format!("the model cannot be simulated on blocks with {lost} samples, which were left out");
+        let mend = "look at these stretches: a channel may be missing there, or another physics at work";
+        out.push(finding(Severity::Warning, "lost_blocks", message, Some(mend)));
+    }
+    if !settled {
+        let message = "the choice of terms still changed in the last pass over the blocks".to_owned();
+        let mend =
+            "the recordings do not settle it: look at the doubtful terms, or ask for a smaller library";
+        out.push(finding(Severity::Warning, "unsettled", message, Some(mend)));
+    }
+    out
 }
 
 /// Unit of a parameter; none where the recordings leave it open.
@@ -194,6 +226,7 @@ fn fit(found: &Identification) -> Fit {
                 format!("recordings held out: {}", role.data.recordings.join(", "))
             }
             (_, HoldoutSource::LastFifth) => "the last fifth of each recording".to_owned(),
+            (Some(_), HoldoutSource::LastBlock) => "the last block of the recordings".to_owned(),
             _ => "none: the recordings are too short to hold anything out".to_owned(),
         },
         recordings: by_name,
