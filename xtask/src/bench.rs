@@ -6,6 +6,7 @@
 
 mod case;
 mod control;
+mod instructions;
 mod page;
 mod peak;
 mod peer;
@@ -46,6 +47,15 @@ pub(crate) struct Arguments {
     /// Instead, identify recordings of 10⁴, 10⁵ … up to so many samples, in blocks
     #[arg(long, value_name = "SAMPLES", conflicts_with_all = ["peers", "only"])]
     scale: Option<usize>,
+    /// Instead, count the instructions of every row with valgrind and hold them against bench/instructions.json
+    #[arg(long, conflicts_with_all = ["peers", "scale"])]
+    instructions: bool,
+    /// With --instructions: accept the counts
+    #[arg(long, requires = "instructions", conflicts_with = "only")]
+    write: bool,
+    /// One row in this process, for --instructions
+    #[arg(long, value_name = "NAME", hide = true)]
+    count_one: Option<String>,
     /// Write the table of docs/src/speed.md that --peers or --scale makes
     #[arg(long, conflicts_with = "only")]
     write_docs: bool,
@@ -103,6 +113,11 @@ struct Comparison {
 /// Runs the command.
 pub(crate) fn run(root: &Path, arguments: &Arguments) -> Result<Ending> {
     let all = rows();
+    if let Some(name) = &arguments.count_one {
+        let row =
+            all.iter().find(|r| r.name == *name).with_context(|| format!("there is no row \"{name}\""))?;
+        return instructions::one(row).map(|()| Ending::Done);
+    }
     let names: Vec<&str> = all.iter().map(|r| r.name).collect();
     if let Some(unknown) = arguments.only.iter().find(|n| !names.contains(&n.as_str())) {
         if unknown == "list" {
@@ -117,6 +132,10 @@ pub(crate) fn run(root: &Path, arguments: &Arguments) -> Result<Ending> {
     let target = process::target(root);
     if let Some(most) = arguments.scale {
         return scale(root, &target, most, arguments);
+    }
+    if arguments.instructions {
+        let good = instructions::run(root, &target, &all, &arguments.only, arguments.write)?;
+        return Ok(if good { Ending::Done } else { Ending::Missed });
     }
     if arguments.write_docs && !arguments.peers {
         bail!("--write-docs needs --peers or --scale");

@@ -38,6 +38,10 @@ pub(crate) struct Cli {
     /// Print one JSON document for machines in place of plain language
     #[arg(long, global = true)]
     json: bool,
+
+    /// Tell every stage on standard error, and at the end what the stages cost
+    #[arg(long, global = true)]
+    pub(crate) log: bool,
 }
 
 /// The recordings of a command that learns from some and is judged on others, and where its results go.

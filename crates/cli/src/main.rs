@@ -8,6 +8,7 @@ mod arguments;
 mod commands;
 mod failure;
 mod loading;
+mod log;
 mod output;
 mod progress;
 mod story;
@@ -34,7 +35,12 @@ fn main() -> ExitCode {
 
 fn run(arguments: Vec<OsString>) -> Result<answer::Answer, Failure> {
     match Cli::read(arguments)? {
-        Ok(cli) => cli.command.run(),
+        Ok(cli) => {
+            if cli.log {
+                log::want();
+            }
+            cli.command.run()
+        }
         Err(help) => Ok(help),
     }
 }

@@ -8,14 +8,17 @@ use std::time::Duration;
 use greybox_diagnose::{Observer, Stage};
 use indicatif::{ProgressBar, ProgressDrawTarget, ProgressStyle};
 
+use crate::log::{self, Log};
+
 /// How long a command may be silent.
 const PATIENCE: Duration = Duration::from_secs(2);
 
 /// A bar on standard error that appears after two seconds, and only where standard error is a terminal;
-/// it is gone when dropped.
+/// it is gone when dropped. With `--log` there are lines in its place.
 #[derive(Debug)]
 pub(crate) struct Progress {
     bar: ProgressBar,
+    log: Option<Log>,
     /// Wakes the thread that waits to show the bar; `None` once dropped.
     waiting: Option<(Sender<()>, JoinHandle<()>)>,
 }
@@ -36,8 +39,9 @@ impl Progress {
         if let Ok(style) = ProgressStyle::with_template(template) {
             bar.set_style(style);
         }
-        if !std::io::stderr().is_terminal() {
-            return Progress { bar, waiting: None };
+        let log = log::is_wanted().then(Log::new);
+        if log.is_some() || !std::io::stderr().is_terminal() {
+            return Progress { bar, log, waiting: None };
         }
         let (stop, stopped) = channel();
         let shown = bar.clone();
@@ -47,12 +51,16 @@ impl Progress {
                 shown.enable_steady_tick(Duration::from_millis(120));
             }
         });
-        Progress { bar, waiting: Some((stop, thread)) }
+        Progress { bar, log, waiting: Some((stop, thread)) }
     }
 
     /// Says what is being done now.
     pub(crate) fn stage(&self, what: impl Into<String>) {
-        self.bar.set_message(what.into());
+        let what = what.into();
+        if let Some(log) = &self.log {
+            log.stage(&what);
+        }
+        self.bar.set_message(what);
     }
 
     /// One step is done.

@@ -127,6 +127,37 @@ fn the_duffing_oscillator_is_found_and_simulates_as_well_as_the_report_says() {
 }
 
 #[test]
+fn a_recording_is_read_in_blocks_and_the_stages_are_told() {
+    let bench = bench();
+    let blocks = ["--block", "1000", "--out", "out", "--json", "--log"];
+    let outcome = bench.greybox(&[&DUFFING as &[&str], &blocks].concat());
+    assert_eq!(outcome.code, 0, "{}", outcome.stderr);
+    let report: Value = serde_json::from_str(&outcome.stdout).unwrap();
+    let found: Vec<&str> = terms(&report).iter().map(|t| t["expression"].as_str().unwrap()).collect();
+    assert_eq!(found.len(), TRUTH.len(), "{found:?}");
+    assert!(TRUTH.iter().all(|(name, _)| found.contains(name)), "{found:?}");
+    assert_eq!(report["fit"]["holdout_source"], "the last block of the recordings");
+    let findings = report["findings"].as_array().unwrap();
+    let read = findings.iter().find(|f| f["code"] == "blocks").unwrap()["message"].as_str().unwrap();
+    assert!(read.contains("3001 samples in 3 blocks") || read.contains("3000 samples in 3 blocks"), "{read}");
+    // One line a stage as it begins, then what each sort of them cost.
+    let log: Vec<&str> = outcome.stderr.lines().collect();
+    assert!(log[0].ends_with(" s  first estimates (weak form)"), "{}", log[0]);
+    assert!(log.iter().any(|l| l.ends_with("  done")) && log.iter().any(|l| l.starts_with("stage ")));
+    // Without the flag there is nothing on standard error.
+    let quiet = bench.greybox(&[&DUFFING as &[&str], &blocks[..5]].concat());
+    assert_eq!((quiet.code, quiet.stderr.as_str()), (0, ""));
+    assert_eq!(quiet.stdout, outcome.stdout);
+
+    bench.write("late.csv", "t,f,x\n0,1,2\n0.1,1,oops\n");
+    let broken =
+        bench.greybox(&["identify", "late.csv", "--states", "x", "--block", "1000", "--out", "none"]);
+    assert_eq!(broken.code, 2);
+    assert!(broken.stderr.contains("late.csv, line 3"), "{}", broken.stderr);
+    assert!(!bench.path("none/report.json").exists());
+}
+
+#[test]
 fn the_story_has_the_equation_the_prediction_and_the_terms() {
     let bench = bench();
     let outcome = bench.greybox(&[&DUFFING as &[&str], &["--out", "out"]].concat());
