@@ -14,7 +14,7 @@ pub fn triangle(a: &mut [f64], m: usize, n: usize) -> Vec<f64> {
         let (done, rest) = a.split_at_mut((k + 1) * m);
         let column = &mut done[k * m..];
         if k < m {
-            let norm = column[k..].iter().map(|v| v * v).sum::<f64>().sqrt();
+            let norm = norm(&column[k..]);
             if norm > 0.0 {
                 let alpha = if column[k] > 0.0 { -norm } else { norm };
                 let pivot = column[k] - alpha;
@@ -22,8 +22,7 @@ pub fn triangle(a: &mut [f64], m: usize, n: usize) -> Vec<f64> {
                 // H = I − v vᵀ / (norm·(norm + |a_k|)), v = column[k..]
                 let scale = 1.0 / (norm * pivot.abs());
                 for other in rest.chunks_exact_mut(m) {
-                    let dot: f64 = column[k..].iter().zip(&other[k..]).map(|(a, b)| a * b).sum();
-                    let f = dot * scale;
+                    let f = dot(&column[k..], &other[k..]) * scale;
                     for (o, v) in other[k..].iter_mut().zip(&column[k..]) {
                         *o -= f * v;
                     }
@@ -78,7 +77,7 @@ pub fn orthonormalise(a: &mut [f64], m: usize, n: usize) {
         let start = norm(column);
         for _ in 0..2 {
             for q in before.chunks_exact(m) {
-                let dot: f64 = q.iter().zip(column.iter()).map(|(a, b)| a * b).sum();
+                let dot = dot(q, column);
                 for (c, q) in column.iter_mut().zip(q) {
                     *c -= dot * q;
                 }
@@ -93,7 +92,7 @@ pub fn orthonormalise(a: &mut [f64], m: usize, n: usize) {
 /// Removes from `column` its part in the span of the orthonormal columns `q`.
 pub fn project_off(q: &[f64], m: usize, column: &mut [f64]) {
     for q in q.chunks_exact(m) {
-        let dot: f64 = q.iter().zip(column.iter()).map(|(a, b)| a * b).sum();
+        let dot = dot(q, column);
         if dot != 0.0 {
             for (c, q) in column.iter_mut().zip(q) {
                 *c -= dot * q;
@@ -102,9 +101,20 @@ pub fn project_off(q: &[f64], m: usize, column: &mut [f64]) {
     }
 }
 
-/// Dot product.
+/// Dot product over the shorter of the two: eight partial sums, which the compiler keeps in vector registers (one sum
+/// would wait for each addition), the same on every machine.
 pub fn dot(a: &[f64], b: &[f64]) -> f64 {
-    a.iter().zip(b).map(|(a, b)| a * b).sum()
+    let n = a.len().min(b.len());
+    let ((a, a_rest), (b, b_rest)) = (a[..n].as_chunks::<8>(), b[..n].as_chunks::<8>());
+    let rest: f64 = a_rest.iter().zip(b_rest).map(|(a, b)| a * b).sum();
+    let mut sums = [0.0; 8];
+    for (a, b) in a.iter().zip(b) {
+        for lane in 0..8 {
+            sums[lane] += a[lane] * b[lane];
+        }
+    }
+    let [a, b, c, d, e, f, g, h] = sums;
+    ((a + b) + (c + d)) + ((e + f) + (g + h)) + rest
 }
 
 fn norm(a: &[f64]) -> f64 {

@@ -575,6 +575,18 @@ pub fn integrate(
     Simulation { system, environment: env, parameters, method, seeds }.run(x0, range)
 }
 
+/// h Σ weight · f of entry `r` over the stages; a weight of zero takes no part.
+#[inline]
+fn along(stages: &[Stage], weights: &[f64], h: f64, r: usize) -> f64 {
+    let mut sum = 0.0;
+    for (stage, &weight) in stages.iter().zip(weights) {
+        if weight != 0.0 {
+            sum += weight * stage.f[r];
+        }
+    }
+    h * sum
+}
+
 struct Core<'a> {
     system: &'a System,
     env: &'a Environment,
@@ -1133,26 +1145,14 @@ impl<'a> Core<'a> {
         let mid = self.s + 0.5 * h;
         let mut xs = std::mem::take(&mut self.xs);
         for i in 1..tableau.b.len() {
-            xs.copy_from_slice(&self.x);
-            for (j, &a) in tableau.a[i].iter().enumerate() {
-                if a != 0.0 {
-                    let f = &self.stages[j].f;
-                    for r in 0..nx {
-                        xs[r] += h * a * f[r];
-                    }
-                }
+            for (r, xs) in xs.iter_mut().enumerate() {
+                *xs = self.x[r] + along(&self.stages, tableau.a[i], h, r);
             }
             self.eval_at(i, self.s + tableau.c[i] * h, mid, &xs);
         }
         self.xs = xs;
-        self.x1.copy_from_slice(&self.x);
-        for (j, &b) in tableau.b.iter().enumerate() {
-            if b != 0.0 {
-                let f = &self.stages[j].f;
-                for r in 0..nx {
-                    self.x1[r] += h * b * f[r];
-                }
-            }
+        for r in 0..nx {
+            self.x1[r] = self.x[r] + along(&self.stages, tableau.b, h, r);
         }
         if end {
             let x1 = std::mem::take(&mut self.x1);

@@ -11,7 +11,8 @@ pub const FINE: usize = 8;
 #[derive(Debug, Clone)]
 pub struct Signal {
     hold: Hold,
-    dt: f64,
+    /// Samples of the grid per second.
+    rate: f64,
     /// Samples; for a band-limited signal [`FINE`] times denser.
     grid: Arc<[f64]>,
 }
@@ -23,9 +24,9 @@ impl Signal {
     pub fn new(hold: Hold, dt: f64, samples: &[f64], fine: impl FnOnce(&[f64]) -> Vec<f64>) -> Signal {
         match hold {
             Hold::BandLimited if samples.len() > 1 => {
-                Signal { hold, dt: dt / FINE as f64, grid: fine(samples).into() }
+                Signal { hold, rate: FINE as f64 / dt, grid: fine(samples).into() }
             }
-            _ => Signal { hold, dt, grid: samples.into() },
+            _ => Signal { hold, rate: 1.0 / dt, grid: samples.into() },
         }
     }
 
@@ -42,11 +43,11 @@ impl Signal {
     pub fn at(&self, s: f64, inside: f64) -> (f64, f64) {
         let g = &self.grid;
         let last = g.len() - 1;
-        let k = (inside / self.dt).floor();
-        if k < 0.0 {
+        let place = inside * self.rate;
+        if place < 0.0 {
             return (g[0], 0.0);
         }
-        let k = k as usize;
+        let k = place as usize;
         if k >= last {
             return (g[last], 0.0);
         }
@@ -54,18 +55,18 @@ impl Signal {
             Hold::Zero => (g[k], 0.0),
             Hold::Linear => {
                 let rise = g[k + 1] - g[k];
-                (g[k] + (s / self.dt - k as f64) * rise, rise / self.dt)
+                (g[k] + (s * self.rate - k as f64) * rise, rise * self.rate)
             }
             Hold::BandLimited => {
                 // Cubic Lagrange on the four neighbours of the dense grid.
-                let x = s / self.dt - k as f64;
+                let x = s * self.rate - k as f64;
                 let (b, c) = (g[k], g[k + 1]);
                 let a = if k > 0 { g[k - 1] } else { 2.0 * b - c };
                 let d = if k + 2 <= last { g[k + 2] } else { 2.0 * c - b };
                 let c1 = c - a / 3.0 - b / 2.0 - d / 6.0;
                 let c2 = 0.5 * (a + c) - b;
                 let c3 = (d - a) / 6.0 + 0.5 * (b - c);
-                (b + x * (c1 + x * (c2 + x * c3)), (c1 + x * (2.0 * c2 + 3.0 * x * c3)) / self.dt)
+                (b + x * (c1 + x * (c2 + x * c3)), (c1 + x * (2.0 * c2 + 3.0 * x * c3)) * self.rate)
             }
         }
     }
