@@ -175,6 +175,10 @@ pub(crate) struct Wide {
     pub theta: Vec<f64>,
     /// Its segments.
     pub segments: Vec<Projected>,
+    /// Residual sum of squares per channel, scaled.
+    pub rss: Vec<f64>,
+    /// Number of values in it.
+    pub count: Vec<usize>,
 }
 
 impl Wide {
@@ -204,7 +208,11 @@ pub(crate) fn widen(structure: &Structure, refined: &Refined, allowed: &[bool]) 
         Some(&refined.setup),
     )?;
     let point = Point { parameters: wide.values(), starts: refined.fit.point.starts.clone() };
-    let rows = wide.with_problem(&refined.level, &refined.scale, |p| p.rows(&point, true, None));
+    let (rows, (rss, count)) = wide.with_problem(&refined.level, &refined.scale, |p| {
+        let rows = p.rows(&point, true, None);
+        let sums = p.rss(&rows);
+        (rows, sums)
+    });
     let theta: Vec<f64> = wide.free.iter().map(|f| point.parameters[f.index]).collect();
     let segments: Vec<Projected> = rows
         .into_par_iter()
@@ -219,7 +227,7 @@ pub(crate) fn widen(structure: &Structure, refined: &Refined, allowed: &[bool]) 
         })
         .collect();
     let finite = segments.iter().all(|s| s.z.iter().chain(&s.j).all(|v| v.is_finite()));
-    finite.then_some(Wide { setup: wide, theta, segments })
+    finite.then_some(Wide { setup: wide, theta, segments, rss, count })
 }
 
 /// The triangle of [J | z] over segments of `stride − 1` coefficients.

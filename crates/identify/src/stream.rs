@@ -30,6 +30,9 @@ const PASSES: usize = 6;
 /// A step below this share of the intervals' half-widths is the last.
 const SETTLED: f64 = 0.1;
 
+/// Samples to which the start of a segment is fitted.
+const HEAD: usize = 500;
+
 /// Independent samples that count in the choice of terms at most: what does not lower the mean square of the residual
 /// by the price of a term over so many is left out, however sure it is. With 10⁸ samples every model is wrong in
 /// detail.
@@ -148,8 +151,11 @@ impl Linearisation {
         let level = still.level((samples as f64 / self.segment as f64).round().max(1.0) as usize);
         let parameters = refined.fit.point.parameters.clone();
         let point = Point { starts: still.starts(&level, &parameters), parameters };
+        // A start is fitted to the samples after it; what these leave of its error is projected off.
+        let mut heads = level.clone();
+        heads.segments.iter_mut().for_each(|s| s.range.end = s.range.end.min(s.range.start + HEAD));
         let limits = Limits { iterations: 10, tolerance: 1e-6 };
-        let fit = still.with_problem(&level, &refined.scale, |p| p.fit(point, limits));
+        let fit = still.with_problem(&heads, &refined.scale, |p| p.fit(point, limits));
         let here = Refined { setup, level, fit, ..refined.clone() };
         let ny = here.setup.system.ny;
         let around = self.theta();
@@ -175,8 +181,8 @@ impl Linearisation {
             segments: here.level.segments.len(),
             samples,
             lost: 0,
-            rss: here.fit.rss,
-            count: here.fit.count,
+            rss: wide.rss,
+            count: wide.count,
         })
     }
 

@@ -137,23 +137,20 @@ impl Gram {
         }
         let m = rows.columns() + 1;
         let mut sums = vec![vec![0.0; m * m]; samples.len()];
-        let mut taken: Vec<(usize, f64)> = Vec::with_capacity(CACHED);
+        // Rows that a sample leaves out take part with a weight of zero: to skip them costs more than to multiply them.
+        let mut roots = [0.0; CACHED];
         let mut panel = vec![0.0; CACHED * m];
         for start in (0..rows.rows()).step_by(CACHED) {
             let end = (start + CACHED).min(rows.rows());
+            let n = end - start;
             for (weights, sums) in samples.iter().zip(&mut sums) {
-                taken.clear();
-                let drawn = weights[start..end].iter().enumerate().filter(|&(_, &w)| w > 0);
-                taken.extend(drawn.map(|(i, &w)| (i, f64::from(w).sqrt())));
-                let n = taken.len();
-                if n == 0 {
-                    continue;
+                for (root, &weight) in roots.iter_mut().zip(&weights[start..end]) {
+                    *root = f64::from(weight).sqrt();
                 }
                 for (j, to) in panel[..n * m].chunks_exact_mut(n).enumerate() {
                     let from = if j < rows.columns() { rows.column(j) } else { rows.target() };
-                    let from = &from[start..end];
-                    for (to, &(i, w)) in to.iter_mut().zip(&taken) {
-                        *to = w * from[i];
+                    for ((to, root), from) in to.iter_mut().zip(&roots).zip(&from[start..end]) {
+                        *to = root * from;
                     }
                 }
                 let columns: Vec<&[f64]> = panel[..n * m].chunks_exact(n).collect();
