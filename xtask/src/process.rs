@@ -43,6 +43,8 @@ pub(crate) struct Measured {
     /// Largest resident set, bytes: the kernel's high-water mark, read every 10 ms, at first every
     /// 1 ms (what is added after the last reading goes unseen). `None` where `/proc` does not exist.
     pub(crate) peak_bytes: Option<u64>,
+    /// CPU time of all its threads, s, as of the last reading. `None` where `/proc` does not exist.
+    pub(crate) cpu: Option<f64>,
 }
 
 /// Runs a command to its end or to `limit`, its output in the files `stdout.txt` and `stderr.txt` of
@@ -59,24 +61,40 @@ pub(crate) fn run(command: &mut Command, logs: &Path, limit: Duration) -> Result
     command.stdin(Stdio::null()).stdout(create("stdout.txt")?).stderr(create("stderr.txt")?);
     let start = Instant::now();
     let mut child = command.spawn().with_context(|| format!("{program} could not be started"))?;
-    let status_file = format!("/proc/{}/status", child.id());
-    let mut peak_bytes = None;
+    let [status_file, times_file] = ["status", "stat"].map(|f| format!("/proc/{}/{f}", child.id()));
+    let (mut peak_bytes, mut cpu) = (None, None);
     loop {
         if let Ok(text) = std::fs::read_to_string(&status_file) {
             peak_bytes = peak_bytes.max(high_water_mark(&text));
         }
+        if let Ok(text) = std::fs::read_to_string(&times_file) {
+            cpu = cpu_time(&text).or(cpu);
+        }
         if let Some(status) = child.try_wait()? {
-            return Ok(Measured { status: Some(status), seconds: start.elapsed().as_secs_f64(), peak_bytes });
+            return Ok(Measured {
+                status: Some(status),
+                seconds: start.elapsed().as_secs_f64(),
+                peak_bytes,
+                cpu,
+            });
         }
         if start.elapsed() > limit {
             child.kill()?;
             child.wait()?;
-            return Ok(Measured { status: None, seconds: start.elapsed().as_secs_f64(), peak_bytes });
+            return Ok(Measured { status: None, seconds: start.elapsed().as_secs_f64(), peak_bytes, cpu });
         }
         // A short run is watched more closely.
         let pause = if start.elapsed().as_millis() < 200 { 1 } else { 10 };
         std::thread::sleep(Duration::from_millis(pause));
     }
+}
+
+/// User and system time of the text of `/proc/PID/stat`, s. Its unit is 10 ms on every Linux that Rust runs on.
+fn cpu_time(stat: &str) -> Option<f64> {
+    // The name of the program, in parentheses, may hold anything.
+    let mut fields = stat.rsplit_once(')')?.1.split_whitespace().skip(11);
+    let mut next = || fields.next()?.parse::<f64>().ok();
+    Some(0.01 * (next()? + next()?)).filter(|t| *t > 0.0)
 }
 
 /// `VmHWM` of the text of `/proc/PID/status`, bytes.
@@ -94,6 +112,13 @@ mod tests {
     fn the_high_water_mark_is_read() {
         assert_eq!(high_water_mark("Name:\tx\nVmHWM:\t    2048 kB\nVmRSS:\t 4 kB\n"), Some(2048 * 1024));
         assert_eq!(high_water_mark("Name:\tx\n"), None);
+    }
+
+    #[test]
+    fn the_cpu_time_is_read_whatever_the_program_is_called() {
+        let stat = "7 (a) b) R 1 2 3 4 5 6 7 8 9 10 150 25 0 0";
+        assert_eq!(cpu_time(stat), Some(1.75));
+        assert_eq!(cpu_time("7 (x) R 1"), None);
     }
 
     #[cfg(unix)]
