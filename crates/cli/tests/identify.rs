@@ -153,7 +153,7 @@ fn a_recording_is_read_in_blocks_and_the_stages_are_told() {
     let broken =
         bench.greybox(&["identify", "late.csv", "--states", "x", "--block", "1000", "--out", "none"]);
     assert_eq!(broken.code, 2);
-    assert!(broken.stderr.contains("late.csv, line 3"), "{}", broken.stderr);
+    assert!(broken.stderr.contains("late.csv:3:"), "{}", broken.stderr);
     assert!(!bench.path("none/report.json").exists());
 }
 

@@ -106,6 +106,19 @@ fn hysteresis_is_named_and_sized() {
 }
 
 #[test]
+fn hysteresis_that_is_friction_by_its_equation_is_called_both() {
+    // γ = 0: the equation of a contact that lets go over 1/β.
+    let effect = |_: f64, s: &State, _: f64| (30.0 * s[2], s[1] - 12.0 * s[1].abs() * s[2]);
+    let d = answer(MODEL, 1, &LINES, &effect, 0.0);
+    assert_eq!(kinds(&d), ["presliding_friction"]);
+    let found = &d.mechanisms[0];
+    let other: Vec<_> = found.alternatives.iter().filter(|a| a.kind == "bouc_wen_hysteresis").collect();
+    assert_eq!(other.len(), 1);
+    assert!(other[0].equivalent && other[0].confidence == found.confidence && found.confidence > 0.9);
+    assert!(other[0].separate.contains("loops"));
+}
+
+#[test]
 fn a_lag_of_the_actuator_is_named_and_sized() {
     // The actuator's force a follows with 60 ms: 0.06 a' + a = f. (f − a is what the model lacks.)
     let effect = |_: f64, s: &State, f: f64| (f - s[2], (f - s[2]) / 0.06);
