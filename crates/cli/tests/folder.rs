@@ -56,7 +56,7 @@ fn every_recording_is_diagnosed_by_itself_and_a_bad_one_ends_nothing() {
         "Viscous friction in the body equation, ",
         " is found in 2 of 2; ",
         "\n  monday.csv  missing physics  viscous friction\n",
-        "\nNote: broken.csv could not be diagnosed: runs/broken.csv: line 3",
+        "\nNote: broken.csv could not be diagnosed: runs/broken.csv:3:f (column 2)",
         "\nWritten: out/summary.html, out/summary.json, and a folder for each recording in out\n",
     ] {
         assert!(outcome.stdout.contains(part), "`{part}` is not in:\n{}", outcome.stdout);
@@ -214,7 +214,7 @@ fn folders_that_cannot_be_worked_through() {
     bench.write("bad.csv", "t,f [N],x [mm]\n0.0,1.0,?\n");
     bench.refuses(
         &["diagnose", "model.toml", "runs", "--holdout", "bad.csv", "--out", "out"],
-        &["error: bad.csv: line 2"],
+        &["error: bad.csv:2:x"],
     );
     bench.refuses(&["diagnose", "model.toml", "nowhere", "--out", "out"], &["nowhere", "no such file"]);
     // Nothing may take the place of an input, or of a file that is no folder.
@@ -237,10 +237,14 @@ fn folders_that_cannot_be_worked_through() {
 fn where_no_recording_can_be_diagnosed_nothing_is_written() {
     let bench = bench();
     bench.write("runs/monday.csv", "t,f [N],x [mm]\n0.0,1.0,?\n");
-    bench.write("runs/friday.csv", "t,f [N]\n0.0,1.0\n0.1,1.0\n");
+    bench.write("runs/friday.csv", &recording(50, 0.0).replace("x [mm]", "y [mm]"));
     bench.refuses(
         &["diagnose", "model.toml", "runs", "--out", "a/b"],
-        &["error: runs: no recording of this folder", "runs/monday.csv: line 2", "friday.csv", "`x`"],
+        &[
+            "error: runs: no recording of this folder",
+            "\n  runs/monday.csv:2:x",
+            "\n  friday.csv: there is no channel `x`",
+        ],
     );
 }
 

@@ -426,7 +426,7 @@ fn unit_circle(frame: &Frame) -> String {
 /// Width of a forest plot, that of its names, and the height of a row.
 const FOREST: (f64, f64, f64) = (440.0, 130.0, 20.0);
 /// Most characters of a name.
-const NAME: usize = 18;
+const NAME: usize = 16;
 
 /// A forest plot: estimates of one number with their 95 % intervals, one per row, and the pooled one as a diamond
 /// with a line through all rows. `None` when no value is finite.
@@ -596,7 +596,7 @@ mod tests {
         let svg = forest_plot(&pooled, "fc [N]", "a \"forest\"").unwrap();
         assert_eq!((svg.matches("class=\"mark\"").count(), svg.matches("class=\"whisker\"").count()), (2, 1));
         assert_eq!(svg.matches("class=\"diamond\"").count(), 1);
-        assert!(svg.contains("&lt;a&gt;.csv") && svg.contains(">a_recordi…ning.csv<"), "{svg}");
+        assert!(svg.contains("&lt;a&gt;.csv") && svg.contains(">a_record…ing.csv<"), "{svg}");
         assert!(svg.contains("a &quot;forest&quot;") && !svg.contains("NaN"), "{svg}");
         // Ends of intervals may be unknown.
         pooled.estimates[0].ci95 = Some(Interval::new(f64::NAN, 1.5));

@@ -119,7 +119,7 @@ pub(super) fn run(arguments: &Arguments, folder: &Path, own: Option<&Mechanisms>
         n => format!("{n} of {} done before.\n", tasks.len()),
     };
     let words = format!(
-        "{}{}\n{resumed}Written: {1}/{html_name}, {1}/{json_name}, and a folder for each recording in {1}\n",
+        "{}\n{resumed}Written: {1}/{html_name}, {1}/{json_name}, and a folder for each recording in {1}\n",
         story::summary(&summary) + &own.map(tried).unwrap_or_default(),
         place.display()
     );
