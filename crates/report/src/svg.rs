@@ -140,12 +140,12 @@ impl Frame {
 }
 
 fn open(alt: &str) -> String {
-    open_at(WIDTH, HEIGHT, alt)
+    open_at("drawing", WIDTH, HEIGHT, alt)
 }
 
-fn open_at(width: f64, height: f64, alt: &str) -> String {
+fn open_at(class: &str, width: f64, height: f64, alt: &str) -> String {
     format!(
-        "<svg class=\"drawing\" viewBox=\"0 0 {width} {height}\" role=\"img\" aria-label=\"{}\">",
+        "<svg class=\"{class}\" viewBox=\"0 0 {width} {height}\" role=\"img\" aria-label=\"{}\">",
         escape(alt)
     )
 }
@@ -441,7 +441,7 @@ pub fn forest_plot(pooled: &Pooled, x_label: &str, alt: &str) -> Option<String> 
     let ends = |(value, ci): (f64, Option<Interval>)| ci.map_or([value; 3], |ci| [value, ci.low, ci.high]);
     let (low, high) = range(all().flat_map(ends), 0.04)?;
     let px = |x: f64| left + (x - low) / (high - low) * (right - left);
-    let mut out = open_at(width, bottom + BOTTOM, alt);
+    let mut out = open_at("drawing forest", width, bottom + BOTTOM, alt);
     let (ticks, decimals) = nice_ticks(low, high, 5);
     for tick in ticks {
         let (x, text) = (px(tick), tick_label(tick, decimals));

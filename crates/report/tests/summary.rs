@@ -1,6 +1,8 @@
 //! `summary.json` against its schema, the algebra of merging, and the page.
 #![allow(clippy::unwrap_used, reason = "helpers of tests panic like the tests themselves")]
 
+use std::sync::OnceLock;
+
 use greybox_report::contract::{Estimate, Interval, ModelId, Producer, Report, Verdict};
 use greybox_report::merge::{conclude, failed, map, reduce};
 use greybox_report::summary::{Method, Statistics, Summary, schema};
@@ -12,9 +14,15 @@ mod documents;
 #[path = "../examples/sample/mod.rs"]
 mod sample;
 
+/// The sample's report, whose signals take a while to make.
+fn sampled() -> &'static Report {
+    static REPORT: OnceLock<Report> = OnceLock::new();
+    REPORT.get_or_init(|| sample::page().report)
+}
+
 /// The sample's report with this much friction and another inertia.
 fn report(fc: f64, half: f64) -> Report {
-    let mut report = sample::page().report;
+    let mut report = sampled().clone();
     let estimate =
         Estimate { value: fc, ci95: Some(Interval::new(fc - half, fc + half)), unit: "N m".into() };
     report.mechanisms[0].parameters.insert("fc".into(), estimate);
@@ -121,8 +129,8 @@ fn what_a_mechanism_does_over_the_recordings_is_known() {
     assert!(h.p_value < 1e-6 && h.tau > 0.01 && h.i_squared > 0.9, "{h:?}");
     // A refitted parameter is pooled over all four recordings, a fixed one is not.
     assert_eq!(summary.parameters["J"].pooled.estimates.len(), 4);
-    assert_eq!(summary.parameters["J"].nominal, sample::page().report.parameters["J"].nominal);
-    for (name, parameter) in &sample::page().report.parameters {
+    assert_eq!(summary.parameters["J"].nominal, sampled().parameters["J"].nominal);
+    for (name, parameter) in &sampled().parameters {
         assert_eq!(summary.parameters.contains_key(name), !parameter.fixed, "{name}");
     }
     assert_eq!(summary.holdout["theta"].improved.diverged, 1);
