@@ -77,6 +77,11 @@ impl Failure {
         Failure::new(Cause::Internal, message)
     }
 
+    /// A panic, of which the default hook has said where.
+    pub(crate) fn fault() -> Failure {
+        Failure::internal("greybox met a fault of its own; please report the lines above")
+    }
+
     /// A command line that clap refuses, in clap's words.
     pub(crate) fn usage(rendered: &str) -> Failure {
         let text = rendered.trim_end();
@@ -146,6 +151,33 @@ impl Failure {
         };
         failure.0.mend = help.map(str::to_owned);
         failure
+    }
+
+    /// Nothing could be done because of `failures`, each of one file.
+    pub(crate) fn all(folder: &Path, message: &str, failures: &[Failure]) -> Failure {
+        let told: String = failures
+            .iter()
+            .map(|f| match &f.0.mend {
+                Some(mend) => format!("\n  {}\n    mend: {mend}", f.0.message),
+                None => format!("\n  {}", f.0.message),
+            })
+            .collect();
+        let mut failure = Failure::file(folder, format!("{message}:{told}"));
+        // A fault of greybox in all of them is no bad input.
+        if !failures.is_empty() && failures.iter().all(|f| f.0.cause == Cause::Internal) {
+            failure.0.cause = Cause::Internal;
+        }
+        failure
+    }
+
+    /// What is wrong.
+    pub(crate) fn message(&self) -> &str {
+        &self.0.message
+    }
+
+    /// What to do about it, where the message does not say.
+    pub(crate) fn advice(&self) -> Option<&str> {
+        self.0.mend.as_deref()
     }
 
     /// Prints on standard error, and in JSON on standard output too where that is spoken.

@@ -61,6 +61,8 @@ pub(crate) struct Mechanisms {
     pub(crate) library: Library,
     /// The files of the folder.
     pub(crate) files: Vec<PathBuf>,
+    /// Name and text of each.
+    pub(crate) texts: Vec<(String, String)>,
 }
 
 /// Adds every `*.toml` of the folder, in the order of their names, to the built-in library.
@@ -72,17 +74,7 @@ pub(crate) fn mechanisms(folder: &Path) -> Result<Mechanisms, Failure> {
         return Err(Failure::file(folder, "this is a file, but `--mechanisms` takes a folder")
             .mend("name the folder that holds the mechanism files"));
     }
-    let entries = fs::read_dir(folder).map_err(|e| match e.kind() {
-        ErrorKind::NotFound => {
-            Failure::file(folder, "no such folder").mend("check the path and the spelling")
-        }
-        _ => Failure::file(folder, format!("the folder cannot be read: {e}")).mend("check its permissions"),
-    })?;
-    let mut files: Vec<PathBuf> = entries
-        .filter_map(|entry| entry.ok().map(|e| e.path()))
-        .filter(|path| has_extension(path, "toml") && path.is_file())
-        .collect();
-    files.sort();
+    let files = files_of(folder, "toml")?;
     if files.is_empty() {
         return Err(Failure::file(folder, "this folder holds no mechanism (`*.toml`)")
             .mend("`greybox mechanisms --example` prints one to start from"));
@@ -92,7 +84,26 @@ pub(crate) fn mechanisms(folder: &Path) -> Result<Mechanisms, Failure> {
         texts.push((file_name(path), read_text(path)?));
     }
     let library = library::combine(&texts).map_err(|e| Failure::mechanism(&e, &texts, folder))?;
-    Ok(Mechanisms { library, files })
+    Ok(Mechanisms { library, files, texts })
+}
+
+/// The files of a folder with this extension, in the order of their names.
+///
+/// # Errors
+/// Bad input: no such folder, or one that cannot be read.
+pub(crate) fn files_of(folder: &Path, extension: &str) -> Result<Vec<PathBuf>, Failure> {
+    let entries = fs::read_dir(folder).map_err(|e| match e.kind() {
+        ErrorKind::NotFound => {
+            Failure::file(folder, "no such folder").mend("check the path and the spelling")
+        }
+        _ => Failure::file(folder, format!("the folder cannot be read: {e}")).mend("check its permissions"),
+    })?;
+    let mut files: Vec<PathBuf> = entries
+        .filter_map(|entry| entry.ok().map(|e| e.path()))
+        .filter(|path| has_extension(path, extension) && path.is_file())
+        .collect();
+    files.sort();
+    Ok(files)
 }
 
 fn looks_like_recording(path: &Path, text: &str) -> bool {
@@ -109,7 +120,8 @@ fn has_extension(path: &Path, wanted: &str) -> bool {
     path.extension().is_some_and(|e| e.eq_ignore_ascii_case(wanted))
 }
 
-fn file_name(path: &Path) -> String {
+/// Name of a file without its folder.
+pub(crate) fn file_name(path: &Path) -> String {
     path.file_name().map_or_else(|| path.display().to_string(), |n| n.to_string_lossy().into_owned())
 }
 
@@ -122,9 +134,7 @@ pub(crate) fn recordings(paths: &[PathBuf]) -> Result<Vec<Recording>, Failure> {
     let mut read = Vec::with_capacity(paths.len());
     for path in paths {
         let mut recording = read_csv(path).map_err(|error| unreadable(path, error))?;
-        if paths.iter().any(|other| other != path && file_name(other) == recording.name) {
-            recording.name = path.display().to_string();
-        }
+        recording.name = called(path, paths);
         read.push(recording);
     }
     Ok(read)
@@ -168,6 +178,15 @@ pub(crate) fn blocks(
     let open = |path: &PathBuf| CsvBlocks::open(path, rows).map_err(|error| unreadable(path, error));
     let files = paths.iter().map(open).collect::<Result<Vec<_>, _>>()?;
     Ok(files.into_iter().flatten().map(|block| block.map_err(Failure::from)))
+}
+
+/// How the recording at `path` is called among those at `paths`: by its file name, unless another has it too.
+pub(crate) fn called(path: &Path, paths: &[PathBuf]) -> String {
+    let name = file_name(path);
+    match paths.iter().any(|other| other != path && file_name(other) == name) {
+        true => path.display().to_string(),
+        false => name,
+    }
 }
 
 /// Reads the recordings for training and those held out, and sees that no recording is both.

@@ -6,6 +6,7 @@
 mod answer;
 mod arguments;
 mod commands;
+mod done;
 mod failure;
 mod loading;
 mod log;
@@ -27,9 +28,7 @@ fn main() -> ExitCode {
         Ok(Ok(answer)) => answer.print(manner),
         Ok(Err(failure)) => failure.print(manner),
         // The default hook has said where on standard error.
-        Err(_) => {
-            Failure::internal("greybox met a fault of its own; please report the lines above").print(manner)
-        }
+        Err(_) => Failure::fault().print(manner),
     }
 }
 

@@ -1,8 +1,9 @@
 //! Writing results whole or not at all.
 
-use std::fs;
+use std::fs::{self, File, TryLockError};
 use std::io;
 use std::path::{Path, PathBuf};
+use std::sync::atomic::{AtomicUsize, Ordering};
 
 use crate::failure::Failure;
 
@@ -13,7 +14,15 @@ use crate::failure::Failure;
 #[derive(Debug)]
 pub(crate) struct OutputFolder {
     path: PathBuf,
+    /// Tells its files that wait from those of other folders of this process.
+    number: usize,
 }
+
+/// How many folders this process has made.
+static FOLDERS: AtomicUsize = AtomicUsize::new(0);
+
+/// Name of the files that wait: head, number of the process, number of the folder, tail.
+const WAITING: (&str, &str) = (".greybox-", ".partial");
 
 impl OutputFolder {
     /// The folder at `path`, which need not exist.
@@ -21,7 +30,7 @@ impl OutputFolder {
     /// # Errors
     /// Bad input when `path` or something above it is a file, or the folder cannot be written.
     pub(crate) fn prepare(path: &Path) -> Result<OutputFolder, Failure> {
-        let folder = OutputFolder { path: path.to_owned() };
+        let folder = OutputFolder { path: path.to_owned(), number: FOLDERS.fetch_add(1, Ordering::Relaxed) };
         if path.as_os_str().is_empty() {
             return Err(
                 Failure::input("the output folder has no name").mend("give one, such as `--out result`")
@@ -38,6 +47,10 @@ impl OutputFolder {
         let stage = folder.stage();
         fs::create_dir(&stage).and_then(|()| fs::remove_dir(&stage)).map_err(|e| folder.refused(&e))?;
         Ok(folder)
+    }
+
+    pub(crate) fn path(&self) -> &Path {
+        &self.path
     }
 
     /// Sees that writing `names` here would not replace one of `inputs`.
@@ -101,6 +114,32 @@ impl OutputFolder {
         result.map_err(|e| self.refused(&e))
     }
 
+    /// Makes the folder and keeps it for this process until the value returned is dropped, also by a kill. What a run
+    /// that was killed left waiting here goes.
+    ///
+    /// # Errors
+    /// Bad input when the folder cannot be made, or another process has it.
+    pub(crate) fn keep(&self) -> Result<Kept, Failure> {
+        let above = self.path.ancestors().take_while(|p| !p.as_os_str().is_empty() && !p.is_dir());
+        let made = above.map(Path::to_owned).collect();
+        fs::create_dir_all(&self.path).map_err(|e| self.refused(&e))?;
+        // Where the system cannot lock a folder, runs beside this one are up to the user.
+        let lock = File::open(&self.path).ok();
+        if let Some(Err(TryLockError::WouldBlock)) = lock.as_ref().map(File::try_lock) {
+            return Err(Failure::file(&self.path, "another run of greybox is writing to this folder")
+                .mend("wait for it to end, or name another folder after `--out`"));
+        }
+        let (head, tail) = WAITING;
+        for entry in fs::read_dir(&self.path).into_iter().flatten().flatten() {
+            let name = entry.file_name();
+            if name.to_str().is_some_and(|n| n.starts_with(head) && n.ends_with(tail)) {
+                // Best effort: nothing reads it.
+                let _ = fs::remove_dir_all(entry.path());
+            }
+        }
+        Ok(Kept { _lock: lock, made })
+    }
+
     /// Moves the staged files over those of an existing folder; puts the old ones back when one fails.
     fn replace(&self, stage: &Path, files: &[(&str, &[u8])]) -> io::Result<()> {
         let old = stage.join("replaced");
@@ -134,12 +173,31 @@ impl OutputFolder {
             true => Path::new("/"),
             false => Path::new("."),
         });
-        near.join(format!(".greybox-{}.partial", std::process::id()))
+        let (head, tail) = WAITING;
+        near.join(format!("{head}{}-{}{tail}", std::process::id(), self.number))
     }
 
     fn refused(&self, error: &io::Error) -> Failure {
         Failure::file(&self.path, format!("the output cannot be written: {error}"))
             .mend("name a place after `--out` that you may write to, and see that the disk has room")
+    }
+}
+
+/// A folder that is kept for this process.
+#[derive(Debug)]
+pub(crate) struct Kept {
+    _lock: Option<File>,
+    /// The folders that were made for it, the innermost first.
+    made: Vec<PathBuf>,
+}
+
+impl Kept {
+    /// Takes away again what was made and is still empty.
+    pub(crate) fn give_up(self) {
+        for folder in self.made {
+            // Not empty, or gone: either way it is not ours.
+            let _ = fs::remove_dir(folder);
+        }
     }
 }
 

@@ -3,9 +3,10 @@
 use std::fmt::Write as _;
 
 use greybox_report::contract::{
-    Finding, Fit, FitSet, Mechanism, Ordered, Parameter, Report, Score, Severity,
+    Finding, Fit, FitSet, Mechanism, Ordered, Parameter, Report, Score, Severity, Verdict,
 };
 use greybox_report::identified::{Equation, IdentifyReport};
+use greybox_report::summary::{Spread, Summary};
 use greybox_report::{expression, format, sentence};
 
 /// The story of a diagnosis: the conclusion, the mechanisms with their rivals, the fit, and what to know.
@@ -49,6 +50,55 @@ pub(crate) fn identification(report: &IdentifyReport) -> String {
     text.push_str(&held_out(&report.fit));
     text.push_str(&notes(&report.findings));
     text
+}
+
+/// The story of many recordings: the conclusion, the verdict on each, the errors over all, and what failed.
+pub(crate) fn summary(summary: &Summary) -> String {
+    let mut text = String::new();
+    for line in &summary.summary {
+        let _ = writeln!(text, "{line}");
+    }
+    let of = &summary.statistics;
+    let mut rows = vec![["recording", "verdict", "missing"].map(str::to_owned).to_vec()];
+    for r in &of.recordings {
+        let kinds: Vec<String> = r.mechanisms.iter().map(|m| format::kind_in_sentence(&m.law.kind)).collect();
+        rows.push(vec![r.recording.clone(), verdict(r.verdict).to_owned(), kinds.join(", ")]);
+    }
+    let _ = write!(text, "\n{}", aligned(&rows));
+    let mut rows = vec![["", "nominal", "calibrated", "improved"].map(str::to_owned).to_vec()];
+    for (channel, errors) in &summary.holdout {
+        let cells = [&errors.nominal, &errors.calibrated, &errors.improved].map(spread);
+        rows.push([vec![expression::text(channel)], cells.to_vec()].concat());
+    }
+    let _ =
+        write!(text, "\nHeld-out error (nrmse), median and range over the recordings:\n{}", aligned(&rows));
+    for failure in &of.failed {
+        let _ = writeln!(text, "Note: {} could not be diagnosed: {}", failure.recording, failure.message);
+        if let Some(mend) = &failure.mend {
+            let _ = writeln!(text, "      mend: {mend}");
+        }
+    }
+    text
+}
+
+fn verdict(of: Verdict) -> &'static str {
+    match of {
+        Verdict::Consistent => "consistent",
+        Verdict::MissingPhysics => "missing physics",
+        Verdict::Unexplained => "unexplained",
+    }
+}
+
+fn spread(s: &Spread) -> String {
+    match s.finite {
+        0 | 1 => format::percent(s.median),
+        _ => format!(
+            "{} ({} … {})",
+            format::percent(s.median),
+            format::percent(s.smallest),
+            format::percent(s.largest)
+        ),
+    }
 }
 
 /// The terms of one equation, as they stand in the model.

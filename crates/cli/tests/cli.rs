@@ -3,33 +3,15 @@
 // Helpers of a test file are tests too; the lint configuration knows only the annotated functions.
 #![allow(clippy::unwrap_used)]
 
-use std::fmt::Write as _;
 use std::fs;
 
 use common::{Bench, names};
 use serde_json::Value;
+use spring::{MODEL, TRUTH, recording};
 
 mod common;
-
-const MODEL: &str = r#"name = "Mass on a spring"
-
-[inputs]
-f = { unit = "N" }
-
-[states]
-x = { unit = "m" } # measured in mm
-
-[parameters]
-m = { value = 1.0, unit = "kg", fixed = true }
-b = { value = 0.5, unit = "N s/m" } # a guess
-k = { value = 30.0, unit = "N/m" }
-
-[equations]
-body = "m*x'' + b*x' + k*x = f"
-"#;
-
-/// True damping and stiffness of the recordings.
-const TRUTH: (f64, f64) = (0.8, 25.0);
+#[path = "common/spring.rs"]
+mod spring;
 
 /// A folder with `model.toml`, `run1.csv` and `run2.csv`.
 fn bench() -> Bench {
@@ -38,33 +20,6 @@ fn bench() -> Bench {
     bench.write("run1.csv", &recording(1200, 0.0));
     bench.write("run2.csv", &recording(900, 1.0));
     bench
-}
-
-/// `t, f [N], x [mm]` of a mass on a spring that starts at rest, simulated finely (semi-implicit Euler), with a
-/// noise of 0.2 mm from a small generator.
-fn recording(rows: usize, phase: f64) -> String {
-    let (b, k) = TRUTH;
-    let force = |t: f64| (2.0 * t + phase).sin() + (5.0 * t).sin();
-    let (mut x, mut v) = (0.0, 0.0);
-    let mut state = 12345u64;
-    let mut text = String::from("t,f [N],x [mm]\n");
-    let (dt, fine) = (0.01, 100);
-    for row in 0..rows {
-        let t = row as f64 * dt;
-        // Twelve uniform numbers make a normal one.
-        let mut noise = -6.0;
-        for _ in 0..12 {
-            state = state.wrapping_mul(6_364_136_223_846_793_005).wrapping_add(1_442_695_040_888_963_407);
-            noise += (state >> 33) as f64 / f64::from(1u32 << 31);
-        }
-        writeln!(text, "{t:.2},{:.6},{:.4}", force(t), 1e3 * x + 0.2 * noise).unwrap();
-        let h = dt / f64::from(fine);
-        for i in 0..fine {
-            v += h * (force(t + f64::from(i) * h) - b * v - k * x);
-            x += h * v;
-        }
-    }
-    text
 }
 
 /// Cells of a column, by position.
@@ -283,8 +238,9 @@ fn paths_that_lead_to_the_wrong_thing() {
     for arguments in with_both("nowhere.toml", "run1.csv") {
         bench.refuses(&arguments, &["nowhere.toml", "no such file", "mend"]);
     }
-    for arguments in with_both("model.toml", "folder") {
-        bench.refuses(&arguments, &["folder", "this is a folder"]);
+    // `diagnose` takes a folder of recordings.
+    for arguments in &with_both("model.toml", "folder")[1..] {
+        bench.refuses(arguments, &["folder", "this is a folder"]);
     }
     for arguments in with_both("folder", "run1.csv") {
         bench.refuses(&arguments, &["folder", "this is a folder", "mend"]);

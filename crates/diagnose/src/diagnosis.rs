@@ -133,6 +133,8 @@ pub struct Alternative {
 pub struct Finding {
     /// Kind.
     pub kind: String,
+    /// Family of the kind.
+    pub family: String,
     /// What it looks like.
     pub signature: String,
     /// Names of the equations it enters.
@@ -1026,6 +1028,7 @@ fn findings(
             }
             Finding {
                 kind: mechanism.kind.clone(),
+                family: mechanism.family.clone(),
                 signature: mechanism.about.signature.clone(),
                 equations: places,
                 channel,

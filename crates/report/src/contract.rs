@@ -31,6 +31,9 @@ pub struct Report {
     /// The nominal model that was examined.
     #[serde(default)]
     pub model: ModelId,
+    /// How many samples it learnt from and was judged on.
+    #[serde(default)]
+    pub samples: Samples,
     /// The conclusion.
     pub verdict: Verdict,
     /// The conclusion in plain language, one sentence per entry, most important first.
@@ -76,6 +79,15 @@ pub struct ModelId {
     pub file: String,
 }
 
+/// Samples of each channel, over all recordings of a role.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default, Serialize, Deserialize, JsonSchema)]
+pub struct Samples {
+    /// To choose and fit with.
+    pub train: usize,
+    /// Held out.
+    pub holdout: usize,
+}
+
 /// The conclusion of a diagnosis.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize, JsonSchema)]
 #[serde(rename_all = "snake_case")]
@@ -93,6 +105,9 @@ pub enum Verdict {
 pub struct Mechanism {
     /// Kind of the mechanism library, e.g. `coulomb_friction`.
     pub kind: String,
+    /// Family of the kind, e.g. `friction`.
+    #[serde(default, skip_serializing_if = "String::is_empty")]
+    pub family: String,
     /// Equation (or equations) of the model in which it acts.
     pub equation: Names,
     /// Measured channel, for the sensing kinds.
@@ -154,7 +169,7 @@ pub struct Experiment {
 }
 
 /// A name, or a list of names where more than one equation is meant.
-#[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize, JsonSchema)]
+#[derive(Debug, Clone, PartialEq, Eq, PartialOrd, Ord, Serialize, Deserialize, JsonSchema)]
 #[serde(untagged)]
 pub enum Names {
     /// Exactly one.

@@ -35,6 +35,7 @@ pub fn report(diagnosis: &Diagnosis, sources: &Sources<'_>) -> Report {
     let mut report = Report {
         greybox: Producer { version: env!("CARGO_PKG_VERSION").to_string(), seed: d.seed },
         model: ModelId { name: d.nominal.name.clone(), file: sources.model_file.to_string() },
+        samples: Samples { train: samples(&d.train.data), holdout: samples(&d.holdout.data) },
         verdict: match d.verdict {
             Answer::Consistent => Verdict::Consistent,
             Answer::MissingPhysics => Verdict::MissingPhysics,
@@ -67,6 +68,10 @@ pub fn report(diagnosis: &Diagnosis, sources: &Sources<'_>) -> Report {
     };
     report.summary = crate::sentence::summary(&report);
     report
+}
+
+fn samples(data: &Data) -> usize {
+    data.pieces.iter().map(|p| p.len).sum()
 }
 
 fn names(data: &Data) -> Vec<String> {
@@ -192,6 +197,7 @@ fn mechanism(found: &Found, improved: &Model, basis: &Basis) -> Mechanism {
         found.figures.iter().map(|(name, e)| (name.clone(), estimate(e, figure_unit(name).to_owned())));
     Mechanism {
         kind: found.kind.clone(),
+        family: found.family.clone(),
         equation: equation_names(&found.equations),
         channel: found.channel.clone(),
         expression: found.expression.clone(),
@@ -638,6 +644,7 @@ mod tests {
         let one = |value| Estimated { value, ci95: Some((0.9 * value, 1.1 * value)) };
         let found = Found {
             kind: "unmodeled_resonance".into(),
+            family: "structure".into(),
             signature: String::new(),
             equations: vec!["fall".into()],
             channel: None,

@@ -8,6 +8,7 @@
 
 mod control;
 mod identified;
+mod summary;
 
 use std::fmt::Write as _;
 

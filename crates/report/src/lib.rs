@@ -7,6 +7,8 @@
 //! - [`contract`]: the types of `report.json` and its JSON schema
 //! - [`identified`]: the same for an identification: [`IdentifyReport`]
 //! - [`control`]: what the page of a controller shows; [`ControlPage::to_html`] writes it
+//! - [`merge`]: many reports as one [`Summary`], by [`merge::map`] and [`merge::reduce`]; [`mod@summary`] has its types,
+//!   [`mod@pool`] the statistics
 //! - [`page`]: what the page shows beside it; [`Page::to_html`] writes the file
 //! - [`sentence`]: the conclusion in plain language, to fill [`Report::summary`]
 //! - [`suggest`]: the experiment that separates a mechanism from its rivals
@@ -39,15 +41,19 @@ pub mod expression;
 pub mod format;
 mod html;
 pub mod identified;
+pub mod merge;
 pub mod page;
+pub mod pool;
 pub mod sentence;
 pub mod suggest;
+pub mod summary;
 pub mod svg;
 
 pub use contract::Report;
 pub use control::ControlPage;
 pub use identified::IdentifyReport;
 pub use page::{IdentifyPage, Page};
+pub use summary::Summary;
 
 /// Why a report could not be written or read.
 #[derive(Debug, thiserror::Error)]

@@ -1,8 +1,9 @@
 //! The conclusion in plain language, worded from the numbers of a [`Report`]; [`identified`] does the same
-//! for an identification.
+//! for an identification, [`recordings`] for many recordings.
 
 pub mod control;
 pub mod identified;
+pub mod recordings;
 
 use crate::contract::{FitSet, Interval, Location, Mechanism, Names, Ordered, Report, Verdict};
 use crate::{expression, format};

@@ -1,12 +1,15 @@
-//! Drawings that need no script: the residual over the state space, a law against its points, poles of a loop.
+//! Drawings that need no script: the residual over the state space, a law against its points, poles of a loop, one
+//! number in many recordings.
 //!
 //! Sizes are in SVG user units; the page scales the drawing to its column. Every text is escaped.
 
 use std::fmt::Write as _;
 
+use crate::contract::Interval;
 use crate::expression::{escape, label};
 use crate::format;
 use crate::page::{MechanismPlot, StateMap};
+use crate::summary::Pooled;
 
 const WIDTH: f64 = 520.0;
 const HEIGHT: f64 = 350.0;
@@ -137,8 +140,12 @@ impl Frame {
 }
 
 fn open(alt: &str) -> String {
+    open_at("drawing", WIDTH, HEIGHT, alt)
+}
+
+fn open_at(class: &str, width: f64, height: f64, alt: &str) -> String {
     format!(
-        "<svg class=\"drawing\" viewBox=\"0 0 {WIDTH} {HEIGHT}\" role=\"img\" aria-label=\"{}\">",
+        "<svg class=\"{class}\" viewBox=\"0 0 {width} {height}\" role=\"img\" aria-label=\"{}\">",
         escape(alt)
     )
 }
@@ -416,6 +423,92 @@ fn unit_circle(frame: &Frame) -> String {
     path
 }
 
+/// Width of a forest plot, that of its names, and the height of a row.
+const FOREST: (f64, f64, f64) = (440.0, 130.0, 20.0);
+/// Most characters of a name.
+const NAME: usize = 16;
+
+/// A forest plot: estimates of one number with their 95 % intervals, one per row, and the pooled one as a diamond
+/// with a line through all rows. `None` when no value is finite.
+pub fn forest_plot(pooled: &Pooled, x_label: &str, alt: &str) -> Option<String> {
+    let (width, left, row) = FOREST;
+    let right = width - 14.0;
+    let bottom = TOP + row * (pooled.estimates.len() + 1) as f64;
+    let all = || {
+        let estimates = pooled.estimates.iter().map(|e| (e.value, e.ci95));
+        estimates.chain([(pooled.value, pooled.ci95)])
+    };
+    let ends = |(value, ci): (f64, Option<Interval>)| ci.map_or([value; 3], |ci| [value, ci.low, ci.high]);
+    let (low, high) = range(all().flat_map(ends), 0.04)?;
+    let px = |x: f64| left + (x - low) / (high - low) * (right - left);
+    let mut out = open_at("drawing forest", width, bottom + BOTTOM, alt);
+    let (ticks, decimals) = nice_ticks(low, high, 5);
+    for tick in ticks {
+        let (x, text) = (px(tick), tick_label(tick, decimals));
+        let _ = write!(
+            out,
+            "<path class=\"grid\" d=\"M{x:.1} {TOP}V{bottom}\"/>\
+             <text x=\"{x:.1}\" y=\"{:.1}\" text-anchor=\"middle\">{text}</text>",
+            bottom + 17.0
+        );
+    }
+    if pooled.value.is_finite() {
+        let _ = write!(out, "<path class=\"zero\" d=\"M{:.1} {TOP}V{bottom}\"/>", px(pooled.value));
+    }
+    for (k, e) in pooled.estimates.iter().enumerate() {
+        let y = TOP + row * (k as f64 + 0.5);
+        name(&mut out, left, y, &e.recording);
+        if let Some(ci) = e.ci95.filter(|ci| ci.low.is_finite() && ci.high.is_finite()) {
+            let _ =
+                write!(out, "<path class=\"whisker\" d=\"M{:.1} {y:.1}H{:.1}\"/>", px(ci.low), px(ci.high));
+        }
+        if e.value.is_finite() {
+            let _ =
+                write!(out, "<path class=\"mark\" d=\"M{:.1} {:.1}v7h-7v-7z\"/>", px(e.value) + 3.5, y - 3.5);
+        }
+    }
+    let y = bottom - 0.5 * row;
+    name(&mut out, left, y, "pooled");
+    if let Some(ci) = pooled.ci95.filter(|_| pooled.value.is_finite()) {
+        let (a, m, b) = (px(ci.low), px(pooled.value), px(ci.high));
+        // Never narrower than a mark.
+        let (a, b) = (a.min(m - 4.0), b.max(m + 4.0));
+        let _ = write!(
+            out,
+            "<path class=\"diamond\" d=\"M{a:.1} {y:.1}L{m:.1} {:.1}L{b:.1} {y:.1}L{m:.1} {:.1}Z\"/>",
+            y - 6.0,
+            y + 6.0
+        );
+    }
+    let _ = write!(
+        out,
+        "<path class=\"frame\" d=\"M{left} {TOP}H{right}V{bottom}H{left}Z\"/>\
+         <text class=\"axis\" x=\"{:.1}\" y=\"{:.1}\" text-anchor=\"middle\">{}</text></svg>",
+        0.5 * (left + right),
+        bottom + BOTTOM - 12.0,
+        escape(&label(x_label))
+    );
+    Some(out)
+}
+
+/// The name of a row, its middle left out where it is long: names often differ at their ends.
+fn name(out: &mut String, left: f64, y: f64, full: &str) {
+    let letters: Vec<char> = full.chars().collect();
+    let shown: String = if letters.len() > NAME {
+        let (head, tail) = (NAME / 2, NAME - NAME / 2 - 1);
+        letters[..head].iter().chain(&['…']).chain(&letters[letters.len() - tail..]).collect()
+    } else {
+        full.to_owned()
+    };
+    let _ = write!(
+        out,
+        "<text x=\"{:.1}\" y=\"{:.1}\" text-anchor=\"end\">{}</text>",
+        left - 8.0,
+        y + 4.5,
+        escape(&shown)
+    );
+}
+
 #[cfg(test)]
 mod tests {
     use super::*;
@@ -479,5 +572,38 @@ mod tests {
         // Beyond the frame: the outlier only, the frame reaches past the 99 % of x.
         assert_eq!((drawn.outside, drawn.every), (1, 1));
         assert!(!drawn.svg.contains("NaN"));
+    }
+
+    #[test]
+    fn a_forest_has_a_row_for_each_estimate_and_its_pooled_value() {
+        use crate::summary::{Method, RecordingEstimate};
+        let estimate = |recording: &str, value: f64, ci95: Option<Interval>| RecordingEstimate {
+            recording: recording.into(),
+            value,
+            ci95,
+        };
+        let mut pooled = Pooled {
+            value: 2.0,
+            ci95: Some(Interval::new(1.8, 2.2)),
+            unit: "N".into(),
+            method: Method::FixedEffect,
+            heterogeneity: None,
+            estimates: vec![
+                estimate("<a>.csv", 1.0, Some(Interval::new(0.5, 1.5))),
+                estimate("a_recording_of_monday_morning.csv", 3.0, None),
+            ],
+        };
+        let svg = forest_plot(&pooled, "fc [N]", "a \"forest\"").unwrap();
+        assert_eq!((svg.matches("class=\"mark\"").count(), svg.matches("class=\"whisker\"").count()), (2, 1));
+        assert_eq!(svg.matches("class=\"diamond\"").count(), 1);
+        assert!(svg.contains("&lt;a&gt;.csv") && svg.contains(">a_record…ing.csv<"), "{svg}");
+        assert!(svg.contains("a &quot;forest&quot;") && !svg.contains("NaN"), "{svg}");
+        // Ends of intervals may be unknown.
+        pooled.estimates[0].ci95 = Some(Interval::new(f64::NAN, 1.5));
+        assert!(!forest_plot(&pooled, "", "").unwrap().contains("NaN"));
+        pooled.value = f64::NAN;
+        pooled.ci95 = None;
+        pooled.estimates.clear();
+        assert_eq!(forest_plot(&pooled, "", ""), None);
     }
 }

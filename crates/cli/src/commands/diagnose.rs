@@ -1,10 +1,13 @@
 //! `greybox diagnose`: what physics does the model leave out?
 
+mod folder;
+
 use std::path::{Path, PathBuf};
 
 use clap::Args;
-use greybox_diagnose::Options;
+use greybox_diagnose::{Diagnosis, Options};
 use greybox_recording::Recording;
+use greybox_report::ReportError;
 use greybox_report::convert::{self, Sources};
 
 use crate::answer::Answer;
@@ -20,9 +23,14 @@ use crate::story;
 #[command(after_help = "Example:
   greybox diagnose link.toml run1.csv run2.csv --holdout run3.csv --out result
   greybox diagnose link.toml run1.csv --mechanisms mine --out result
+  greybox diagnose link.toml recordings --out results
 
 DIR receives report.json, report.html (self-contained, with plots) and improved.toml. With no --holdout, the
-last fifth of each recording is held out. The same seed and inputs give the same results.")]
+last fifth of each recording is held out. The same seed and inputs give the same results.
+
+A folder in the place of TRAIN.csv stands alone: each of its *.csv files that is not held out is diagnosed by
+itself, into a folder of its own in DIR, and summary.html and summary.json say what all say together. A run that
+was ended is gone on with by the same command: what is done is not done again.")]
 pub(crate) struct Arguments {
     #[command(flatten)]
     inputs: ModelStudy,
@@ -42,17 +50,37 @@ pub(crate) struct Arguments {
 
 const BILLION: u64 = 1_000_000_000;
 
+/// The files of a diagnosis.
+const RESULTS: [&str; 3] = ["report.json", "report.html", "improved.toml"];
+
+impl Arguments {
+    fn options(&self, own: Option<&Mechanisms>) -> Options {
+        Options {
+            seed: self.seed,
+            library: own.map(|o| o.library.mechanisms.clone()),
+            work: self.work.saturating_mul(BILLION),
+        }
+    }
+}
+
 pub(crate) fn run(arguments: &Arguments) -> Result<Answer, Failure> {
     let own = arguments.mechanisms.as_deref().map(loading::mechanisms).transpose()?;
+    let train = &arguments.inputs.study.train;
+    match (train.as_slice(), train.iter().find(|path| path.is_dir())) {
+        ([alone], Some(_)) => return folder::run(arguments, alone, own.as_ref()),
+        (_, Some(folder)) => {
+            return Err(Failure::file(
+                folder,
+                "this is a folder, which stands alone as the place of recordings",
+            )
+            .mend("name the folder alone, or every recording by its own name"));
+        }
+        (_, None) => {}
+    }
     let (loaded, recordings) = arguments.inputs.read()?;
-    let results = ["report.json", "report.html", "improved.toml"];
-    let out = arguments.inputs.folder(&results)?;
-    out.spares(&results, own.iter().flat_map(|own| &own.files))?;
-    let options = Options {
-        seed: arguments.seed,
-        library: own.as_ref().map(|o| o.library.mechanisms.clone()),
-        work: arguments.work.saturating_mul(BILLION),
-    };
+    let out = arguments.inputs.folder(&RESULTS)?;
+    out.spares(&RESULTS, own.iter().flat_map(|own| &own.files))?;
+    let options = arguments.options(own.as_ref());
     let results = diagnose(&loaded, &recordings.train, &recordings.holdout, &options)?;
     results.write(&out)?;
     let tried = own.as_ref().map(tried).unwrap_or_default();
@@ -105,12 +133,34 @@ impl Results {
     /// # Errors
     /// As [`OutputFolder::write`].
     pub(crate) fn write_with(&self, out: &OutputFolder, others: &[(&str, &[u8])]) -> Result<(), Failure> {
-        let own: [(&str, &[u8]); 3] = [
-            ("report.json", self.report_json.as_bytes()),
-            ("report.html", self.report_html.as_bytes()),
-            ("improved.toml", self.improved_toml.as_bytes()),
-        ];
-        out.write(&[&own, others].concat())
+        out.write(&[&self.files(), others].concat())
+    }
+
+    /// The files, by name.
+    fn files(&self) -> [(&'static str, &[u8]); 3] {
+        let [json, html, toml] = RESULTS;
+        [
+            (json, self.report_json.as_bytes()),
+            (html, self.report_html.as_bytes()),
+            (toml, self.improved_toml.as_bytes()),
+        ]
+    }
+
+    /// What is told of a finished diagnosis of these recordings.
+    fn of(
+        diagnosis: &Diagnosis,
+        loaded: &LoadedModel,
+        train: &[Recording],
+        holdout: &[Recording],
+    ) -> Result<Results, Failure> {
+        let sources = Sources { model_file: &loaded.file, model_text: &loaded.text, train, holdout };
+        let report = convert::report(diagnosis, &sources);
+        let report_json = report.to_json().map_err(unwritten)?;
+        let json = serde_json::from_str(&report_json).map_err(|e| unwritten(e.into()))?;
+        let story = story::diagnosis(&report);
+        let report_html = convert::page(diagnosis, report, &sources).to_html().map_err(unwritten)?;
+        let improved_toml = convert::improved_toml(diagnosis, &loaded.text);
+        Ok(Results { report_json, report_html, improved_toml, story, json })
     }
 }
 
@@ -127,13 +177,9 @@ pub(crate) fn diagnose(
     let progress = Progress::open();
     let diagnosis = greybox_diagnose::diagnose(&loaded.model, train, holdout, options, &progress)?;
     progress.stage("writing the report");
-    let sources = Sources { model_file: &loaded.file, model_text: &loaded.text, train, holdout };
-    let report = convert::report(&diagnosis, &sources);
-    let unwritten = |e: greybox_report::ReportError| Failure::internal(e.to_string());
-    let report_json = report.to_json().map_err(unwritten)?;
-    let json = serde_json::from_str(&report_json).map_err(|e| unwritten(e.into()))?;
-    let story = story::diagnosis(&report);
-    let report_html = convert::page(&diagnosis, report, &sources).to_html().map_err(unwritten)?;
-    let improved_toml = convert::improved_toml(&diagnosis, &loaded.text);
-    Ok(Results { report_json, report_html, improved_toml, story, json })
+    Results::of(&diagnosis, loaded, train, holdout)
+}
+
+fn unwritten(error: ReportError) -> Failure {
+    Failure::internal(error.to_string())
 }

@@ -5,7 +5,8 @@ use std::f64::consts::TAU;
 
 use greybox_report::contract::{
     Alternative, Estimate, Experiment, Finding, Fit, FitSet, InputHold, Interval, Location, Mechanism,
-    ModelId, Ordered, Parameter, Producer, RecordingFit, Remainder, Report, Score, Severity, Verdict,
+    ModelId, Ordered, Parameter, Producer, RecordingFit, Remainder, Report, Samples, Score, Severity,
+    Verdict,
 };
 use greybox_report::page::{
     Channel, Input, MechanismPlot, ModelTexts, Page, Recording, Residual, Role, Spectrum, StateMap,
@@ -275,6 +276,7 @@ fn map<V>(entries: impl IntoIterator<Item = (&'static str, V)>) -> Ordered<V> {
 fn mechanism(windows: Vec<Interval>) -> Mechanism {
     Mechanism {
         kind: "coulomb_friction".to_owned(),
+        family: "friction".to_owned(),
         equation: "hub".into(),
         channel: None,
         expression: "fc*sign(theta')".to_owned(),
@@ -395,6 +397,7 @@ pub(crate) fn page() -> Page {
             name: "Rotary flexible link, linear nominal".to_owned(),
             file: "link.toml".to_owned(),
         },
+        samples: Samples { train: train.recording.t.len(), holdout: test.recording.t.len() },
         verdict: Verdict::MissingPhysics,
         summary: Vec::new(),
         mechanisms: vec![mechanism(windows.clone())],
