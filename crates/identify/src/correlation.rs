@@ -13,6 +13,9 @@ pub(crate) struct Lagged {
 /// Lags over which a correlation time is summed at most.
 pub(crate) const LONGEST: usize = 400;
 
+/// Lags that mostly tell.
+pub(crate) const FEW: usize = 20;
+
 impl Lagged {
     /// Lags from 0 to `lags` of stretches of residuals.
     pub(crate) fn of<'a>(stretches: impl IntoIterator<Item = &'a [f64]>, lags: usize) -> Lagged {
@@ -32,26 +35,31 @@ impl Lagged {
         self.samples += other.samples;
     }
 
+    /// ρ of the lags from one on, as far as it is beyond chance.
+    fn beyond(&self) -> impl Iterator<Item = f64> {
+        let zero = self.sums[0];
+        let chance = 2.5 / (self.samples as f64).sqrt();
+        self.sums[1..].iter().map(move |s| s / zero).take_while(move |rho| zero > 0.0 && *rho >= chance)
+    }
+
     /// 1 + 2 Σ ρ, summed over lags while ρ is beyond chance.
     pub(crate) fn time(&self) -> f64 {
-        let zero = self.sums[0];
-        if zero <= 0.0 {
-            return 1.0;
-        }
-        let chance = 2.5 / (self.samples as f64).sqrt();
-        let beyond = self.sums[1..].iter().map(|s| s / zero).take_while(|rho| *rho >= chance);
-        beyond.fold(1.0, |time, rho| time + 2.0 * rho)
+        self.beyond().fold(1.0, |time, rho| time + 2.0 * rho)
+    }
+
+    /// Whether ρ falls to chance within the lags: more of them would not change [`time`](Self::time).
+    pub(crate) fn is_enough(&self) -> bool {
+        self.beyond().count() + 1 < self.sums.len()
     }
 
     /// Whether they look white: Ljung–Box over twenty lags at the 0.1 % level.
     pub(crate) fn is_white(&self) -> bool {
-        const LAGS: usize = 20;
         let (zero, n) = (self.sums[0], self.samples as f64);
-        let lags = self.sums[1..].iter().take(LAGS).enumerate();
+        let lags = self.sums[1..].iter().take(FEW).enumerate();
         let q = lags.map(|(l, c)| (c / zero).powi(2) / (n - l as f64 - 1.0).max(1.0)).sum::<f64>()
             * n
             * (n + 2.0);
-        // Upper 0.1 % point of χ² with twenty degrees of freedom.
+        // Upper 0.1 % point of χ² with so many degrees of freedom.
         q < 45.315
     }
 }
@@ -85,6 +93,16 @@ mod tests {
         let white = autoregression(0.0, 200_000);
         let lagged = Lagged::of([&white[..]], LONGEST);
         assert!(lagged.is_white() && lagged.time() < 1.1);
+    }
+
+    #[test]
+    fn a_few_lags_are_enough_where_more_say_the_same() {
+        for (rho, enough) in [(0.0, true), (0.5, true), (0.95, false)] {
+            let e = autoregression(rho, 100_000);
+            let [few, all] = [FEW, LONGEST].map(|lags| Lagged::of([&e[..]], lags));
+            assert_eq!(few.is_enough(), enough, "{rho}");
+            assert_eq!(few.time() == all.time(), enough, "{rho}");
+        }
     }
 
     #[test]

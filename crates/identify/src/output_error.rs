@@ -13,7 +13,7 @@ use greybox_calibrate::{Data, Fit, Free, Level, Limits, Point, Segment, SegmentR
 use rayon::prelude::*;
 
 use crate::choose::{Reduced, Roles};
-use crate::correlation::{LONGEST, Lagged};
+use crate::correlation::{FEW, LONGEST, Lagged};
 use crate::structure::Structure;
 
 /// Misfit, relative to a channel's spread, that counts as numerical: integration, rounding in the file.
@@ -171,8 +171,6 @@ pub(crate) struct Projected {
 pub(crate) struct Wide {
     /// The model with all of them.
     pub setup: Setup,
-    /// Coefficients around which it is linearised.
-    pub theta: Vec<f64>,
     /// Its segments.
     pub segments: Vec<Projected>,
     /// Residual sum of squares per channel, scaled.
@@ -181,16 +179,12 @@ pub(crate) struct Wide {
     pub count: Vec<usize>,
 }
 
-impl Wide {
-    /// Column of each candidate (none: it has no coefficient, or is not allowed).
-    pub(crate) fn columns(&self, structure: &Structure, wanted: &[bool]) -> Vec<Option<usize>> {
-        let free = &self.setup.free;
-        let of = |name: &str| {
-            self.setup.model.parameter(name).and_then(|i| free.iter().position(|f| f.index == i))
-        };
-        let wanted = structure.terms.iter().zip(wanted);
-        wanted.map(|(t, wanted)| if *wanted { of(&t.parameter) } else { None }).collect()
-    }
+/// Column of each candidate among those of a model that has all `wanted` (none: it has no coefficient, or is not
+/// wanted): coefficients stand in the order of the candidates, before what the extras have.
+pub(crate) fn columns(structure: &Structure, wanted: &[bool]) -> Vec<Option<usize>> {
+    let mut next = 0..;
+    let has = |i: usize| wanted[i] && structure.has_coefficient(i);
+    (0..wanted.len()).map(|i| if has(i) { next.next() } else { None }).collect()
 }
 
 /// Both, term by term.
@@ -227,7 +221,7 @@ pub(crate) fn widen(structure: &Structure, refined: &Refined, allowed: &[bool]) 
         })
         .collect();
     let finite = segments.iter().all(|s| s.z.iter().chain(&s.j).all(|v| v.is_finite()));
-    finite.then_some(Wide { setup: wide, theta, segments, rss, count })
+    finite.then_some(Wide { setup: wide, segments, rss, count })
 }
 
 /// The triangle of [J | z] over segments of `stride − 1` coefficients.
@@ -283,9 +277,9 @@ pub(crate) fn linearise(
     blocks: usize,
 ) -> Option<Linearised> {
     let wide = widen(structure, refined, allowed)?;
-    let np = wide.theta.len();
+    let np = wide.setup.free.len();
     let t = triangle_of(&wide.segments, np + 1);
-    let column = wide.columns(structure, &either(&refined.state.active, allowed));
+    let column = columns(structure, &either(&refined.state.active, allowed));
     let count: usize = refined.fit.count.iter().sum();
     let floor = floor(&refined.setup.data.spread, &refined.scale);
     let projected = &wide.segments;
@@ -301,12 +295,22 @@ pub(crate) fn linearise(
 
 /// Correlation time of the residual with coefficients `theta`, the longest of the channels.
 fn correlation_time(projected: &[Projected], theta: &[f64], refined: &Refined, ny: usize) -> f64 {
-    let lagged = lagged(projected, theta, &refined.level.segments, ny);
-    lagged.iter().map(Lagged::time).fold(1.0, f64::max)
+    let segments = &refined.level.segments;
+    // Mostly a few lags tell.
+    let few = lagged(projected, theta, segments, ny, FEW);
+    let all =
+        if few.iter().all(Lagged::is_enough) { few } else { lagged(projected, theta, segments, ny, LONGEST) };
+    all.iter().map(Lagged::time).fold(1.0, f64::max)
 }
 
 /// Lagged products of the residual with coefficients `theta`, channel by channel.
-pub(crate) fn lagged(projected: &[Projected], theta: &[f64], segments: &[Segment], ny: usize) -> Vec<Lagged> {
+pub(crate) fn lagged(
+    projected: &[Projected],
+    theta: &[f64],
+    segments: &[Segment],
+    ny: usize,
+    lags: usize,
+) -> Vec<Lagged> {
     let residuals: Vec<Vec<f64>> = projected
         .par_iter()
         .map(|s| {
@@ -322,7 +326,7 @@ pub(crate) fn lagged(projected: &[Projected], theta: &[f64], segments: &[Segment
             let m = segment.range.len();
             &e[c * m..(c + 1) * m]
         });
-        Lagged::of(stretches, LONGEST)
+        Lagged::of(stretches, lags)
     };
     (0..ny).map(of_channel).collect()
 }

@@ -5,7 +5,7 @@ use rand::RngExt;
 use rand_pcg::Pcg64Mcg;
 use rayon::prelude::*;
 
-use crate::correlation::Lagged;
+use crate::correlation::{FEW, Lagged};
 use crate::identify::Options;
 use crate::output_error::{self, Linearised, Refined};
 use crate::structure::Structure;
@@ -84,7 +84,7 @@ pub(crate) fn assess(
             let m = segment.range.len();
             &s.r[c * m..(c + 1) * m]
         });
-        Lagged::of(stretches, 20).is_white()
+        Lagged::of(stretches, FEW).is_white()
     };
     let correlated = !(0..setup.system.ny).all(white);
     let gradients = if correlated { gradients(&projected, np) } else { Vec::new() };

@@ -16,7 +16,7 @@ use rayon::prelude::*;
 use serde::{Deserialize, Serialize};
 
 use crate::choose::Reduced;
-use crate::correlation::Lagged;
+use crate::correlation::{LONGEST, Lagged};
 use crate::error::IdentifyError;
 use crate::identify::{
     self, Blocks, HoldoutSource, Identification, Observer, Options, Search, conclude, search,
@@ -42,12 +42,14 @@ const MOST: f64 = 1e6;
 ///
 /// [`identify_blocks`] drives it; an engine that works over many machines can do so itself: [`begin`](Self::begin) on
 /// one block, [`map`](Self::map) on every block wherever it is, [`Statistics::merge`] in the order of the blocks,
-/// [`step`](Self::step), and again until [`is_settled`](Self::is_settled).
+/// [`step`](Self::step), and again until [`is_settled`](Self::is_settled); then [`conclude`](Self::conclude).
 #[derive(Debug, Clone)]
 pub struct Linearisation {
     search: Search,
     /// Samples of a segment.
     segment: usize,
+    /// Steps made, and how far the last one went in half-widths of the intervals.
+    steps: usize,
     moved: f64,
 }
 
@@ -98,6 +100,11 @@ impl Statistics {
         Ok(self)
     }
 
+    /// The triangle of all blocks.
+    fn triangle(&self) -> Vec<f64> {
+        stack(&self.groups, self.around.len() + 1)
+    }
+
     /// Gradient Jᵀ(z − J θ) of a group.
     fn gradient(group: &[f64], theta: &[f64]) -> Vec<f64> {
         let stride = theta.len() + 1;
@@ -135,7 +142,7 @@ impl Linearisation {
         let search = search(std::slice::from_ref(block), options, observer)?;
         let samples: usize = search.data.lengths().iter().sum();
         let segment = samples.div_ceil(search.refined.level.segments.len().max(1));
-        Ok(Self { search, segment, moved: f64::INFINITY })
+        Ok(Self { search, segment, steps: 0, moved: f64::INFINITY })
     }
 
     /// Reduces a block.
@@ -170,12 +177,12 @@ impl Linearisation {
                 lost: samples,
                 rss: vec![0.0; ny],
                 count: vec![0; ny],
-                lagged: vec![Lagged::of([], crate::correlation::LONGEST); ny],
+                lagged: vec![Lagged::of([], LONGEST); ny],
             });
         };
         Ok(Statistics {
             groups: vec![triangle_of(&wide.segments, around.len() + 1)],
-            lagged: output_error::lagged(&wide.segments, &around, &here.level.segments, ny),
+            lagged: output_error::lagged(&wide.segments, &around, &here.level.segments, ny, LONGEST),
             around,
             blocks: 1,
             segments: here.level.segments.len(),
@@ -188,38 +195,26 @@ impl Linearisation {
 
     /// Coefficients of all candidates that have a column.
     fn theta(&self) -> Vec<f64> {
-        let Search { structure, refined, .. } = &self.search;
-        let wanted = self.wanted();
-        let has = |i: &usize| wanted[*i] && structure.has_coefficient(*i);
-        (0..wanted.len()).filter(has).map(|i| refined.state.values[i]).collect()
+        let values = self.columns().into_iter().zip(&self.search.refined.state.values);
+        values.filter_map(|(column, value)| column.map(|_| *value)).collect()
     }
 
-    fn wanted(&self) -> Vec<bool> {
-        either(&self.search.refined.state.active, &self.search.first.allowed)
-    }
-
-    /// Column of each candidate: in the order of the candidates.
+    /// Column of each candidate.
     fn columns(&self) -> Vec<Option<usize>> {
-        let mut next = 0..;
-        let wanted = self.wanted();
-        let has = |i: usize| wanted[i] && self.search.structure.has_coefficient(i);
-        (0..wanted.len()).map(|i| if has(i) { next.next() } else { None }).collect()
+        let Search { structure, first, refined, .. } = &self.search;
+        output_error::columns(structure, &either(&refined.state.active, &first.allowed))
     }
 
-    /// The regression of all blocks, as many rows in it as are independent, and its groups.
-    fn linearised(&self, statistics: &Statistics) -> Linearised {
+    /// The regression of all blocks by their triangle, as many rows in it as are independent; no blocks to resample.
+    fn linearised(&self, statistics: &Statistics, triangle: &[f64]) -> (Linearised, f64) {
         let np = statistics.around.len();
-        let t = stack(&statistics.groups, np + 1);
         let count: usize = statistics.count.iter().sum();
         let time = statistics.lagged.iter().map(Lagged::time).fold(1.0, f64::max);
         let share = (1.0 / time).min(MOST / count as f64);
         let refined = &self.search.refined;
         let floor = floor(&refined.setup.data.spread, &refined.scale);
-        Linearised {
-            reduced: Reduced::from_triangle(&t, np, count as f64, floor).weighted(share),
-            column: self.columns(),
-            blocks: statistics.groups.iter().map(|g| Statistics::gram(g, np + 1, share)).collect(),
-        }
+        let reduced = Reduced::from_triangle(triangle, np, count as f64, floor).weighted(share);
+        (Linearised { reduced, column: self.columns(), blocks: Vec::new() }, share)
     }
 
     /// The choice of terms and their estimates from all blocks: one step of Gauss–Newton.
@@ -235,9 +230,10 @@ impl Linearisation {
             return Err(IdentifyError::NoFit);
         }
         let Search { structure, first, refined, .. } = &self.search;
-        let linear = self.linearised(statistics);
+        let triangle = statistics.triangle();
+        let (linear, _) = self.linearised(statistics, &triangle);
         let solution = linear.reduced.choose(&linear.roles(structure, &first.allowed));
-        let half = self.half(statistics, &solution.columns, &solution.values);
+        let half = self.half(statistics, &triangle, &solution.columns, &solution.values);
         let mut state = refined.state.clone();
         let mut moved = 0.0_f64;
         for (i, column) in linear.column.iter().enumerate() {
@@ -259,7 +255,8 @@ impl Linearisation {
         let mut fit = refined.fit.clone();
         fit.point.parameters = setup.values();
         let refined = Refined { state, setup, fit, scale, rounds: refined.rounds + 1, ..refined.clone() };
-        Ok(Self { search: Search { refined, ..self.search.clone() }, segment: self.segment, moved })
+        let search = Search { refined, ..self.search.clone() };
+        Ok(Self { search, segment: self.segment, steps: self.steps + 1, moved })
     }
 
     /// Whether the last step left the choice as it was and moved no coefficient by a tenth of its interval.
@@ -269,10 +266,9 @@ impl Linearisation {
     }
 
     /// Half-widths of the 95 % intervals of `values`, the coefficients of `columns`.
-    fn half(&self, statistics: &Statistics, columns: &[usize], values: &[f64]) -> Vec<f64> {
+    fn half(&self, statistics: &Statistics, t: &[f64], columns: &[usize], values: &[f64]) -> Vec<f64> {
         let (np, k) = (statistics.around.len(), columns.len());
         let stride = np + 1;
-        let t = stack(&statistics.groups, stride);
         // The triangle of the chosen columns and the right-hand side.
         let mut a = vec![0.0; stride * (k + 1)];
         for (to, &from) in columns.iter().chain([&np]).enumerate() {
@@ -306,7 +302,10 @@ impl Linearisation {
     /// Intervals and inclusion probabilities of the model from the statistics of its last step.
     fn precision(&self, statistics: &Statistics, options: &Options) -> Precision {
         let Search { structure, first, refined, .. } = &self.search;
-        let linear = self.linearised(statistics);
+        let triangle = statistics.triangle();
+        let (mut linear, share) = self.linearised(statistics, &triangle);
+        let stride = statistics.around.len() + 1;
+        linear.blocks = statistics.groups.iter().map(|g| Statistics::gram(g, stride, share)).collect();
         let chosen: Vec<(usize, f64)> = linear
             .column
             .iter()
@@ -315,13 +314,39 @@ impl Linearisation {
             .filter_map(|(i, c)| Some(((*c)?, refined.state.values[i])))
             .collect();
         let (columns, values): (Vec<usize>, Vec<f64>) = chosen.into_iter().unzip();
-        let half = self.half(statistics, &columns, &values);
+        let half = self.half(statistics, &triangle, &columns, &values);
         let of = |c: &Option<usize>| columns.iter().position(|k| Some(*k) == *c).map(|at| half[at]);
         Precision {
             half: linear.column.iter().map(of).collect(),
             inclusion: precision::inclusion(structure, &linear, &first.allowed, options),
             ..Precision::default()
         }
+    }
+
+    /// The equations after the last step, whose `statistics` give their intervals; `holdout` is only simulated.
+    ///
+    /// # Errors
+    /// [`IdentifyError::Data`] where a channel of `holdout` is missing, [`IdentifyError::NoFit`] where the model
+    /// cannot be simulated on the first block.
+    pub fn conclude(
+        &self,
+        statistics: &Statistics,
+        holdout: &[Recording],
+        source: HoldoutSource,
+        options: &Options,
+    ) -> Result<Identification, IdentifyError> {
+        let precision = self.precision(statistics, options);
+        let Search { structure, data, first, refined } = &self.search;
+        let mut found = conclude(structure, data, refined, &precision, first, holdout, source, options)?;
+        found.segments = statistics.segments;
+        found.blocks = Some(Blocks {
+            blocks: statistics.blocks,
+            samples: statistics.samples,
+            lost: statistics.lost,
+            passes: self.steps,
+            settled: self.is_settled(),
+        });
+        Ok(found)
     }
 }
 
@@ -360,31 +385,19 @@ where
     };
     drop((blocks, second));
     let mut around = Linearisation::begin(&first, options, observer)?;
-    let mut passes = 0;
     let (statistics, last) = loop {
-        passes += 1;
-        let (statistics, last) = pass(&around, open()?, holdout.is_empty(), passes, observer)?;
+        let (statistics, last) = pass(&around, open()?, holdout.is_empty(), observer)?;
         around = around.step(&statistics)?;
-        if around.is_settled() || passes == PASSES {
+        if around.is_settled() || around.steps == PASSES {
             break (statistics, last);
         }
     };
     observer.stage("precision");
-    let precision = around.precision(&statistics, options);
-    let Search { structure, data, first: estimates, refined } = &around.search;
     let (held, source) = match last {
         Some(last) => (vec![last], HoldoutSource::LastBlock),
         None => (holdout.to_vec(), HoldoutSource::Given),
     };
-    let mut found = conclude(structure, data, refined, &precision, estimates, &held, source, options)?;
-    found.segments = statistics.segments;
-    found.blocks = Some(Blocks {
-        blocks: statistics.blocks,
-        samples: statistics.samples,
-        lost: statistics.lost,
-        passes,
-        settled: around.is_settled(),
-    });
+    let found = around.conclude(&statistics, &held, source, options)?;
     Ok(Streamed { found, first, holdout: held })
 }
 
@@ -393,7 +406,6 @@ fn pass<E: From<IdentifyError>>(
     around: &Linearisation,
     mut blocks: impl Iterator<Item = Result<Recording, E>>,
     keep: bool,
-    number: usize,
     observer: &dyn Observer,
 ) -> Result<(Statistics, Option<Recording>), E> {
     let most = 2 * rayon::current_num_threads().max(1);
@@ -426,6 +438,6 @@ fn pass<E: From<IdentifyError>>(
         }
         waiting.extend(last);
         let samples = statistics.as_ref().map_or(0, Statistics::samples);
-        observer.stage(&format!("pass {number}, {samples} samples"));
+        observer.stage(&format!("pass {}, {samples} samples", around.steps + 1));
     }
 }
