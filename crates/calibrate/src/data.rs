@@ -241,6 +241,11 @@ impl Data {
             .collect()
     }
 
+    /// Number of samples of each channel, over all pieces.
+    pub fn samples(&self) -> usize {
+        self.pieces.iter().map(|p| p.len).sum()
+    }
+
     /// Number of samples of each piece.
     pub fn lengths(&self) -> Vec<usize> {
         self.pieces.iter().map(|p| p.len).collect()

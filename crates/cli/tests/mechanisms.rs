@@ -8,8 +8,11 @@ use std::fs;
 use std::path::Path;
 
 use common::Bench;
+use noise::Noise;
 
 mod common;
+#[path = "common/noise.rs"]
+mod noise;
 
 const MODEL: &str = r#"name = "Slide on a spring"
 
@@ -32,24 +35,18 @@ slide = "m*x'' + b*x' + k*x = f"
 const TRUTH: (f64, f64, f64) = (30.0, 0.8, 25.0);
 
 /// The slide with friction `fb*x^2*sign(x')`, simulated finely: in each step friction takes what it can of the
-/// velocity and never turns it round, so that the slide sticks. Noise of 0.2 mm from a small generator.
+/// velocity and never turns it round, so that the slide sticks. Noise of 0.2 mm.
 fn recording(rows: usize, phase: f64) -> String {
     let (fb, b, k) = TRUTH;
     let force =
         |t: f64| 3.0 * (1.7 * t + phase).sin() + 2.5 * (4.1 * t).sin() + 1.5 * (9.0 * t + phase).sin();
     let (mut x, mut v) = (0.05, 0.0);
-    let mut state = 2024u64;
+    let mut noise = Noise(2024);
     let mut text = String::from("t,f [N],x [m]\n");
     let (dt, fine) = (0.02, 200);
     for row in 0..rows {
         let t = row as f64 * dt;
-        // Twelve uniform numbers make a normal one.
-        let mut noise = -6.0;
-        for _ in 0..12 {
-            state = state.wrapping_mul(6_364_136_223_846_793_005).wrapping_add(1_442_695_040_888_963_407);
-            noise += (state >> 33) as f64 / f64::from(1u32 << 31);
-        }
-        writeln!(text, "{t:.2},{:.6},{:.6}", force(t), x + 2e-4 * noise).unwrap();
+        writeln!(text, "{t:.2},{:.6},{:.6}", force(t), x + 2e-4 * noise.normal()).unwrap();
         let h = dt / f64::from(fine);
         let (now, next) = (force(t), force(t + dt));
         for i in 0..fine {

@@ -297,7 +297,7 @@ pub fn layout(model: &Model, train: &[Recording], holdout: &[Recording]) -> Resu
     let whole = Data::new(model, train)?;
     let needed =
         4 * model.states.iter().map(|s| s.order).sum::<usize>() + 4 * model.parameters.len().min(8) + 8;
-    let found: usize = whole.pieces.iter().map(|p| p.len).sum();
+    let found = whole.samples();
     if found < needed {
         return Err(DiagnoseError::TooShort { file: whole.recordings.join(", "), found, needed });
     }

@@ -266,7 +266,7 @@ pub(crate) fn search(
     let extras: Vec<f64> = structure.extras.iter().flat_map(|e| &e.parameters).map(|p| p.1).collect();
     let whole = structure.model(&all, &ones, &extras)?;
     let data = Arc::new(Data::new(&whole, fit_on)?);
-    let samples: usize = data.pieces.iter().map(|p| p.len).sum();
+    let samples = data.samples();
     if structure.terms.len() * 4 > samples {
         return Err(IdentifyError::TooManyTerms { candidates: structure.terms.len(), samples });
     }

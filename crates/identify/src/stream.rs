@@ -140,7 +140,7 @@ impl Linearisation {
             return Err(IdentifyError::DelayInBlocks);
         }
         let search = search(std::slice::from_ref(block), options, observer)?;
-        let samples: usize = search.data.lengths().iter().sum();
+        let samples = search.data.samples();
         let segment = samples.div_ceil(search.refined.level.segments.len().max(1));
         Ok(Self { search, segment, steps: 0, moved: f64::INFINITY })
     }
@@ -152,7 +152,7 @@ impl Linearisation {
     pub fn map(&self, block: &Recording) -> Result<Statistics, IdentifyError> {
         let Search { structure, first, refined, .. } = &self.search;
         let data = Arc::new(Data::new(&refined.setup.model, std::slice::from_ref(block))?);
-        let samples: usize = data.lengths().iter().sum();
+        let samples = data.samples();
         let setup = refined.setup.with_data(data);
         let still = Setup { free: Vec::new(), ..setup.clone() };
         let level = still.level((samples as f64 / self.segment as f64).round().max(1.0) as usize);

@@ -35,7 +35,7 @@ pub fn report(diagnosis: &Diagnosis, sources: &Sources<'_>) -> Report {
     let mut report = Report {
         greybox: Producer { version: env!("CARGO_PKG_VERSION").to_string(), seed: d.seed },
         model: ModelId { name: d.nominal.name.clone(), file: sources.model_file.to_string() },
-        samples: Samples { train: samples(&d.train.data), holdout: samples(&d.holdout.data) },
+        samples: Samples { train: d.train.data.samples(), holdout: d.holdout.data.samples() },
         verdict: match d.verdict {
             Answer::Consistent => Verdict::Consistent,
             Answer::MissingPhysics => Verdict::MissingPhysics,
@@ -68,10 +68,6 @@ pub fn report(diagnosis: &Diagnosis, sources: &Sources<'_>) -> Report {
     };
     report.summary = crate::sentence::summary(&report);
     report
-}
-
-fn samples(data: &Data) -> usize {
-    data.pieces.iter().map(|p| p.len).sum()
 }
 
 fn names(data: &Data) -> Vec<String> {

@@ -43,6 +43,9 @@ pub struct IdentifyReport {
     pub delay: Ordered<Delay>,
     /// How well the identified model (`improved`) reproduces the measurements.
     pub fit: Fit,
+    /// How the recordings were read, where in blocks.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub blocks: Option<Blocks>,
     /// Estimated measurement-noise RMS over RMS(measurement − its mean), by channel: the `nrmse` that no
     /// model can beat.
     #[serde(with = "number_map")]
@@ -58,6 +61,21 @@ pub struct IdentifyReport {
     /// Data health and other observations that a reader must know.
     #[serde(default)]
     pub findings: Vec<Finding>,
+}
+
+/// Recordings that were read in blocks; `fit.train` is that of the first one.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize, JsonSchema)]
+pub struct Blocks {
+    /// Blocks that the equations were fitted to.
+    pub blocks: usize,
+    /// Their samples.
+    pub samples: usize,
+    /// Samples of blocks on which the model could not be simulated.
+    pub lost: usize,
+    /// Passes over the recordings.
+    pub passes: usize,
+    /// Whether the last pass moved no coefficient by more than a tenth of its interval's half-width.
+    pub settled: bool,
 }
 
 /// One equation: Σ value × term = input.

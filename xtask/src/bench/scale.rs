@@ -99,15 +99,12 @@ fn one(binary: &Path, folder: &Path, samples: usize) -> Result<Length> {
         bail!("greybox identify failed: {}", std::fs::read_to_string(folder.join("stderr.txt"))?.trim());
     }
     let report: Value = serde_json::from_str(&std::fs::read_to_string(out.join("report.json"))?)?;
-    let read = report["findings"].as_array().into_iter().flatten().find(|f| f["code"] == "blocks");
-    let passes =
-        read.and_then(|f| f["message"].as_str()?.split_once("read ")?.1.split(' ').next()?.parse().ok());
     let length = Length {
         samples,
         file: std::fs::metadata(&file)?.len(),
         seconds: run.cpu.unwrap_or(run.seconds),
         memory: run.peak_bytes,
-        passes,
+        passes: report["blocks"]["passes"].as_u64(),
         error: worst(&report)?,
     };
     std::fs::remove_file(&file)?;

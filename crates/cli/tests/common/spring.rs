@@ -3,6 +3,11 @@
 
 use std::fmt::Write as _;
 
+use noise::Noise;
+
+#[path = "noise.rs"]
+mod noise;
+
 /// The nominal model.
 pub(crate) const MODEL: &str = r#"name = "Mass on a spring"
 
@@ -25,23 +30,17 @@ body = "m*x'' + b*x' + k*x = f"
 pub(crate) const TRUTH: (f64, f64) = (0.8, 25.0);
 
 /// `t, f [N], x [mm]` of a mass on a spring that starts at rest, simulated finely (semi-implicit Euler), with a
-/// noise of 0.2 mm from a small generator.
+/// noise of 0.2 mm.
 pub(crate) fn recording(rows: usize, phase: f64) -> String {
     let (b, k) = TRUTH;
     let force = |t: f64| (2.0 * t + phase).sin() + (5.0 * t).sin();
     let (mut x, mut v) = (0.0, 0.0);
-    let mut state = 12345u64;
+    let mut noise = Noise(12345);
     let mut text = String::from("t,f [N],x [mm]\n");
     let (dt, fine) = (0.01, 100);
     for row in 0..rows {
         let t = row as f64 * dt;
-        // Twelve uniform numbers make a normal one.
-        let mut noise = -6.0;
-        for _ in 0..12 {
-            state = state.wrapping_mul(6_364_136_223_846_793_005).wrapping_add(1_442_695_040_888_963_407);
-            noise += (state >> 33) as f64 / f64::from(1u32 << 31);
-        }
-        writeln!(text, "{t:.2},{:.6},{:.4}", force(t), 1e3 * x + 0.2 * noise).unwrap();
+        writeln!(text, "{t:.2},{:.6},{:.4}", force(t), 1e3 * x + 0.2 * noise.normal()).unwrap();
         let h = dt / f64::from(fine);
         for i in 0..fine {
             v += h * (force(t + f64::from(i) * h) - b * v - k * x);

@@ -3,7 +3,7 @@
 
 use std::sync::Arc;
 
-use greybox_identify::{Blocks, FoundDelay, FoundEquation, HoldoutSource, Identification, Role as RoleRun};
+use greybox_identify::{FoundDelay, FoundEquation, HoldoutSource, Identification, Role as RoleRun};
 use greybox_model::{Hold, Model, Unit, WriteOptions};
 use greybox_recording::Recording;
 
@@ -13,7 +13,7 @@ use super::{
 use crate::contract::{Finding, Fit, FitSet, InputHold, ModelId, Ordered, Producer, RecordingFit, Severity};
 use crate::format;
 use crate::identified::{
-    Delay, Doubtful, Equation, IdentifyReport, Order, OrderValue, Term, Variable, VariableRole,
+    Blocks, Delay, Doubtful, Equation, IdentifyReport, Order, OrderValue, Term, Variable, VariableRole,
 };
 use crate::page::{self, IdentifyPage, Residual};
 use crate::sentence;
@@ -60,6 +60,13 @@ pub fn report(found: &Identification, sources: &Sources<'_>) -> IdentifyReport {
         },
         delay: found.delays.iter().map(|d| (d.state.clone(), delay(d, &found.model, units))).collect(),
         fit: fit(found),
+        blocks: found.blocks.map(|b| Blocks {
+            blocks: b.blocks,
+            samples: b.samples,
+            lost: b.lost,
+            passes: b.passes,
+            settled: b.settled,
+        }),
         noise_floor: channels.iter().cloned().zip(found.noise_floor.iter().copied()).collect(),
         misfit: channels.into_iter().zip(found.misfit.iter().copied()).collect(),
         inputs: found
@@ -76,7 +83,7 @@ pub fn report(found: &Identification, sources: &Sources<'_>) -> IdentifyReport {
             .collect(),
         findings: health_findings(&found.model, sources.train.iter().chain(sources.holdout)),
     };
-    report.findings.extend(found.blocks.iter().flat_map(blocks));
+    report.findings.extend(report.blocks.iter().flat_map(blocks));
     report.summary = sentence::identified::summary(&report);
     report
 }
