@@ -191,8 +191,12 @@ impl Setup {
         let ladder = [
             Method::Rk4 { substeps: 1 },
             Method::Dp5 { substeps: 1 },
+            // As dear as two steps of the fifth order; where the past is interpolated, two steps may be better.
+            Method::Dop853 { substeps: 1 },
             Method::Dp5 { substeps: 2 },
+            Method::Dop853 { substeps: 2 },
             Method::Dp5 { substeps: 4 },
+            Method::Dop853 { substeps: 4 },
             Method::Dp5 { substeps: 8 },
             Method::Dp5 { substeps: 16 },
         ];

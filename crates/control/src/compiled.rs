@@ -1,7 +1,7 @@
 //! Expressions of states compiled for fast evaluation, with exact derivatives.
 
 use greybox_model::Expr;
-use greybox_model::tape::{LeafKind, Tape, UnknownName};
+use greybox_model::tape::{LeafKind, Tangents, Tape, UnknownName};
 use nalgebra::DMatrix;
 
 /// Functions of n variables.
@@ -12,7 +12,7 @@ pub(crate) struct Compiled {
     registers: Vec<f64>,
     modes: Vec<i8>,
     variables: usize,
-    active: Vec<bool>,
+    tangents: Tangents,
 }
 
 impl Compiled {
@@ -39,8 +39,8 @@ impl Compiled {
         }
         tape.prepare(&mut registers, &mut modes);
         let leaves: Vec<bool> = (0..tape.leaves()).map(|i| i < n).collect();
-        let active = tape.activity(&leaves, false);
-        Ok(Compiled { tape, registers, modes, variables: n, active })
+        let tangents = tape.tangents(&leaves);
+        Ok(Compiled { tape, registers, modes, variables: n, tangents })
     }
 
     fn run(&self, x: &[f64]) -> (Vec<f64>, Vec<i8>) {
@@ -68,7 +68,7 @@ impl Compiled {
         for i in 0..n {
             d[i * n + i] = 1.0;
         }
-        self.tape.tangent(&registers, &modes, &[], n, &self.active, &mut d);
+        self.tape.tangent(&self.tangents, &registers, &modes, n, &mut d);
         DMatrix::from_fn(self.tape.outputs.len(), n, |i, j| d[self.tape.outputs[i] as usize * n + j])
     }
 }

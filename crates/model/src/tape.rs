@@ -15,7 +15,13 @@
 
 use std::collections::HashMap;
 
+use code::Code;
+pub use tangents::Tangents;
+
 use crate::expr::{BinOp, Expr, Func};
+
+mod code;
+mod tangents;
 
 /// A register number.
 pub type Reg = u32;
@@ -204,6 +210,9 @@ pub struct Tape {
     constants: Vec<f64>,
     ops: Vec<Op>,
     prologue: usize,
+    /// What runs the prologue, and what runs the rest.
+    prepared: Vec<Code>,
+    code: Vec<Code>,
     /// Registers of the compiled expressions, in the order they were given.
     pub outputs: Vec<Reg>,
     /// Non-smooth nodes in the order they are evaluated.
@@ -433,7 +442,7 @@ impl<'a> Compiler<'a> {
                 r
             }
         };
-        let ops = order
+        let ops: Vec<Op> = order
             .iter()
             .map(|&i| match self.ops[i].0 {
                 Op::Neg(a) => Op::Neg(at(a)),
@@ -457,6 +466,8 @@ impl<'a> Compiler<'a> {
             leaves,
             kinds: self.kinds,
             constants: self.constants.clone(),
+            prepared: code::compile(&ops[..prologue], first_op),
+            code: code::compile(&ops[prologue..], first_op + prologue),
             ops,
             prologue,
             outputs: outputs.iter().map(|&r| at(r)).collect(),
@@ -519,195 +530,52 @@ impl Tape {
     /// Fills the constants and evaluates the operations that depend on parameters alone. The
     /// parameters' leaves must be set. Modes of switches in the prologue are set from their values.
     pub fn prepare(&self, regs: &mut [f64], modes: &mut [i8]) {
-        regs[self.leaves..self.first_op()].copy_from_slice(&self.constants);
-        self.run::<true>(0, self.prologue, regs, modes, &[]);
+        let first = self.first_op();
+        regs[self.leaves..first].copy_from_slice(&self.constants);
+        code::run::<true>(&self.prepared, first, &self.switches, regs, modes, &[]);
     }
 
     /// Evaluates the body with fixed modes; `lambda[k]` is the value of a sticking `sign` `k`.
     #[inline]
     pub fn eval(&self, regs: &mut [f64], modes: &mut [i8], lambda: &[f64]) {
-        self.run::<false>(self.prologue, self.ops.len(), regs, modes, lambda);
+        code::run::<false>(&self.code, self.first_op() + self.prologue, &self.switches, regs, modes, lambda);
     }
 
     /// Evaluates the body with every mode taken from the arguments' values as they are met, and
     /// leaves the modes in `modes`.
     pub fn eval_natural(&self, regs: &mut [f64], modes: &mut [i8]) {
-        self.run::<true>(self.prologue, self.ops.len(), regs, modes, &[]);
+        code::run::<true>(&self.code, self.first_op() + self.prologue, &self.switches, regs, modes, &[]);
     }
 
-    #[inline(always)]
-    fn run<const NATURAL: bool>(
-        &self,
-        from: usize,
-        to: usize,
-        regs: &mut [f64],
-        modes: &mut [i8],
-        lambda: &[f64],
-    ) {
-        let first = self.first_op();
-        for (i, op) in self.ops[from..to].iter().enumerate() {
-            let g = |r: Reg| regs[r as usize];
-            let v = match *op {
-                Op::Neg(a) => -g(a),
-                Op::Add(a, b) => g(a) + g(b),
-                Op::Sub(a, b) => g(a) - g(b),
-                Op::Mul(a, b) => g(a) * g(b),
-                Op::Div(a, b) => g(a) / g(b),
-                Op::Powi(a, n) => powi(g(a), n),
-                Op::Pow(a, b) => g(a).powf(g(b)),
-                Op::Sqrt(a) => g(a).sqrt(),
-                Op::Sin(a) => g(a).sin(),
-                Op::Cos(a) => g(a).cos(),
-                Op::Tan(a) => g(a).tan(),
-                Op::Exp(a) => g(a).exp(),
-                Op::Ln(a) => g(a).ln(),
-                Op::Tanh(a) => g(a).tanh(),
-                Op::Switch(k) => {
-                    let s = &self.switches[k as usize];
-                    let (a, b) = (g(s.a), g(s.b));
-                    if NATURAL {
-                        modes[k as usize] = s.natural_mode(a, b);
-                        s.value(modes[k as usize], 0.0, a, b)
-                    } else {
-                        s.value(modes[k as usize], lambda[k as usize], a, b)
-                    }
-                }
-            };
-            regs[first + from + i] = v;
-        }
+    /// Which registers can have a non-zero derivative when the leaves marked in `leaf_active` have, and how
+    /// each is computed. (The value of a sticking sign counts as a constant.)
+    pub fn tangents(&self, leaf_active: &[bool]) -> Tangents {
+        Tangents::new(&self.ops, self.prologue, self.first_op(), &self.switches, leaf_active)
     }
 
     /// Directional derivatives of every register for `lanes` directions at the point whose values
     /// stand in `regs`. `d` is `registers × lanes`, row major; the leaves' rows (and, for the body,
-    /// the prologue's) must be set. `dlambda` is `switches × lanes`: derivatives of the values of
-    /// sticking signs. `active[r]` false promises a zero row and skips the work.
-    pub fn tangent(
-        &self,
-        regs: &[f64],
-        modes: &[i8],
-        dlambda: &[f64],
-        lanes: usize,
-        active: &[bool],
-        d: &mut [f64],
-    ) {
-        self.run_tangent(self.prologue, self.ops.len(), regs, modes, dlambda, lanes, active, d);
+    /// the prologue's) must be set, rows that are not active zero.
+    ///
+    /// Inlined, so that a caller's literal `lanes` and instruction set are those of its loops.
+    #[inline(always)]
+    pub fn tangent(&self, tangents: &Tangents, regs: &[f64], modes: &[i8], lanes: usize, d: &mut [f64]) {
+        let at = tangents::Place { regs, modes, switches: &self.switches };
+        tangents::run(&tangents.body, at, lanes, d);
     }
 
     /// [`tangent`](Self::tangent) of the prologue: once per simulation.
-    pub fn prepare_tangent(&self, regs: &[f64], modes: &[i8], lanes: usize, active: &[bool], d: &mut [f64]) {
-        d[self.leaves * lanes..self.first_op() * lanes].fill(0.0);
-        self.run_tangent(0, self.prologue, regs, modes, &[], lanes, active, d);
-    }
-
-    /// Which registers can have a non-zero derivative when the leaves marked in `leaf_active` have.
-    /// `any_lambda`: whether sticking signs have derivatives.
-    pub fn activity(&self, leaf_active: &[bool], any_lambda: bool) -> Vec<bool> {
-        let mut active = vec![false; self.registers()];
-        active[..self.leaves].copy_from_slice(leaf_active);
-        let first = self.first_op();
-        for (i, op) in self.ops.iter().enumerate() {
-            active[first + i] = match *op {
-                Op::Neg(a)
-                | Op::Powi(a, _)
-                | Op::Sqrt(a)
-                | Op::Sin(a)
-                | Op::Cos(a)
-                | Op::Tan(a)
-                | Op::Exp(a)
-                | Op::Ln(a)
-                | Op::Tanh(a) => active[a as usize],
-                Op::Add(a, b) | Op::Sub(a, b) | Op::Mul(a, b) | Op::Div(a, b) | Op::Pow(a, b) => {
-                    active[a as usize] || active[b as usize]
-                }
-                Op::Switch(k) => {
-                    let s = &self.switches[k as usize];
-                    match s.kind {
-                        SwitchKind::Sign => any_lambda,
-                        SwitchKind::Step => false,
-                        _ => active[s.a as usize] || active[s.b as usize],
-                    }
-                }
-            };
-        }
-        active
-    }
-
-    fn run_tangent(
+    pub fn prepare_tangent(
         &self,
-        from: usize,
-        to: usize,
+        tangents: &Tangents,
         regs: &[f64],
         modes: &[i8],
-        dlambda: &[f64],
         lanes: usize,
-        active: &[bool],
         d: &mut [f64],
     ) {
-        let first = self.first_op();
-        for (i, op) in self.ops[from..to].iter().enumerate() {
-            let out = first + from + i;
-            let (lower, upper) = d.split_at_mut(out * lanes);
-            let o = &mut upper[..lanes];
-            if !active[out] {
-                o.fill(0.0);
-                continue;
-            }
-            let v = |r: Reg| regs[r as usize];
-            let row = |r: Reg| &lower[r as usize * lanes..][..lanes];
-            let scaled = |o: &mut [f64], a: Reg, k: f64| scale(o, row(a), k);
-            let blended = |o: &mut [f64], a: Reg, ka: f64, b: Reg, kb: f64| match (
-                active[a as usize],
-                active[b as usize],
-            ) {
-                (true, false) => scale(o, row(a), ka),
-                (false, true) => scale(o, row(b), kb),
-                _ => blend(o, row(a), ka, row(b), kb),
-            };
-            match *op {
-                Op::Neg(a) => scaled(o, a, -1.0),
-                Op::Add(a, b) => blended(o, a, 1.0, b, 1.0),
-                Op::Sub(a, b) => blended(o, a, 1.0, b, -1.0),
-                Op::Mul(a, b) => blended(o, a, v(b), b, v(a)),
-                Op::Div(a, b) => blended(o, a, 1.0 / v(b), b, -v(a) / (v(b) * v(b))),
-                Op::Powi(a, n) => scaled(o, a, n as f64 * powi(v(a), n - 1)),
-                Op::Pow(a, b) => {
-                    let (x, y) = (v(a), v(b));
-                    let log = if active[b as usize] { x.powf(y) * x.ln() } else { 0.0 };
-                    blended(o, a, y * x.powf(y - 1.0), b, log);
-                }
-                // At 0 the slope of the root is infinite; a zero derivative keeps lanes finite
-                // where a state rests at the boundary of its domain (an empty tank).
-                Op::Sqrt(a) => {
-                    let root = regs[out];
-                    scaled(o, a, if root > 0.0 { 0.5 / root } else { 0.0 })
-                }
-                Op::Sin(a) => scaled(o, a, v(a).cos()),
-                Op::Cos(a) => scaled(o, a, -v(a).sin()),
-                Op::Tan(a) => scaled(o, a, 1.0 + regs[out] * regs[out]),
-                Op::Exp(a) => scaled(o, a, regs[out]),
-                Op::Ln(a) => scaled(o, a, 1.0 / v(a)),
-                Op::Tanh(a) => scaled(o, a, 1.0 - regs[out] * regs[out]),
-                Op::Switch(k) => {
-                    let s = &self.switches[k as usize];
-                    let mode = modes[k as usize];
-                    let m = mode as f64;
-                    use SwitchKind::*;
-                    match s.kind {
-                        Sign if mode == 0 && !dlambda.is_empty() => {
-                            o.copy_from_slice(&dlambda[k as usize * lanes..][..lanes]);
-                        }
-                        Sign | Step => o.fill(0.0),
-                        Abs => scaled(o, s.a, m),
-                        Max => scaled(o, if mode > 0 { s.a } else { s.b }, 1.0),
-                        Min => scaled(o, if mode > 0 { s.b } else { s.a }, 1.0),
-                        Deadzone if mode == 0 => o.fill(0.0),
-                        Deadzone => blended(o, s.a, 1.0, s.b, -m),
-                        Saturate if mode == 0 => scaled(o, s.a, 1.0),
-                        Saturate => scaled(o, s.b, m),
-                    }
-                }
-            }
-        }
+        let at = tangents::Place { regs, modes, switches: &self.switches };
+        d[self.leaves * lanes..self.first_op() * lanes].fill(0.0);
+        tangents::run(&tangents.prologue, at, lanes, d);
     }
 
     /// Evaluates the outputs at `n` points; every non-smooth function pointwise, sign(0) = 0.
@@ -795,24 +663,6 @@ pub enum Column<'a> {
     Series(&'a [f64]),
 }
 
-/// o = k x.
-#[inline(always)]
-fn scale(o: &mut [f64], x: &[f64], k: f64) {
-    let x = &x[..o.len()];
-    for l in 0..o.len() {
-        o[l] = k * x[l];
-    }
-}
-
-/// o = a x + b y.
-#[inline(always)]
-fn blend(o: &mut [f64], x: &[f64], a: f64, y: &[f64], b: f64) {
-    let (x, y) = (&x[..o.len()], &y[..o.len()]);
-    for l in 0..o.len() {
-        o[l] = a * x[l] + b * y[l];
-    }
-}
-
 #[inline]
 fn powi(x: f64, n: i32) -> f64 {
     match n {
@@ -887,13 +737,13 @@ mod tests {
             regs[..3].copy_from_slice(&[x, v, k]);
             tape.prepare(&mut regs, &mut modes);
             tape.eval_natural(&mut regs, &mut modes);
-            let active = tape.activity(&[true, true, true], false);
+            let tangents = tape.tangents(&[true, true, true]);
             let mut d = vec![0.0; tape.registers() * 3];
             for i in 0..3 {
                 d[i * 3 + i] = 1.0;
             }
-            tape.prepare_tangent(&regs, &modes, 3, &active, &mut d);
-            tape.tangent(&regs, &modes, &[], 3, &active, &mut d);
+            tape.prepare_tangent(&tangents, &regs, &modes, 3, &mut d);
+            tape.tangent(&tangents, &regs, &modes, 3, &mut d);
             let row = &d[tape.outputs[0] as usize * 3..][..3];
             let h = 1e-6;
             let numeric = [
@@ -913,6 +763,42 @@ mod tests {
         let tape = Tape::compile(&[k2() * Expr::var("x"), k2() + Expr::var("x")], kinds(), &names).unwrap();
         assert_eq!(tape.prologue, 1);
         assert_eq!(tape.body_len(), 2);
+    }
+
+    #[test]
+    fn operations_in_pairs_round_as_they_do_one_by_one() {
+        let (x, v) = (|| Expr::var("x"), || Expr::prime("x", 1));
+        let (k, square) = (|| Expr::var("k") * x(), || x().pow(Expr::Num(2.0)));
+        let exprs = [
+            x() * v() + k(),
+            v() + v() * k(),
+            Expr::var("k") * v() - x(),
+            x() - v() * v(),
+            x() * v() * k() * v(),
+            v() * (k() * square()),
+            square() + v(),
+            (v() * k()) * (v() * k()),
+            square() - square(),
+        ];
+        let tape = Tape::compile(&exprs, kinds(), &names).unwrap();
+        assert!(tape.code.len() + 5 < tape.body_len(), "{:?}", tape.code);
+        let xs: Vec<f64> = (0..40).map(|i| (0.37 * i as f64).sin() * 3.0).collect();
+        let vs: Vec<f64> = (0..40).map(|i| (0.91 * i as f64).cos() * 0.7).collect();
+        let batch = tape.eval_batch(40, &|i| match i {
+            0 => Column::Series(&xs),
+            1 => Column::Series(&vs),
+            _ => Column::Value(1.0 / 3.0),
+        });
+        let mut regs = vec![0.0; tape.registers()];
+        regs[2] = 1.0 / 3.0;
+        tape.prepare(&mut regs, &mut []);
+        for (i, (x, v)) in xs.iter().zip(&vs).enumerate() {
+            regs[..2].copy_from_slice(&[*x, *v]);
+            tape.eval(&mut regs, &mut [], &[]);
+            for (one_by_one, &r) in batch.iter().zip(&tape.outputs) {
+                assert_eq!(regs[r as usize].to_bits(), one_by_one[i].to_bits());
+            }
+        }
     }
 
     #[test]

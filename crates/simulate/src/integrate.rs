@@ -31,9 +31,11 @@
 
 use greybox_model::Hold;
 use greybox_model::system::System;
-use greybox_model::tape::SwitchKind;
+use greybox_model::tape::{SwitchKind, Tangents};
+use pulp::{Arch, Simd, WithSimd};
 
-use crate::signal::Signal;
+use crate::aligned::Aligned;
+use crate::signal::{Piece, Signal};
 use crate::small;
 
 /// How to step.
@@ -46,6 +48,11 @@ pub enum Method {
     },
     /// Dormand–Prince 5 with fixed steps.
     Dp5 {
+        /// Steps per sample interval (≥ 1).
+        substeps: usize,
+    },
+    /// The eighth-order method of Dormand and Prince (DOP853, twelve stages) with fixed steps.
+    Dop853 {
         /// Steps per sample interval (≥ 1).
         substeps: usize,
     },
@@ -167,11 +174,106 @@ static DP5: Tableau = Tableau {
     e: &[71.0 / 57600.0, 0.0, -71.0 / 16695.0, 71.0 / 1920.0, -17253.0 / 339200.0, 22.0 / 525.0, -1.0 / 40.0],
 };
 
+// Hairer, Nørsett & Wanner, Solving Ordinary Differential Equations I, section II.5: the eighth-order method of DOP853.
+static DOP853: Tableau = Tableau {
+    a: &[
+        &[],
+        &[0.05260015195876773],
+        &[0.0197250569845379, 0.0591751709536137],
+        &[0.02958758547680685, 0.0, 0.08876275643042054],
+        &[0.2413651341592667, 0.0, -0.8845494793282861, 0.924834003261792],
+        &[0.037037037037037035, 0.0, 0.0, 0.17082860872947386, 0.12546768756682242],
+        &[0.037109375, 0.0, 0.0, 0.17025221101954405, 0.06021653898045596, -0.017578125],
+        &[
+            0.03709200011850479,
+            0.0,
+            0.0,
+            0.17038392571223998,
+            0.10726203044637328,
+            -0.015319437748624402,
+            0.008273789163814023,
+        ],
+        &[
+            0.6241109587160757,
+            0.0,
+            0.0,
+            -3.3608926294469414,
+            -0.868219346841726,
+            27.59209969944671,
+            20.154067550477894,
+            -43.48988418106996,
+        ],
+        &[
+            0.47766253643826434,
+            0.0,
+            0.0,
+            -2.4881146199716677,
+            -0.590290826836843,
+            21.230051448181193,
+            15.279233632882423,
+            -33.28821096898486,
+            -0.020331201708508627,
+        ],
+        &[
+            -0.9371424300859873,
+            0.0,
+            0.0,
+            5.186372428844064,
+            1.0914373489967295,
+            -8.149787010746927,
+            -18.52006565999696,
+            22.739487099350505,
+            2.4936055526796523,
+            -3.0467644718982196,
+        ],
+        &[
+            2.273310147516538,
+            0.0,
+            0.0,
+            -10.53449546673725,
+            -2.0008720582248625,
+            -17.9589318631188,
+            27.94888452941996,
+            -2.8589982771350235,
+            -8.87285693353063,
+            12.360567175794303,
+            0.6433927460157636,
+        ],
+    ],
+    b: &[
+        0.054293734116568765,
+        0.0,
+        0.0,
+        0.0,
+        0.0,
+        4.450312892752409,
+        1.8915178993145003,
+        -5.801203960010585,
+        0.3111643669578199,
+        -0.1521609496625161,
+        0.20136540080403034,
+        0.04471061572777259,
+    ],
+    c: &[
+        0.0,
+        0.05260015195876773,
+        0.0789002279381516,
+        0.1183503419072274,
+        0.2816496580927726,
+        0.3333333333333333,
+        0.25,
+        0.3076923076923077,
+        0.6512820512820513,
+        0.6,
+        0.8571428571428571,
+        1.0,
+    ],
+    e: &[],
+};
+
 /// One evaluation of the right-hand side, kept for the tangent pass.
 struct Stage {
     regs: Vec<f64>,
-    f: Vec<f64>,
-    z: Vec<f64>,
     lu: Vec<f64>,
     pivots: Vec<usize>,
     slopes: Vec<f64>,
@@ -575,19 +677,115 @@ pub fn integrate(
     Simulation { system, environment: env, parameters, method, seeds }.run(x0, range)
 }
 
-/// h Σ weight · f of entry `r` over the stages; a weight of zero takes no part.
-#[inline]
-fn along(stages: &[Stage], weights: &[f64], h: f64, r: usize) -> f64 {
-    let mut sum = 0.0;
-    for (stage, &weight) in stages.iter().zip(weights) {
-        if weight != 0.0 {
-            sum += weight * stage.f[r];
+/// ẋ of every stage.
+struct Rates {
+    /// Entry by entry, the stages of one side by side.
+    f: Vec<f64>,
+    stages: usize,
+}
+
+impl Rates {
+    fn new(entries: usize, stages: usize) -> Rates {
+        Rates { f: vec![0.0; entries * stages], stages }
+    }
+
+    fn at(&self, stage: usize, entry: usize) -> f64 {
+        self.f[entry * self.stages + stage]
+    }
+
+    fn set(&mut self, stage: usize, entry: usize, value: f64) {
+        self.f[entry * self.stages + stage] = value;
+    }
+
+    fn stage(&self, stage: usize) -> impl Iterator<Item = f64> {
+        self.f.iter().skip(stage).step_by(self.stages).copied()
+    }
+
+    fn swap(&mut self, a: usize, b: usize) {
+        self.f.chunks_exact_mut(self.stages).for_each(|entry| entry.swap(a, b));
+    }
+
+    /// out = x + h Σ weight · f over the stages that have a weight.
+    #[inline(always)]
+    fn along(&self, out: &mut [f64], x: &[f64], weights: &[f64], h: f64) {
+        for ((out, x), f) in out.iter_mut().zip(x).zip(self.f.chunks_exact(self.stages)) {
+            *out = x + h * dot(weights, f);
         }
     }
-    h * sum
+}
+
+#[inline(always)]
+fn dot(weights: &[f64], f: &[f64]) -> f64 {
+    weights.iter().zip(f).fold(0.0, |sum, (w, f)| sum + w * f)
+}
+
+/// out = x + Σ h · weight · k, k one block as long as x after the other; a weight of zero takes no part.
+#[inline(always)]
+fn tangents_along(out: &mut [f64], x: &[f64], k: &[f64], weights: &[f64], h: f64) {
+    let n = x.len();
+    let mut terms =
+        weights.iter().enumerate().filter(|w| *w.1 != 0.0).map(|(j, w)| (h * w, &k[j * n..][..n]));
+    let out = &mut out[..n];
+    match (terms.next(), terms.next()) {
+        (None, _) => out.copy_from_slice(x),
+        (Some((a, ka)), None) => {
+            for e in 0..n {
+                out[e] = x[e] + a * ka[e];
+            }
+        }
+        (Some((a, ka)), Some((b, kb))) => {
+            for e in 0..n {
+                out[e] = x[e] + a * ka[e] + b * kb[e];
+            }
+        }
+    }
+    while let Some((a, ka)) = terms.next() {
+        match terms.next() {
+            None => {
+                for e in 0..n {
+                    out[e] += a * ka[e];
+                }
+            }
+            Some((b, kb)) => {
+                for e in 0..n {
+                    out[e] = out[e] + a * ka[e] + b * kb[e];
+                }
+            }
+        }
+    }
+}
+
+/// The sensitivities' step, with the machine's widest vectors (which round as any others: products and sums are not
+/// fused).
+struct TangentStep<'c, 'a> {
+    core: &'c mut Core<'a>,
+    h: f64,
+}
+
+impl WithSimd for TangentStep<'_, '_> {
+    type Output = ();
+
+    #[inline(always)]
+    fn with_simd<S: Simd>(self, _: S) {
+        let TangentStep { core, h } = self;
+        // Loops of known length for the usual widths.
+        match core.width {
+            4 => core.tangent_step_of(h, 4),
+            8 => core.tangent_step_of(h, 8),
+            12 => core.tangent_step_of(h, 12),
+            16 => core.tangent_step_of(h, 16),
+            width => core.tangent_step_of(h, width),
+        }
+    }
+}
+
+/// The stride of a row of `lanes` tangents: a multiple of four, whose spare lanes are zero.
+fn width(lanes: usize) -> usize {
+    if lanes > 2 { lanes.next_multiple_of(4) } else { lanes }
 }
 
 struct Core<'a> {
+    arch: Arch,
     system: &'a System,
     env: &'a Environment,
     seeds: &'a Seeds,
@@ -595,7 +793,15 @@ struct Core<'a> {
     substeps: usize,
     tolerance: Option<(f64, f64)>,
     lanes: usize,
+    /// Stride of a row of tangents.
+    width: usize,
     stages: Vec<Stage>,
+    rates: Rates,
+    /// What the inputs do around the time `mid`.
+    pieces: Vec<Piece>,
+    mid: f64,
+    /// The register that each entry of ẋ is.
+    source: Vec<usize>,
     modes: Vec<i8>,
     sticking: Vec<usize>,
     live: Vec<usize>,
@@ -603,19 +809,16 @@ struct Core<'a> {
     s: f64,
     x: Vec<f64>,
     x1: Vec<f64>,
-    xs: Vec<f64>,
     reach: Vec<f64>,
-    dx: Vec<f64>,
-    dxs: Vec<f64>,
-    dk: Vec<f64>,
-    d: Vec<f64>,
-    active: Vec<bool>,
-    b: Vec<f64>,
-    dlambda: Vec<f64>,
+    dx: Aligned,
+    dk: Aligned,
+    d: Aligned,
+    tangents: Tangents,
+    b: Aligned,
     /// Tangents of what holds the sticking switches.
     dl: Vec<f64>,
     gd: Vec<f64>,
-    gactive: Vec<bool>,
+    along: Tangents,
     h_next: f64,
     fresh: bool,
     /// Whether the delayed expressions remember this stretch's start.
@@ -627,8 +830,8 @@ struct Core<'a> {
     rhs_history: Vec<History>,
     out_regs: Vec<f64>,
     out_modes: Vec<i8>,
-    out_d: Vec<f64>,
-    out_active: Vec<bool>,
+    out_d: Aligned,
+    out_tangents: Tangents,
     out_history: Vec<History>,
     result: Trajectory,
 }
@@ -638,9 +841,11 @@ impl<'a> Core<'a> {
         let Simulation { system, environment: env, parameters, method, seeds } = *simulation;
         let (nx, nz) = (system.nx, system.nz);
         let lanes = seeds.lanes();
+        let width = width(lanes);
         let (tableau, substeps, tolerance) = match method {
             Method::Rk4 { substeps } => (&RK4, substeps.max(1), None),
             Method::Dp5 { substeps } => (&DP5, substeps.max(1), None),
+            Method::Dop853 { substeps } => (&DOP853, substeps.max(1), None),
             Method::Adaptive { rtol, atol } => (&DP5, 1, Some((rtol, atol))),
         };
         let tape = &system.rhs;
@@ -650,8 +855,6 @@ impl<'a> Core<'a> {
         tape.prepare(&mut regs, &mut modes);
         let stage = |regs: &Vec<f64>| Stage {
             regs: regs.clone(),
-            f: vec![0.0; nx],
-            z: vec![0.0; nz],
             lu: vec![0.0; nz * nz],
             pivots: vec![0; nz],
             slopes: vec![0.0; system.nu],
@@ -683,17 +886,17 @@ impl<'a> Core<'a> {
         for leaf in &mut leaf_active[system.delayed()..] {
             *leaf = seeded_states;
         }
-        let active = tape.activity(&leaf_active, true);
-        let mut d = vec![0.0; tape.registers() * lanes];
+        let tangents = tape.tangents(&leaf_active);
+        let mut d = Aligned::zeros(tape.registers() * width);
         for (l, &p) in seeds.parameters.iter().enumerate() {
-            d[(system.parameters() + p) * lanes + l] = 1.0;
+            d[(system.parameters() + p) * width + l] = 1.0;
         }
         if lanes > 0 {
-            tape.prepare_tangent(&regs, &modes, lanes, &active, &mut d);
+            tape.prepare_tangent(&tangents, &regs, &modes, width, &mut d);
         }
         let mut gleaf = vec![true; tape.leaves()];
         gleaf[system.parameters()..system.parameters() + system.np].fill(false);
-        let gactive = tape.activity(&gleaf, false);
+        let along = tape.tangents(&gleaf);
 
         let out = &system.output;
         let mut out_regs = vec![0.0; out.registers()];
@@ -702,17 +905,17 @@ impl<'a> Core<'a> {
         out.prepare(&mut out_regs, &mut out_modes);
         let mut out_leaf_active = vec![seeded_states; out.leaves()];
         out_leaf_active[System::TIME] = false;
-        let out_active = out.activity(&out_leaf_active, false);
-        let mut out_d = vec![0.0; out.registers() * lanes];
+        let out_tangents = out.tangents(&out_leaf_active);
+        let mut out_d = Aligned::zeros(out.registers() * width);
         for (l, &p) in seeds.parameters.iter().enumerate() {
-            out_d[(system.parameters() + p) * lanes + l] = 1.0;
+            out_d[(system.parameters() + p) * width + l] = 1.0;
         }
         if lanes > 0 {
-            out.prepare_tangent(&out_regs, &out_modes, lanes, &out_active, &mut out_d);
+            out.prepare_tangent(&out_tangents, &out_regs, &out_modes, width, &mut out_d);
         }
-        let mut dx = vec![0.0; nx * lanes];
+        let mut dx = Aligned::zeros(nx * width);
         for (l, &i) in seeds.initial.iter().enumerate() {
-            dx[i * lanes + seeds.parameters.len() + l] = 1.0;
+            dx[i * width + seeds.parameters.len() + l] = 1.0;
         }
         // A state delay shorter than the step would read the future: shorten the steps.
         let mut substeps = substeps;
@@ -725,7 +928,12 @@ impl<'a> Core<'a> {
             }
         }
         let live = (0..tape.switches.len()).filter(|&k| tape.switches[k].live).collect();
+        let mut source: Vec<usize> = (0..nx).map(|r| System::STATES + r + 1).collect();
+        for j in 0..nz {
+            source[system.offsets[j] + system.orders[j] - 1] = system.highest() + j;
+        }
         Core {
+            arch: Arch::new(),
             system,
             env,
             seeds,
@@ -733,6 +941,11 @@ impl<'a> Core<'a> {
             substeps,
             tolerance,
             lanes,
+            width,
+            rates: Rates::new(nx, stages.len()),
+            pieces: env.inputs.iter().map(|u| u.piece(s)).collect(),
+            mid: s,
+            source,
             sticking: Vec::new(),
             live,
             scale: vec![0.0; modes.len()],
@@ -740,18 +953,15 @@ impl<'a> Core<'a> {
             s,
             x: x0.to_vec(),
             x1: vec![0.0; nx],
-            xs: vec![0.0; nx],
             reach: x0.iter().map(|v| v.abs()).collect(),
             dx,
-            dxs: vec![0.0; nx * lanes],
-            dk: vec![0.0; tableau.b.len() * nx * lanes],
+            dk: Aligned::zeros(tableau.b.len() * nx * width),
             d,
-            active,
-            b: vec![0.0; nz * lanes.max(1)],
-            dlambda: vec![0.0; tape.switches.len() * lanes],
+            tangents,
+            b: Aligned::zeros(nz * width),
             dl: Vec::new(),
             gd: Vec::new(),
-            gactive,
+            along,
             h_next: env.dt,
             fresh: false,
             begun: false,
@@ -762,7 +972,7 @@ impl<'a> Core<'a> {
             out_regs,
             out_modes,
             out_d,
-            out_active,
+            out_tangents,
             out_history: vec![History::default(); out.delays.len()],
             result: Trajectory::default(),
             stages,
@@ -772,10 +982,9 @@ impl<'a> Core<'a> {
     /// Takes over what `before` remembers, and its tangents of the states `carried`.
     fn go_on(&mut self, before: &Carry, carried: &[usize]) {
         let map = LaneMap::new(before, self.seeds);
-        let lanes = self.lanes;
         for &i in carried {
             let row = map.apply(&before.dx[i * map.from..(i + 1) * map.from], 1);
-            self.dx[i * lanes..(i + 1) * lanes].copy_from_slice(&row);
+            self.dx[i * self.width..][..self.lanes].copy_from_slice(&row);
         }
         for (reach, old) in self.reach.iter_mut().zip(&before.reach) {
             *reach = reach.max(*old);
@@ -792,7 +1001,8 @@ impl<'a> Core<'a> {
         let (x, dx) = if (self.lost || trajectory.diverged.is_some()) && n > 0 {
             ((0..nx).map(|i| trajectory.x[i * n + n - 1]).collect(), vec![0.0; nx * lanes])
         } else {
-            (self.x, self.dx)
+            let rows = self.dx.chunks_exact(self.width.max(1)).flat_map(|row| &row[..lanes]);
+            (self.x, rows.copied().collect())
         };
         let keep = |histories: &[History], taus: Vec<f64>| {
             histories.iter().zip(taus).map(|(h, tau)| h.recent(s, tau.max(0.0), lanes)).collect()
@@ -895,14 +1105,14 @@ impl<'a> Core<'a> {
             return;
         }
         self.eval(0, at, at - 1e-6 * self.env.dt);
-        let before = self.stages[0].f.clone();
+        let before: Vec<f64> = self.rates.stage(0).collect();
         self.eval(0, at, 0.5 * (at + next.max(at + 1e-9 * self.env.dt)));
         let tau = self.system.rhs.delays[delay].tau as usize;
         for i in 0..self.system.nx {
-            let jump = before[i] - self.stages[0].f[i];
+            let jump = before[i] - self.rates.at(0, i);
             if jump != 0.0 {
-                for l in 0..self.lanes {
-                    self.dx[i * self.lanes + l] += jump * self.d[tau * self.lanes + l];
+                for l in 0..self.width {
+                    self.dx[i * self.width + l] += jump * self.d[tau * self.width + l];
                 }
             }
         }
@@ -916,28 +1126,44 @@ impl<'a> Core<'a> {
             .then(|| leaf - self.system.inputs())
     }
 
-    /// Evaluates the right-hand side at `self.xs`-style state `x` into stage `b`.
+    /// Evaluates the right-hand side at the state `self.x` into stage `b`.
     fn eval(&mut self, b: usize, s: f64, mid: f64) {
-        let x = std::mem::take(&mut self.x);
-        self.eval_at(b, s, mid, &x);
-        self.x = x;
+        self.stages[b].regs[System::STATES..][..self.system.nx].copy_from_slice(&self.x);
+        self.eval_stage(b, s, mid);
     }
 
-    fn eval_at(&mut self, b: usize, s: f64, mid: f64, x: &[f64]) {
+    /// Evaluates the right-hand side at the state that stands in the registers of stage `b`.
+    #[inline]
+    fn eval_stage(&mut self, b: usize, s: f64, mid: f64) {
         let system = self.system;
-        let tape = &system.rhs;
-        {
-            let st = &mut self.stages[b];
-            st.s = s;
-            st.mid = mid;
-            st.regs[System::TIME] = self.env.start + s;
-            st.regs[System::STATES..System::STATES + system.nx].copy_from_slice(x);
-            for (i, u) in self.env.inputs.iter().enumerate() {
-                let (v, slope) = u.at(s, mid);
-                st.regs[system.inputs() + i] = v;
-                st.slopes[i] = slope;
+        if mid != self.mid {
+            self.mid = mid;
+            for (piece, input) in self.pieces.iter_mut().zip(&self.env.inputs) {
+                *piece = input.piece(mid);
             }
         }
+        let st = &mut self.stages[b];
+        st.s = s;
+        st.mid = mid;
+        st.regs[System::TIME] = self.env.start + s;
+        for (i, piece) in self.pieces.iter().enumerate() {
+            let (v, slope) = piece.at(s);
+            st.regs[system.inputs() + i] = v;
+            st.slopes[i] = slope;
+        }
+        if !system.rhs.delays.is_empty() {
+            self.eval_delays(b, s, mid);
+        }
+        if self.sticking.is_empty() {
+            self.eval_free(b);
+        } else {
+            self.eval_sticking(b);
+        }
+    }
+
+    /// The delayed values of stage `b`.
+    fn eval_delays(&mut self, b: usize, s: f64, mid: f64) {
+        let tape = &self.system.rhs;
         for i in 0..tape.delays.len() {
             let delay = tape.delays[i];
             let tau = self.stages[b].regs[delay.tau as usize].max(0.0);
@@ -952,47 +1178,41 @@ impl<'a> Core<'a> {
             st.regs[delay.leaf as usize] = v;
             st.delayed_slopes[i] = slope;
         }
-        if self.sticking.is_empty() {
-            let st = &mut self.stages[b];
-            tape.eval(&mut st.regs, &mut self.modes, &st.lambda);
-            self.result.evaluations += 1;
-            self.solve(b);
-        } else {
-            self.eval_sticking(b);
-        }
     }
 
-    /// Highest derivatives and ẋ from the evaluated registers.
-    fn solve(&mut self, b: usize) {
+    /// Highest derivatives (into their registers) and ẋ of stage `b`, with the values of sticking signs as they stand.
+    #[inline]
+    fn eval_free(&mut self, b: usize) {
         let system = self.system;
-        let (nx, nz) = (system.nx, system.nz);
+        let nz = system.nz;
         let st = &mut self.stages[b];
+        system.rhs.eval(&mut st.regs, &mut self.modes, &st.lambda);
+        self.result.evaluations += 1;
         let outputs = &system.rhs.outputs;
         if !system.mass_is_fixed {
             for (m, &r) in st.lu.iter_mut().zip(&outputs[..nz * nz]) {
                 *m = st.regs[r as usize];
             }
-            if !small::factor(&mut st.lu, &mut st.pivots, nz) {
-                st.lu.fill(f64::NAN);
-            }
+            small::factor(&mut st.lu, &mut st.pivots, nz);
         }
+        let highest = system.highest();
         for i in 0..nz {
-            st.z[i] = -st.regs[outputs[nz * nz + i] as usize];
+            st.regs[highest + i] = -st.regs[outputs[nz * nz + i] as usize];
         }
+        let z = &mut st.regs[highest..highest + nz];
         if !self.env.forces.is_empty() {
             let (k, w) = locate(st.s, st.mid, self.env.dt, self.env.len);
             for force in &self.env.forces {
                 let (a, b) = (force.samples[k], force.samples[(k + 1).min(self.env.len - 1)]);
                 let v = a + w * (b - a);
-                for (z, weight) in st.z.iter_mut().zip(&force.weights) {
+                for (z, weight) in z.iter_mut().zip(&force.weights) {
                     *z -= weight * v;
                 }
             }
         }
-        small::solve(&st.lu, &st.pivots, nz, &mut st.z, 1);
-        st.f[..nx - 1].copy_from_slice(&st.regs[System::STATES + 1..System::STATES + nx]);
-        for j in 0..nz {
-            st.f[system.offsets[j] + system.orders[j] - 1] = st.z[j];
+        small::solve_one(&st.lu, &st.pivots, nz, z);
+        for (r, &source) in self.source.iter().enumerate() {
+            self.rates.set(b, r, st.regs[source]);
         }
     }
 
@@ -1002,23 +1222,17 @@ impl<'a> Core<'a> {
         let nx = self.system.nx;
         let sticking = std::mem::take(&mut self.sticking);
         let m = sticking.len();
-        let evaluate = |core: &mut Self| {
-            let st = &mut core.stages[b];
-            tape.eval(&mut st.regs, &mut core.modes, &st.lambda);
-            core.result.evaluations += 1;
-            core.solve(b);
-        };
         for &k in &sticking {
             self.stages[b].lambda[k] = 0.0;
         }
-        evaluate(self);
+        self.eval_free(b);
         // Gradient of the arguments with respect to the state; the last lane collects explicit time.
-        self.rates(b, true);
+        self.slopes(b, true);
         let lanes = nx + 1;
         let mut held = std::mem::take(&mut self.stages[b].held);
         held.resize(m, nx);
         let f0 = &mut held.f0;
-        f0.copy_from_slice(&self.stages[b].f);
+        f0.iter_mut().zip(self.rates.stage(b)).for_each(|(f0, f)| *f0 = f);
         for (i, &k) in sticking.iter().enumerate() {
             let row = &self.gd[tape.switches[k].a as usize * lanes..][..lanes];
             held.gradient[i * nx..(i + 1) * nx].copy_from_slice(&row[..nx]);
@@ -1026,9 +1240,9 @@ impl<'a> Core<'a> {
         }
         for (i, &k) in sticking.iter().enumerate() {
             self.stages[b].lambda[k] = 1.0;
-            evaluate(self);
+            self.eval_free(b);
             self.stages[b].lambda[k] = 0.0;
-            for ((p, f1), f0) in held.pull[i * nx..].iter_mut().zip(&self.stages[b].f).zip(&*f0) {
+            for ((p, f1), f0) in held.pull[i * nx..].iter_mut().zip(self.rates.stage(b)).zip(&*f0) {
                 *p = f1 - f0;
             }
         }
@@ -1046,7 +1260,7 @@ impl<'a> Core<'a> {
                 self.stages[b].lambda[k] = held.a[i];
             }
         }
-        evaluate(self);
+        self.eval_free(b);
         let st = &mut self.stages[b];
         if held.ok {
             // A velocity that is held does not change, not even by rounding: relative error control
@@ -1054,7 +1268,7 @@ impl<'a> Core<'a> {
             for &k in &sticking {
                 let leaf = tape.switches[k].a as usize;
                 if (System::STATES..System::STATES + nx).contains(&leaf) {
-                    st.f[leaf - System::STATES] = 0.0;
+                    self.rates.set(b, leaf - System::STATES, 0.0);
                 }
             }
         }
@@ -1064,7 +1278,7 @@ impl<'a> Core<'a> {
 
     /// Time derivatives of the registers at stage `b` into `self.gd`: with `split` one lane per state
     /// plus one for explicit time, else one lane along the flow.
-    fn rates(&mut self, b: usize, split: bool) {
+    fn slopes(&mut self, b: usize, split: bool) {
         let system = self.system;
         let tape = &system.rhs;
         let nx = system.nx;
@@ -1078,7 +1292,7 @@ impl<'a> Core<'a> {
             if split {
                 self.gd[(System::STATES + i) * lanes + i] = 1.0;
             } else {
-                self.gd[System::STATES + i] = st.f[i];
+                self.gd[System::STATES + i] = self.rates.at(b, i);
             }
         }
         for i in 0..system.nu {
@@ -1087,7 +1301,7 @@ impl<'a> Core<'a> {
         for (i, delay) in tape.delays.iter().enumerate() {
             self.gd[delay.leaf as usize * lanes + last] = st.delayed_slopes[i];
         }
-        tape.tangent(&st.regs, &self.modes, &[], lanes, &self.gactive, &mut self.gd);
+        tape.tangent(&self.along, &st.regs, &self.modes, lanes, &mut self.gd);
     }
 
     /// Modes at the very start: natural, with a decision where a sign's argument is exactly zero.
@@ -1143,21 +1357,16 @@ impl<'a> Core<'a> {
         let nx = self.system.nx;
         let tableau = self.tableau;
         let mid = self.s + 0.5 * h;
-        let mut xs = std::mem::take(&mut self.xs);
         for i in 1..tableau.b.len() {
-            for (r, xs) in xs.iter_mut().enumerate() {
-                *xs = self.x[r] + along(&self.stages, tableau.a[i], h, r);
-            }
-            self.eval_at(i, self.s + tableau.c[i] * h, mid, &xs);
+            let xs = &mut self.stages[i].regs[System::STATES..][..nx];
+            self.rates.along(xs, &self.x, tableau.a[i], h);
+            self.eval_stage(i, self.s + tableau.c[i] * h, mid);
         }
-        self.xs = xs;
-        for r in 0..nx {
-            self.x1[r] = self.x[r] + along(&self.stages, tableau.b, h, r);
-        }
+        let last = tableau.b.len();
+        self.rates.along(&mut self.x1, &self.x, tableau.b, h);
         if end {
-            let x1 = std::mem::take(&mut self.x1);
-            self.eval_at(tableau.b.len(), self.s + h, mid, &x1);
-            self.x1 = x1;
+            self.stages[last].regs[System::STATES..][..nx].copy_from_slice(&self.x1);
+            self.eval_stage(last, self.s + h, mid);
         }
     }
 
@@ -1265,7 +1474,7 @@ impl<'a> Core<'a> {
         let nx = self.system.nx;
         let mut sum = 0.0;
         for r in 0..nx {
-            let e: f64 = self.tableau.e.iter().zip(&self.stages).map(|(w, st)| w * st.f[r]).sum::<f64>() * h;
+            let e = dot(self.tableau.e, &self.rates.f[r * self.rates.stages..]) * h;
             let size = self.x[r].abs().max(self.x1[r].abs());
             let floor = self.reach[r].max(size).max(f64::MIN_POSITIVE);
             let e = e / (atol * floor + rtol * size);
@@ -1351,6 +1560,7 @@ impl<'a> Core<'a> {
         if has_end {
             let end = self.tableau.b.len();
             self.stages.swap(0, end);
+            self.rates.swap(0, end);
             self.fresh = true;
             self.remember(0);
         } else {
@@ -1368,40 +1578,56 @@ impl<'a> Core<'a> {
         if !needed {
             return;
         }
-        self.rates(b, false);
+        self.slopes(b, false);
         if self.lanes > 0 {
-            let dx = std::mem::take(&mut self.dx);
-            self.tangent_at(b, &dx);
-            self.dx = dx;
+            self.tangent_here(b);
         }
         for i in 0..tape.delays.len() {
             let arg = tape.delays[i].arg as usize;
             let st = &self.stages[b];
-            let lanes = &self.d[arg * self.lanes..(arg + 1) * self.lanes];
+            let lanes = &self.d[arg * self.width..][..self.lanes];
             self.rhs_history[i].push(st.s, st.regs[arg], self.gd[arg], lanes);
         }
     }
 
-    /// Tangents of all registers at stage `b` for state tangents `dx`, into `self.d`.
-    fn tangent_at(&mut self, b: usize, dx: &[f64]) {
+    /// Tangents of all registers at stage `b` for the tangents of the state at the step's start.
+    fn tangent_here(&mut self, b: usize) {
+        let width = self.width;
+        self.d[System::STATES * width..][..self.dx.len()].copy_from_slice(&self.dx);
+        self.tangent_at(b, width);
+    }
+
+    /// Tangents of all registers at stage `b` for the state tangents that stand in `self.d`.
+    #[inline(always)]
+    fn tangent_at(&mut self, b: usize, width: usize) {
         let system = self.system;
-        let tape = &system.rhs;
-        let (nx, lanes) = (system.nx, self.lanes);
         let st = &self.stages[b];
-        self.d[System::STATES * lanes..(System::STATES + nx) * lanes].copy_from_slice(dx);
-        let first = self.seeds.parameters.len() + self.seeds.initial.len();
-        let count = self.seeds.signals.lanes;
-        for (i, change) in &self.seeds.signals.inputs {
+        if !self.seeds.signals.inputs.is_empty() {
+            let first = self.seeds.parameters.len() + self.seeds.initial.len();
+            let count = self.seeds.signals.lanes;
             let (k, w) = locate(st.s, st.mid, self.env.dt, self.env.len);
-            let row = &mut self.d[(system.inputs() + i) * lanes + first..][..count];
-            lerp(change, k, w, self.env.len, count, row);
+            for (i, change) in &self.seeds.signals.inputs {
+                let row = &mut self.d[(system.inputs() + i) * width + first..][..count];
+                lerp(change, k, w, self.env.len, count, row);
+            }
         }
-        for (i, delay) in tape.delays.iter().enumerate() {
+        if !system.rhs.delays.is_empty() {
+            self.tangent_delays(b);
+        }
+        let st = &self.stages[b];
+        system.rhs.tangent(&self.tangents, &st.regs, &self.modes, width, &mut self.d);
+    }
+
+    /// Tangents of the delayed values of stage `b`.
+    fn tangent_delays(&mut self, b: usize) {
+        let (lanes, width) = (self.lanes, self.width);
+        let st = &self.stages[b];
+        for (i, delay) in self.system.rhs.delays.iter().enumerate() {
             let tau = delay.tau as usize;
             let slope = st.delayed_slopes[i];
             let leaf = delay.leaf as usize;
             for l in 0..lanes {
-                self.d[leaf * lanes + l] = -slope * self.d[tau * lanes + l];
+                self.d[leaf * width + l] = -slope * self.d[tau * width + l];
             }
             if self.delayed_input(delay.arg_leaf).is_none() {
                 let history = &self.rhs_history[i];
@@ -1411,127 +1637,142 @@ impl<'a> Core<'a> {
                     let next = (j + 1).min(history.s.len() - 1);
                     for l in 0..lanes {
                         let (a, b) = (history.lanes[j * lanes + l], history.lanes[next * lanes + l]);
-                        self.d[leaf * lanes + l] += a + w * (b - a);
+                        self.d[leaf * width + l] += a + w * (b - a);
                     }
                 }
             }
         }
-        tape.tangent(&st.regs, &self.modes, &[], lanes, &self.active, &mut self.d);
     }
 
-    /// Derivative of stage `b`'s ẋ along the lanes into `self.dk[b]`, for state tangents `self.dxs`.
-    fn tangent_stage(&mut self, b: usize) {
+    /// Derivative of stage `b`'s ẋ along the lanes into `self.dk[b]`, for the state tangents that stand in `self.d`.
+    #[inline(always)]
+    fn tangent_stage(&mut self, b: usize, width: usize) {
+        self.tangent_at(b, width);
         let system = self.system;
-        let (nx, nz, lanes) = (system.nx, system.nz, self.lanes);
-        let dxs = std::mem::take(&mut self.dxs);
-        self.tangent_at(b, &dxs);
+        let (nx, nz) = (system.nx, system.nz);
         let outputs = &system.rhs.outputs;
         let st = &self.stages[b];
         for i in 0..nz {
-            let row = &mut self.b[i * lanes..(i + 1) * lanes];
-            let h = &self.d[outputs[nz * nz + i] as usize * lanes..][..lanes];
+            let row = &mut self.b[i * width..][..width];
+            let h = &self.d[outputs[nz * nz + i] as usize * width..][..width];
             for (r, h) in row.iter_mut().zip(h) {
                 *r = -h;
             }
             for j in 0..nz {
-                let reg = outputs[i * nz + j] as usize;
-                if self.active[reg] {
-                    let z = st.z[j];
-                    for (r, m) in row.iter_mut().zip(&self.d[reg * lanes..][..lanes]) {
+                let reg = outputs[i * nz + j];
+                if self.tangents.is_active(reg) {
+                    let z = st.regs[system.highest() + j];
+                    for (r, m) in row.iter_mut().zip(&self.d[reg as usize * width..][..width]) {
                         *r -= m * z;
                     }
                 }
             }
         }
-        let signals = &self.seeds.signals;
-        if !signals.force.is_empty() {
-            let first = self.seeds.parameters.len() + self.seeds.initial.len();
-            let count = signals.lanes;
-            let (k, w) = locate(st.s, st.mid, self.env.dt, self.env.len);
-            let a = &signals.force[k * count..][..count];
-            let c = &signals.force[(k + 1).min(self.env.len - 1) * count..][..count];
-            for i in 0..nz {
-                let weights = &signals.weights[i * count..][..count];
-                let row = &mut self.b[i * lanes + first..][..count];
-                for l in 0..count {
-                    row[l] -= weights[l] * (a[l] + w * (c[l] - a[l]));
-                }
-            }
+        if !self.seeds.signals.force.is_empty() {
+            self.tangent_forces(b);
         }
-        small::solve(&st.lu, &st.pivots, nz, &mut self.b, lanes);
-        let dk = &mut self.dk[b * nx * lanes..(b + 1) * nx * lanes];
-        dk[..(nx - 1) * lanes].copy_from_slice(&dxs[lanes..]);
-        for j in 0..nz {
-            let r = system.offsets[j] + system.orders[j] - 1;
-            dk[r * lanes..(r + 1) * lanes].copy_from_slice(&self.b[j * lanes..(j + 1) * lanes]);
+        let st = &self.stages[b];
+        small::solve_rows(&st.lu, &st.pivots, nz, &mut self.b, width);
+        let dk = &mut self.dk[b * nx * width..][..nx * width];
+        for (dk, &source) in dk.chunks_exact_mut(width).zip(&self.source) {
+            let from = match source.checked_sub(system.highest()) {
+                Some(j) => &self.b[j * width..][..width],
+                None => &self.d[source * width..][..width],
+            };
+            dk.copy_from_slice(from);
         }
-        let m = self.sticking.len();
-        if m > 0 && st.held.ok {
-            // dλ keeps the derivative of ġ zero: ∇g·(dẋ + Σ pull dλ) = 0.
-            let mut dl = std::mem::take(&mut self.dl);
-            dl.clear();
-            dl.resize(m * lanes, 0.0);
-            for i in 0..m {
-                for r in 0..nx {
-                    let g = st.held.gradient[i * nx + r];
-                    if g != 0.0 {
-                        for l in 0..lanes {
-                            dl[i * lanes + l] -= g * dk[r * lanes + l];
-                        }
-                    }
-                }
-            }
-            small::solve(&st.held.b, &st.held.pivots, m, &mut dl, lanes);
-            for i in 0..m {
-                for r in 0..nx {
-                    let p = st.held.pull[i * nx + r];
-                    if p != 0.0 {
-                        for l in 0..lanes {
-                            dk[r * lanes + l] += p * dl[i * lanes + l];
-                        }
-                    }
-                }
-                let k = self.sticking[i];
-                self.dlambda[k * lanes..(k + 1) * lanes].copy_from_slice(&dl[i * lanes..(i + 1) * lanes]);
-            }
-            self.dl = dl;
+        if !self.sticking.is_empty() && st.held.ok {
+            self.tangent_sticking(b);
         }
-        self.dxs = dxs;
     }
 
-    fn tangent_step(&mut self, h: f64) {
-        let n = self.system.nx * self.lanes;
-        for i in 0..self.tableau.b.len() {
-            self.dxs.copy_from_slice(&self.dx);
-            for (j, &a) in self.tableau.a[i].iter().enumerate() {
-                if a != 0.0 {
-                    for (x, k) in self.dxs.iter_mut().zip(&self.dk[j * n..(j + 1) * n]) {
-                        *x += h * a * k;
+    /// The lanes of exogenous forces, into the right-hand side of the equations' tangents.
+    fn tangent_forces(&mut self, b: usize) {
+        let st = &self.stages[b];
+        let signals = &self.seeds.signals;
+        let first = self.seeds.parameters.len() + self.seeds.initial.len();
+        let count = signals.lanes;
+        let (k, w) = locate(st.s, st.mid, self.env.dt, self.env.len);
+        let a = &signals.force[k * count..][..count];
+        let c = &signals.force[(k + 1).min(self.env.len - 1) * count..][..count];
+        for i in 0..self.system.nz {
+            let weights = &signals.weights[i * count..][..count];
+            let row = &mut self.b[i * self.width + first..][..count];
+            for l in 0..count {
+                row[l] -= weights[l] * (a[l] + w * (c[l] - a[l]));
+            }
+        }
+    }
+
+    /// dλ keeps the derivative of ġ zero: ∇g·(dẋ + Σ pull dλ) = 0.
+    fn tangent_sticking(&mut self, b: usize) {
+        let (nx, width) = (self.system.nx, self.width);
+        let held = &self.stages[b].held;
+        let dk = &mut self.dk[b * nx * width..][..nx * width];
+        let m = self.sticking.len();
+        let dl = &mut self.dl;
+        dl.clear();
+        dl.resize(m * width, 0.0);
+        for i in 0..m {
+            for r in 0..nx {
+                let g = held.gradient[i * nx + r];
+                if g != 0.0 {
+                    for l in 0..width {
+                        dl[i * width + l] -= g * dk[r * width + l];
                     }
                 }
             }
-            self.tangent_stage(i);
         }
-        for (j, &b) in self.tableau.b.iter().enumerate() {
-            if b != 0.0 {
-                for (x, k) in self.dx.iter_mut().zip(&self.dk[j * n..(j + 1) * n]) {
-                    *x += h * b * k;
+        small::solve(&held.b, &held.pivots, m, dl, width);
+        for i in 0..m {
+            for r in 0..nx {
+                let p = held.pull[i * nx + r];
+                if p != 0.0 {
+                    for l in 0..width {
+                        dk[r * width + l] += p * dl[i * width + l];
+                    }
                 }
             }
         }
+    }
+
+    /// Derivatives along the lanes of ẋ at the step's start, stage 0, into `self.dk[0]`.
+    fn rate_here(&mut self) {
+        let width = self.width;
+        self.d[System::STATES * width..][..self.dx.len()].copy_from_slice(&self.dx);
+        self.tangent_stage(0, width);
+    }
+
+    /// The sensitivities' step that belongs to the trial step of length `h`.
+    fn tangent_step(&mut self, h: f64) {
+        self.arch.dispatch(TangentStep { core: self, h });
+    }
+
+    #[inline(always)]
+    fn tangent_step_of(&mut self, h: f64, width: usize) {
+        let n = self.system.nx * width;
+        let tableau = self.tableau;
+        for i in 0..tableau.b.len() {
+            let rows = &mut self.d[System::STATES * width..][..n];
+            tangents_along(rows, &self.dx[..n], &self.dk, tableau.a[i], h);
+            self.tangent_stage(i, width);
+        }
+        let rows = &mut self.d[System::STATES * width..][..n];
+        tangents_along(rows, &self.dx[..n], &self.dk, tableau.b, h);
+        self.dx.copy_from_slice(rows);
     }
 
     /// At (s, x), with stage 0 evaluated there in the old modes: changes the modes that were left.
     fn handle_event(&mut self, to: f64) {
-        let lanes = self.lanes;
+        let (lanes, width) = (self.lanes, self.width);
         let left: Vec<usize> = self.live.iter().copied().filter(|&k| self.slack(0, k) < 0.0).collect();
         let Some(&primary) = left.first() else { return };
-        let before = self.stages[0].f.clone();
+        let before: Vec<f64> = self.rates.stage(0).collect();
         // dtₑ of the primary event, in the old modes.
         let mut dte = Vec::new();
         let released = self.system.rhs.switches[primary].kind == SwitchKind::Sign && self.modes[primary] == 0;
         if lanes > 0 && !released {
-            self.rates(0, false);
+            self.slopes(0, false);
             let sw = self.system.rhs.switches[primary];
             let (ra, rb) = (sw.a as usize, sw.b as usize);
             let two = ra != rb;
@@ -1541,13 +1782,11 @@ impl<'a> Core<'a> {
             let rate = side * self.gd[ra] - if two { self.gd[rb] } else { 0.0 };
             let size = before.iter().fold(0.0f64, |m, v| m.max(v.abs()));
             if rate.abs() > 1e-12 * size.max(1e-300) {
-                let dx = std::mem::take(&mut self.dx);
-                self.tangent_at(0, &dx);
-                self.dx = dx;
+                self.tangent_here(0);
                 dte = (0..lanes)
                     .map(|l| {
                         let g =
-                            side * self.d[ra * lanes + l] - if two { self.d[rb * lanes + l] } else { 0.0 };
+                            side * self.d[ra * width + l] - if two { self.d[rb * width + l] } else { 0.0 };
                         -g / rate
                     })
                     .collect();
@@ -1581,10 +1820,10 @@ impl<'a> Core<'a> {
         self.fresh = true;
         if !dte.is_empty() {
             for i in 0..self.system.nx {
-                let jump = before[i] - self.stages[0].f[i];
+                let jump = before[i] - self.rates.at(0, i);
                 if jump != 0.0 {
                     for l in 0..lanes {
-                        self.dx[i * lanes + l] += jump * dte[l];
+                        self.dx[i * width + l] += jump * dte[l];
                     }
                 }
             }
@@ -1635,7 +1874,7 @@ impl<'a> Core<'a> {
         }
         if lanes > 0 {
             for (c, &reg) in out.outputs.iter().enumerate() {
-                let d = &self.out_d[reg as usize * lanes..][..lanes];
+                let d = &self.out_d[reg as usize * self.width..][..lanes];
                 for (l, v) in d.iter().enumerate() {
                     self.result.dy[(l * ny + c) * n + row] = *v;
                 }
@@ -1654,21 +1893,18 @@ impl<'a> Core<'a> {
     /// The outputs and their tangents now, into `out_regs` and `out_d`; delayed ones remember it.
     fn observe(&mut self) {
         let system = self.system;
-        let (nx, lanes) = (system.nx, self.lanes);
+        let (nx, lanes, width) = (system.nx, self.lanes, self.width);
         // The output belongs to the instant of the sample: inputs with the value they take then.
         let inside = self.s + 1e-6 * self.env.dt;
         if system.output_needs_z {
             self.eval(0, self.s, inside);
             self.fresh = false;
-            let z = &self.stages[0].z;
-            self.out_regs[system.highest()..][..system.nz].copy_from_slice(z);
+            let highest = system.highest()..system.highest() + system.nz;
+            self.out_regs[highest.clone()].copy_from_slice(&self.stages[0].regs[highest.clone()]);
             if lanes > 0 {
-                self.dxs.copy_from_slice(&self.dx);
-                self.tangent_stage(0);
-                for j in 0..system.nz {
-                    let r = system.offsets[j] + system.orders[j] - 1;
-                    let (from, to) = (r * lanes, (system.highest() + j) * lanes);
-                    self.out_d[to..to + lanes].copy_from_slice(&self.dk[from..from + lanes]);
+                self.rate_here();
+                for (r, &to) in self.source.iter().enumerate().filter(|s| highest.contains(s.1)) {
+                    self.out_d[to * width..][..width].copy_from_slice(&self.dk[r * width..][..width]);
                 }
             }
         }
@@ -1679,12 +1915,12 @@ impl<'a> Core<'a> {
             self.out_regs[system.inputs() + i] = u.at(self.s, inside).0;
         }
         if lanes > 0 {
-            self.out_d[System::STATES * lanes..(System::STATES + nx) * lanes].copy_from_slice(&self.dx);
+            self.out_d[System::STATES * width..][..nx * width].copy_from_slice(&self.dx);
             let first = self.seeds.parameters.len() + self.seeds.initial.len();
             let count = self.seeds.signals.lanes;
             for (i, change) in &self.seeds.signals.inputs {
                 let (k, w) = locate(self.s, inside, self.env.dt, self.env.len);
-                let to = &mut self.out_d[(system.inputs() + i) * lanes + first..][..count];
+                let to = &mut self.out_d[(system.inputs() + i) * width + first..][..count];
                 lerp(change, k, w, self.env.len, count, to);
             }
         }
@@ -1693,18 +1929,18 @@ impl<'a> Core<'a> {
         }
         out.eval_natural(&mut self.out_regs, &mut self.out_modes);
         if lanes > 0 {
-            out.tangent(&self.out_regs, &self.out_modes, &[], lanes, &self.out_active, &mut self.out_d);
+            out.tangent(&self.out_tangents, &self.out_regs, &self.out_modes, width, &mut self.out_d);
         }
     }
 
     /// Delayed values of the measurements (sensor delays), sample by sample.
     fn output_delays(&mut self) {
         let system = self.system;
-        let (out, lanes) = (&system.output, self.lanes);
+        let (out, lanes, width) = (&system.output, self.lanes, self.width);
         // The arguments now, for the history; nested delays read the values of earlier samples.
         out.eval_natural(&mut self.out_regs, &mut self.out_modes);
         if lanes > 0 {
-            out.tangent(&self.out_regs, &self.out_modes, &[], lanes, &self.out_active, &mut self.out_d);
+            out.tangent(&self.out_tangents, &self.out_regs, &self.out_modes, width, &mut self.out_d);
         }
         // A state's slope is its rate; before the start it goes straight on along it.
         let states = || out.delays.iter().map(|d| state_leaf(system, d.arg_leaf));
@@ -1714,8 +1950,7 @@ impl<'a> Core<'a> {
             self.eval(0, self.s, inside);
             self.fresh = false;
             if begins && lanes > 0 {
-                self.dxs.copy_from_slice(&self.dx);
-                self.tangent_stage(0);
+                self.rate_here();
             }
         }
         for (i, delay) in out.delays.iter().enumerate() {
@@ -1733,13 +1968,13 @@ impl<'a> Core<'a> {
             let slope = match state_leaf(system, delay.arg_leaf) {
                 Some(x) => {
                     if first {
-                        history.rate = self.dk[x * lanes..(x + 1) * lanes].to_vec();
+                        history.rate = self.dk[x * width..][..lanes].to_vec();
                     }
-                    self.stages[0].f[x]
+                    self.rates.at(0, x)
                 }
                 None => slope,
             };
-            history.push(self.s, value, slope, &self.out_d[arg * lanes..(arg + 1) * lanes]);
+            history.push(self.s, value, slope, &self.out_d[arg * width..][..lanes]);
             let tau = delay.tau as usize;
             let at = self.s - self.out_regs[tau].max(0.0);
             if at < history.s[0] {
@@ -1748,8 +1983,8 @@ impl<'a> Core<'a> {
                 self.out_regs[delay.leaf as usize] = history.value[0] + back * history.slope[0];
                 for l in 0..lanes {
                     let rate = history.rate.get(l).copied().unwrap_or(0.0);
-                    self.out_d[delay.leaf as usize * lanes + l] =
-                        history.lanes[l] + back * rate - history.slope[0] * self.out_d[tau * lanes + l];
+                    self.out_d[delay.leaf as usize * width + l] =
+                        history.lanes[l] + back * rate - history.slope[0] * self.out_d[tau * width + l];
                 }
                 continue;
             }
@@ -1758,8 +1993,8 @@ impl<'a> Core<'a> {
             let next = (j + 1).min(history.s.len() - 1);
             for l in 0..lanes {
                 let (a, b) = (history.lanes[j * lanes + l], history.lanes[next * lanes + l]);
-                self.out_d[delay.leaf as usize * lanes + l] =
-                    a + w * (b - a) - slope * self.out_d[tau * lanes + l];
+                self.out_d[delay.leaf as usize * width + l] =
+                    a + w * (b - a) - slope * self.out_d[tau * width + l];
             }
         }
     }

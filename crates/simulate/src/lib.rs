@@ -1,4 +1,5 @@
 //! Simulation of greybox models: events, true stick–slip, delays, forward sensitivities.
+mod aligned;
 mod integrate;
 pub mod rigs;
 mod signal;

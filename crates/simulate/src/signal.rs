@@ -41,34 +41,53 @@ impl Signal {
     /// last the last.
     #[inline]
     pub fn at(&self, s: f64, inside: f64) -> (f64, f64) {
+        self.piece(inside).at(s)
+    }
+
+    /// The smooth stretch that time `inside` lies in.
+    pub(crate) fn piece(&self, inside: f64) -> Piece {
         let g = &self.grid;
         let last = g.len() - 1;
         let place = inside * self.rate;
+        let constant = |value: f64| Piece { c: [value, 0.0, 0.0, 0.0], k: 0.0, rate: 0.0 };
         if place < 0.0 {
-            return (g[0], 0.0);
+            return constant(g[0]);
         }
         let k = place as usize;
         if k >= last {
-            return (g[last], 0.0);
+            return constant(g[last]);
         }
-        match self.hold {
-            Hold::Zero => (g[k], 0.0),
-            Hold::Linear => {
-                let rise = g[k + 1] - g[k];
-                (g[k] + (s * self.rate - k as f64) * rise, rise * self.rate)
-            }
+        let (b, c) = (g[k], g[k + 1]);
+        let c = match self.hold {
+            Hold::Zero => return constant(b),
+            Hold::Linear => [b, c - b, 0.0, 0.0],
             Hold::BandLimited => {
                 // Cubic Lagrange on the four neighbours of the dense grid.
-                let x = s * self.rate - k as f64;
-                let (b, c) = (g[k], g[k + 1]);
                 let a = if k > 0 { g[k - 1] } else { 2.0 * b - c };
                 let d = if k + 2 <= last { g[k + 2] } else { 2.0 * c - b };
-                let c1 = c - a / 3.0 - b / 2.0 - d / 6.0;
-                let c2 = 0.5 * (a + c) - b;
-                let c3 = (d - a) / 6.0 + 0.5 * (b - c);
-                (b + x * (c1 + x * (c2 + x * c3)), (c1 + x * (2.0 * c2 + 3.0 * x * c3)) * self.rate)
+                [b, c - a / 3.0 - b / 2.0 - d / 6.0, 0.5 * (a + c) - b, (d - a) / 6.0 + 0.5 * (b - c)]
             }
-        }
+        };
+        Piece { c, k: k as f64, rate: self.rate }
+    }
+}
+
+/// A signal within one smooth stretch: a cubic in time over the grid's interval.
+#[derive(Debug, Clone, Copy)]
+pub(crate) struct Piece {
+    c: [f64; 4],
+    /// Where the stretch begins, and samples per second.
+    k: f64,
+    rate: f64,
+}
+
+impl Piece {
+    /// Value and slope at time `s`.
+    #[inline(always)]
+    pub(crate) fn at(&self, s: f64) -> (f64, f64) {
+        let [c0, c1, c2, c3] = self.c;
+        let x = s * self.rate - self.k;
+        (c0 + x * (c1 + x * (c2 + x * c3)), (c1 + x * (2.0 * c2 + 3.0 * x * c3)) * self.rate)
     }
 }
 

@@ -1,6 +1,7 @@
 //! LU of the mass matrix: a few equations, factored thousands of times a second.
 
-/// Factors `a` (`n × n`, row major) in place with partial pivoting; `false` when singular.
+/// Factors `a` (`n × n`, row major) in place with partial pivoting, reciprocal pivots on the diagonal; `false` when
+/// singular, and then no number is left in it.
 pub fn factor(a: &mut [f64], pivots: &mut [usize], n: usize) -> bool {
     for k in 0..n {
         let mut p = k;
@@ -12,6 +13,7 @@ pub fn factor(a: &mut [f64], pivots: &mut [usize], n: usize) -> bool {
         pivots[k] = p;
         let pivot = a[p * n + k];
         if !(pivot.abs() > 0.0 && pivot.is_finite()) {
+            a[..n * n].fill(f64::NAN);
             return false;
         }
         if p != k {
@@ -26,19 +28,23 @@ pub fn factor(a: &mut [f64], pivots: &mut [usize], n: usize) -> bool {
                 a[i * n + j] -= m * a[k * n + j];
             }
         }
+        a[k * n + k] = 1.0 / pivot;
     }
     true
 }
 
 /// Solves for `lanes` right-hand sides at once; `b` is `n × lanes`, row major.
 pub fn solve(a: &[f64], pivots: &[usize], n: usize, b: &mut [f64], lanes: usize) {
+    if lanes == 1 { solve_one(a, pivots, n, b) } else { solve_rows(a, pivots, n, b, lanes) }
+}
+
+/// [`solve`] where rows are worth cutting.
+#[inline(always)]
+pub(crate) fn solve_rows(a: &[f64], pivots: &[usize], n: usize, b: &mut [f64], lanes: usize) {
     if n == 1 {
-        let inverse = 1.0 / a[0];
+        let inverse = a[0];
         b[..lanes].iter_mut().for_each(|x| *x *= inverse);
         return;
-    }
-    if lanes == 1 {
-        return solve_one(a, pivots, n, b);
     }
     for (k, &p) in pivots[..n].iter().enumerate() {
         if p != k {
@@ -55,7 +61,7 @@ pub fn solve(a: &[f64], pivots: &[usize], n: usize, b: &mut [f64], lanes: usize)
     for k in (0..n).rev() {
         let (above, below) = b.split_at_mut(k * lanes);
         let known = &mut below[..lanes];
-        let inverse = 1.0 / a[k * n + k];
+        let inverse = a[k * n + k];
         known.iter_mut().for_each(|x| *x *= inverse);
         for i in 0..k {
             less(&mut above[i * lanes..][..lanes], a[i * n + k], known);
@@ -64,7 +70,12 @@ pub fn solve(a: &[f64], pivots: &[usize], n: usize, b: &mut [f64], lanes: usize)
 }
 
 /// [`solve`] of one right-hand side: numbers in the place of rows, which are not worth cutting.
-fn solve_one(a: &[f64], pivots: &[usize], n: usize, b: &mut [f64]) {
+#[inline]
+pub(crate) fn solve_one(a: &[f64], pivots: &[usize], n: usize, b: &mut [f64]) {
+    if n == 1 {
+        b[0] *= a[0];
+        return;
+    }
     let b = &mut b[..n];
     for (k, &p) in pivots[..n].iter().enumerate() {
         b.swap(k, p);
@@ -78,7 +89,7 @@ fn solve_one(a: &[f64], pivots: &[usize], n: usize, b: &mut [f64]) {
         }
     }
     for k in (0..n).rev() {
-        b[k] *= 1.0 / a[k * n + k];
+        b[k] *= a[k * n + k];
         for i in 0..k {
             let m = a[i * n + k];
             if m != 0.0 {

@@ -8,7 +8,7 @@ use greybox_simulate::Method;
 const FINE: Method = Method::Adaptive { rtol: 1e-11, atol: 1e-13 };
 
 #[test]
-fn damped_oscillator_with_an_order_of_four_and_of_five() {
+fn damped_oscillator_with_an_order_of_four_of_five_and_of_eight() {
     let m = model(&[], &[("x", 2)], &[("c", 0.4), ("k", 9.0)], &["x'' + c*x' + k*x = 0"], &["x"]);
     let exact = |t: f64| {
         let (s, w) = (0.2, (9.0f64 - 0.04).sqrt());
@@ -23,6 +23,8 @@ fn damped_oscillator_with_an_order_of_four_and_of_five() {
     assert!((a / b).log2() > 3.8 && (a / b).log2() < 4.3, "{a} {b}");
     let (a, b) = (error(Method::Dp5 { substeps: 1 }, 60), error(Method::Dp5 { substeps: 1 }, 120));
     assert!((a / b).log2() > 4.7 && (a / b).log2() < 5.4, "{a} {b}");
+    let (a, b) = (error(Method::Dop853 { substeps: 1 }, 8), error(Method::Dop853 { substeps: 2 }, 8));
+    assert!((a / b).log2() > 7.6 && (a / b).log2() < 9.0, "{a} {b}");
     assert!(error(FINE, 30) < 1e-9);
 }
 
@@ -103,7 +105,8 @@ fn a_late_sensor_sees_the_motion_before_the_start() {
     let parameters = [("w", 3.0), ("tau", 0.004)];
     let m = model(&[], &[("x", 2)], &parameters, &["x'' + w^2*x = 0"], &["delay(x, tau)"]);
     let (x0, v0, w, tau) = (0.3, 1.2, 3.0, 0.004);
-    for method in [Method::Rk4 { substeps: 1 }, Method::Dp5 { substeps: 1 }, FINE] {
+    let eighth = Method::Dop853 { substeps: 1 };
+    for method in [Method::Rk4 { substeps: 1 }, Method::Dp5 { substeps: 1 }, eighth, FINE] {
         let y = run(&m, &free(300, 0.01), &[x0, v0], method).y;
         let exact = |k: usize| {
             let t = k as f64 * 0.01 - tau;

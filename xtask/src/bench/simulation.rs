@@ -156,7 +156,7 @@ fn simulation() -> Result<Case> {
             system: &system,
             environment: &environment,
             parameters: &parameters,
-            method: Method::Dp5 { substeps: 4 },
+            method: Method::Dop853 { substeps: 1 },
             seeds: &Seeds::default(),
         };
         Ok(Answer::from([("x".to_owned(), run.run(&[1.0, 0.0], 0..SAMPLES).y)]))

@@ -1,0 +1,245 @@
+//! Directional derivatives of the registers: which have any, and the rule of each.
+
+use super::{Op, Reg, Switch, SwitchKind, powi};
+
+/// Which registers can have a non-zero derivative, and what computes it. Made once by
+/// [`Tape::tangents`](super::Tape::tangents), for the leaves that have one.
+#[derive(Debug, Clone)]
+pub struct Tangents {
+    active: Vec<bool>,
+    pub(super) prologue: Vec<Row>,
+    pub(super) body: Vec<Row>,
+}
+
+impl Tangents {
+    /// Whether the register can have a non-zero derivative.
+    #[inline]
+    pub fn is_active(&self, r: Reg) -> bool {
+        self.active[r as usize]
+    }
+
+    /// The rules of `ops`, of which the first `prologue` depend on parameters alone.
+    pub(super) fn new(
+        ops: &[Op],
+        prologue: usize,
+        first: usize,
+        switches: &[Switch],
+        leaf_active: &[bool],
+    ) -> Tangents {
+        let mut active = vec![false; first + ops.len()];
+        active[..leaf_active.len()].copy_from_slice(leaf_active);
+        let mut rows = [Vec::new(), Vec::new()];
+        for (i, op) in ops.iter().enumerate() {
+            let out = (first + i) as Reg;
+            if let Some(rule) = Rule::of(*op, switches, &|r| active[r as usize]) {
+                active[out as usize] = true;
+                rows[usize::from(i >= prologue)].push(Row { out, rule });
+            }
+        }
+        let [prologue, body] = rows;
+        Tangents { active, prologue, body }
+    }
+}
+
+/// The derivative of one register.
+#[derive(Debug, Clone, Copy)]
+pub(super) struct Row {
+    out: Reg,
+    rule: Rule,
+}
+
+/// d(out) from the rows of the arguments that have one. Capitals: the argument has none.
+#[derive(Debug, Clone, Copy)]
+enum Rule {
+    /// da.
+    Same(Reg),
+    /// −da.
+    Negated(Reg),
+    /// da + db.
+    Sum(Reg, Reg),
+    /// da − db.
+    Difference(Reg, Reg),
+    /// da · B.
+    Scaled(Reg, Reg),
+    /// da · b + a · db.
+    Product(Reg, Reg),
+    /// da / B.
+    Over(Reg, Reg),
+    /// d(A / b).
+    Under(Reg, Reg),
+    /// d(a / b).
+    Quotient(Reg, Reg),
+    Powi(Reg, i32),
+    /// d(a^B).
+    Base(Reg, Reg),
+    /// d(A^b).
+    Exponent(Reg, Reg),
+    /// d(a^b).
+    Pow(Reg, Reg),
+    Sqrt(Reg),
+    Sin(Reg),
+    Cos(Reg),
+    Tan(Reg),
+    Exp(Reg),
+    Ln(Reg),
+    Tanh(Reg),
+    /// A non-smooth function: by its mode; which of the arguments have a row.
+    Switch(u32, bool, bool),
+}
+
+impl Rule {
+    fn of(op: Op, switches: &[Switch], active: &dyn Fn(Reg) -> bool) -> Option<Rule> {
+        let one = |a: Reg, rule: Rule| active(a).then_some(rule);
+        let two = |a: Reg, b: Reg, left: Rule, right: Rule, both: Rule| match (active(a), active(b)) {
+            (true, true) => Some(both),
+            (true, false) => Some(left),
+            (false, true) => Some(right),
+            (false, false) => None,
+        };
+        match op {
+            Op::Neg(a) => one(a, Rule::Negated(a)),
+            Op::Add(a, b) => two(a, b, Rule::Same(a), Rule::Same(b), Rule::Sum(a, b)),
+            Op::Sub(a, b) => two(a, b, Rule::Same(a), Rule::Negated(b), Rule::Difference(a, b)),
+            Op::Mul(a, b) => two(a, b, Rule::Scaled(a, b), Rule::Scaled(b, a), Rule::Product(a, b)),
+            Op::Div(a, b) => two(a, b, Rule::Over(a, b), Rule::Under(a, b), Rule::Quotient(a, b)),
+            Op::Powi(a, n) => one(a, Rule::Powi(a, n)),
+            Op::Pow(a, b) => two(a, b, Rule::Base(a, b), Rule::Exponent(a, b), Rule::Pow(a, b)),
+            Op::Sqrt(a) => one(a, Rule::Sqrt(a)),
+            Op::Sin(a) => one(a, Rule::Sin(a)),
+            Op::Cos(a) => one(a, Rule::Cos(a)),
+            Op::Tan(a) => one(a, Rule::Tan(a)),
+            Op::Exp(a) => one(a, Rule::Exp(a)),
+            Op::Ln(a) => one(a, Rule::Ln(a)),
+            Op::Tanh(a) => one(a, Rule::Tanh(a)),
+            Op::Switch(k) => {
+                let s = &switches[k as usize];
+                let (a, b) = (active(s.a), active(s.b));
+                // (What a sticking sign does is the integrator's business.)
+                let flat = matches!(s.kind, SwitchKind::Sign | SwitchKind::Step);
+                (!flat && (a || b)).then_some(Rule::Switch(k, a, b))
+            }
+        }
+    }
+}
+
+/// The point at which derivatives are taken.
+#[derive(Clone, Copy)]
+pub(super) struct Place<'a> {
+    pub(super) regs: &'a [f64],
+    pub(super) modes: &'a [i8],
+    pub(super) switches: &'a [Switch],
+}
+
+/// Runs the rules on `d`, `registers × lanes`.
+#[inline(always)]
+pub(super) fn run(rows: &[Row], at: Place<'_>, lanes: usize, d: &mut [f64]) {
+    for Row { out, rule } in rows {
+        let out = *out as usize;
+        let (lower, upper) = d.split_at_mut(out * lanes);
+        let o = &mut upper[..lanes];
+        let v = |r: Reg| at.regs[r as usize];
+        let row = |r: Reg| &lower[r as usize * lanes..][..lanes];
+        // (Every operation has few forms of arithmetic, so that it stands here few times.)
+        match *rule {
+            Rule::Same(a) => o.copy_from_slice(row(a)),
+            Rule::Sum(a, b) => join(o, row(a), row(b), |x, y| x + y),
+            Rule::Difference(a, b) => join(o, row(a), row(b), |x, y| x - y),
+            Rule::Scaled(a, b) => scale(o, row(a), v(b)),
+            Rule::Product(a, b) => blend(o, row(a), v(b), row(b), v(a)),
+            Rule::Switch(k, a, b) => switch(o, k as usize, (a, b), at, lower),
+            other => match other.factors(at.regs, out) {
+                (Some((a, ka)), Some((b, kb))) => blend(o, row(a), ka, row(b), kb),
+                (Some((a, k)), None) | (None, Some((a, k))) => scale(o, row(a), k),
+                (None, None) => {}
+            },
+        }
+    }
+}
+
+type Factor = Option<(Reg, f64)>;
+
+impl Rule {
+    /// The arguments' rows and what they are multiplied with.
+    #[inline(never)]
+    fn factors(self, regs: &[f64], out: usize) -> (Factor, Factor) {
+        let v = |r: Reg| regs[r as usize];
+        let one = |a: Reg, k: f64| (Some((a, k)), None);
+        match self {
+            Rule::Negated(a) => one(a, -1.0),
+            Rule::Over(a, b) => one(a, 1.0 / v(b)),
+            Rule::Under(a, b) => one(b, -v(a) / (v(b) * v(b))),
+            Rule::Quotient(a, b) => (Some((a, 1.0 / v(b))), Some((b, -v(a) / (v(b) * v(b))))),
+            Rule::Powi(a, n) => one(a, n as f64 * powi(v(a), n - 1)),
+            Rule::Base(a, b) => one(a, v(b) * v(a).powf(v(b) - 1.0)),
+            Rule::Exponent(a, b) => one(b, v(a).powf(v(b)) * v(a).ln()),
+            Rule::Pow(a, b) => {
+                let (x, y) = (v(a), v(b));
+                (Some((a, y * x.powf(y - 1.0))), Some((b, x.powf(y) * x.ln())))
+            }
+            // At 0 the slope of the root is infinite; a zero derivative keeps lanes finite
+            // where a state rests at the boundary of its domain (an empty tank).
+            Rule::Sqrt(a) => one(a, if regs[out] > 0.0 { 0.5 / regs[out] } else { 0.0 }),
+            Rule::Sin(a) => one(a, v(a).cos()),
+            Rule::Cos(a) => one(a, -v(a).sin()),
+            Rule::Tan(a) => one(a, 1.0 + regs[out] * regs[out]),
+            Rule::Exp(a) => one(a, regs[out]),
+            Rule::Ln(a) => one(a, 1.0 / v(a)),
+            Rule::Tanh(a) => one(a, 1.0 - regs[out] * regs[out]),
+            Rule::Same(a) => one(a, 1.0),
+            Rule::Sum(a, b) => (Some((a, 1.0)), Some((b, 1.0))),
+            Rule::Difference(a, b) => (Some((a, 1.0)), Some((b, -1.0))),
+            Rule::Scaled(a, b) => one(a, v(b)),
+            Rule::Product(a, b) => (Some((a, v(b))), Some((b, v(a)))),
+            Rule::Switch(..) => (None, None),
+        }
+    }
+}
+
+/// d(non-smooth function) in its mode; `live` says which arguments have a row.
+#[inline(never)]
+fn switch(o: &mut [f64], k: usize, live: (bool, bool), at: Place<'_>, lower: &[f64]) {
+    use SwitchKind::*;
+    let lanes = o.len();
+    let row = |r: Reg| &lower[r as usize * lanes..][..lanes];
+    let Switch { kind, a, b, .. } = at.switches[k];
+    let mode = at.modes[k];
+    let m = mode as f64;
+    match kind {
+        Sign | Step => o.fill(0.0),
+        Abs => scale(o, row(a), m),
+        Max => o.copy_from_slice(row(if mode > 0 { a } else { b })),
+        Min => o.copy_from_slice(row(if mode > 0 { b } else { a })),
+        Deadzone if mode == 0 => o.fill(0.0),
+        Deadzone => match live {
+            (true, false) => o.copy_from_slice(row(a)),
+            (false, true) => scale(o, row(b), -m),
+            _ => blend(o, row(a), 1.0, row(b), -m),
+        },
+        Saturate if mode == 0 => o.copy_from_slice(row(a)),
+        Saturate => scale(o, row(b), m),
+    }
+}
+
+/// o = f(x, y).
+#[inline(always)]
+fn join(o: &mut [f64], x: &[f64], y: &[f64], f: impl Fn(f64, f64) -> f64) {
+    let (x, y) = (&x[..o.len()], &y[..o.len()]);
+    for l in 0..o.len() {
+        o[l] = f(x[l], y[l]);
+    }
+}
+
+/// o = k x.
+#[inline(always)]
+fn scale(o: &mut [f64], x: &[f64], k: f64) {
+    let x = &x[..o.len()];
+    for l in 0..o.len() {
+        o[l] = k * x[l];
+    }
+}
+
+/// o = a x + b y.
+#[inline(always)]
+fn blend(o: &mut [f64], x: &[f64], a: f64, y: &[f64], b: f64) {
+    join(o, x, y, |x, y| a * x + b * y);
+}
