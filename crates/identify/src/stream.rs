@@ -374,8 +374,8 @@ pub fn identify_blocks<I, E>(
     observer: &dyn Observer,
 ) -> Result<Streamed, E>
 where
-    I: Iterator<Item = Result<Recording, E>>,
-    E: From<IdentifyError>,
+    I: Iterator<Item = Result<Recording, E>> + Send,
+    E: From<IdentifyError> + Send,
 {
     let mut blocks = open()?;
     let first = blocks.next().ok_or(IdentifyError::NoBlocks)??;
@@ -401,31 +401,35 @@ where
     Ok(Streamed { found, first, holdout: held })
 }
 
-/// Statistics of all blocks, the last one kept out of them where `keep` says so.
-fn pass<E: From<IdentifyError>>(
+/// Statistics of all blocks, the last one kept out of them where `keep` says so. While some blocks are mapped, the next
+/// ones are read.
+fn pass<E: From<IdentifyError> + Send>(
     around: &Linearisation,
-    mut blocks: impl Iterator<Item = Result<Recording, E>>,
+    mut blocks: impl Iterator<Item = Result<Recording, E>> + Send,
     keep: bool,
     observer: &dyn Observer,
 ) -> Result<(Statistics, Option<Recording>), E> {
-    let most = 2 * rayon::current_num_threads().max(1);
-    let mut statistics: Option<Statistics> = None;
-    let mut waiting: Vec<Recording> = Vec::with_capacity(most + 1);
-    loop {
-        let mut over = false;
-        while waiting.len() <= most {
+    let most = 4 * rayon::current_num_threads().max(1);
+    // Blocks to map, one held back where it may be the last, and whether there are no more.
+    let mut read = |held: Option<Recording>| -> Result<(Vec<Recording>, Option<Recording>, bool), E> {
+        let mut batch: Vec<Recording> = held.into_iter().collect();
+        while batch.len() <= most {
             match blocks.next().transpose()? {
-                Some(block) => waiting.push(block),
+                Some(block) => batch.push(block),
                 None => {
-                    over = true;
-                    break;
+                    let held = if keep { batch.pop() } else { None };
+                    return Ok((batch, held, true));
                 }
             }
         }
-        let last = if keep || !over { waiting.pop() } else { None };
-        let mapped: Vec<Result<Statistics, IdentifyError>> =
-            waiting.par_iter().map(|block| around.map(block)).collect();
-        waiting.clear();
+        let held = batch.pop();
+        Ok((batch, held, false))
+    };
+    let mut statistics: Option<Statistics> = None;
+    let (mut batch, mut held, mut over) = read(None)?;
+    loop {
+        let map = || batch.par_iter().map(|block| around.map(block)).collect();
+        let (mapped, next): (Vec<_>, _) = rayon::join(map, || (!over).then(|| read(held.take())));
         for block in mapped {
             let block = block?;
             statistics = Some(match statistics {
@@ -433,10 +437,10 @@ fn pass<E: From<IdentifyError>>(
                 None => block,
             });
         }
-        if over {
-            return Ok((statistics.ok_or(IdentifyError::NoFit)?, last));
-        }
-        waiting.extend(last);
+        let Some(next) = next else {
+            return Ok((statistics.ok_or(IdentifyError::NoFit)?, held));
+        };
+        (batch, held, over) = next?;
         let samples = statistics.as_ref().map_or(0, Statistics::samples);
         observer.stage(&format!("pass {}, {samples} samples", around.steps + 1));
     }
