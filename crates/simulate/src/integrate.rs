@@ -1473,8 +1473,15 @@ impl<'a> Core<'a> {
     fn error(&self, h: f64, rtol: f64, atol: f64) -> f64 {
         let nx = self.system.nx;
         let mut sum = 0.0;
-        for r in 0..nx {
+        // (Backwards: a chain's noise comes from its end.)
+        let mut noise = 0.0;
+        for r in (0..nx).rev() {
+            noise = match self.source[r].checked_sub(self.system.highest()) {
+                Some(_) => h * self.rounding(r),
+                None => h * noise,
+            };
             let e = dot(self.tableau.e, &self.rates.f[r * self.rates.stages..]) * h;
+            let e = (e.abs() - noise).max(0.0);
             let size = self.x[r].abs().max(self.x1[r].abs());
             let floor = self.reach[r].max(size).max(f64::MIN_POSITIVE);
             let e = e / (atol * floor + rtol * size);
@@ -1482,6 +1489,15 @@ impl<'a> Core<'a> {
         }
         let error = (sum / nx as f64).sqrt();
         if error.is_finite() { error } else { 1e10 }
+    }
+
+    /// What rounding of the forces that hold the sticking signs does to entry `r` of ẋ. Where all else is at rest,
+    /// error control relative to the motion would chase it with ever smaller steps.
+    fn rounding(&self, r: usize) -> f64 {
+        const ROUNDED: f64 = 64.0 * f64::EPSILON;
+        let (nx, st) = (self.system.nx, &self.stages[0]);
+        let pull = |(i, &k): (usize, &usize)| (st.held.pull[i * nx + r] * st.lambda[k]).abs();
+        ROUNDED * self.sticking.iter().enumerate().map(pull).sum::<f64>()
     }
 
     /// Finds the first h' ≤ h at which a mode is left; leaves the trial of h' in place.

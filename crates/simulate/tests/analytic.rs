@@ -28,6 +28,21 @@ fn damped_oscillator_with_an_order_of_four_of_five_and_of_eight() {
     assert!(error(FINE, 30) < 1e-9);
 }
 
+/// A drive at rest that its friction holds while the force grows: the link on it does not move, and what rounding
+/// makes of that is not worth small steps.
+#[test]
+fn a_rig_at_rest_is_simulated_in_few_steps() {
+    let parameters = [("J", 0.0021), ("Jl", 0.0039), ("ks", 1.3), ("fc", 0.11)];
+    let hub = "J*q'' - ks*a + fc*sign(q') = u";
+    let m = model(&["u"], &[("q", 2), ("a", 2)], &parameters, &[hub, "Jl*(q'' + a'') + ks*a = 0"], &["a"]);
+    let ramp: Vec<f64> = (0..200).map(|k| 1e-3 * k as f64).collect();
+    let t = run(&m, &driven(Hold::Linear, 0.01, &ramp), &[0.0; 4], FINE);
+    // It breaks loose at 0.11 of 0.199: sample 110.
+    assert!(t.y[..110].iter().all(|a| a.abs() < 1e-12));
+    assert!(t.y[199].abs() > 1e-3);
+    assert!(t.steps < 100 * 200, "{} steps", t.steps);
+}
+
 /// Coulomb-damped free decay: each half swing loses 2 fc/k of amplitude, and the mass sticks inside
 /// |x| ≤ fc/k (Den Hartog 1931).
 #[test]

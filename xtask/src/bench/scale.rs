@@ -51,6 +51,13 @@ fn force(t: f64) -> f64 {
     Duffing::thesis_force(t) + 15.0 * (2.39 * t).sin()
 }
 
+/// The force as recordings hold it: a straight line between two samples.
+fn held(t: f64) -> f64 {
+    let k = (t / DT + 1e-6).floor();
+    let (now, next) = (force(k * DT), force((k + 1.0) * DT));
+    now + (t / DT - k) * (next - now)
+}
+
 /// Writes a recording of the oscillator of thesis equation 2.18, chunk by chunk.
 fn record(path: &Path, samples: usize) -> Result<()> {
     let mut out = BufWriter::with_capacity(1 << 20, File::create(path)?);
@@ -62,7 +69,7 @@ fn record(path: &Path, samples: usize) -> Result<()> {
         let rows = CHUNK.min(samples - from);
         let clock = |k: usize| (from + k) as f64 * DT;
         let sampling = Sampling { dt: DT, substeps: 2 };
-        let states = Duffing::THESIS.run(sampling, start, rows + 1, |t| force(clock(0) + t))?;
+        let states = Duffing::THESIS.run(sampling, start, rows + 1, |t| held(clock(0) + t))?;
         for (k, [x, _]) in states[..rows].iter().enumerate() {
             let measured = x + noise.sample(&mut random);
             writeln!(out, "{:.2},{:.6},{measured:.6}", clock(k), force(clock(k)))?;
