@@ -1,0 +1,246 @@
+//! Forward sensitivities: the derivative of every stage along the lanes.
+
+use greybox_model::system::System;
+use pulp::{Simd, WithSimd};
+
+use super::{Core, lerp, locate};
+use crate::small;
+
+/// out = x + Σ h · weight · k, k one block as long as x after the other; a weight of zero takes no part.
+#[inline(always)]
+fn tangents_along(out: &mut [f64], x: &[f64], k: &[f64], weights: &[f64], h: f64) {
+    let n = x.len();
+    let mut terms =
+        weights.iter().enumerate().filter(|w| *w.1 != 0.0).map(|(j, w)| (h * w, &k[j * n..][..n]));
+    let out = &mut out[..n];
+    match (terms.next(), terms.next()) {
+        (None, _) => out.copy_from_slice(x),
+        (Some((a, ka)), None) => {
+            for e in 0..n {
+                out[e] = x[e] + a * ka[e];
+            }
+        }
+        (Some((a, ka)), Some((b, kb))) => {
+            for e in 0..n {
+                out[e] = x[e] + a * ka[e] + b * kb[e];
+            }
+        }
+    }
+    while let Some((a, ka)) = terms.next() {
+        match terms.next() {
+            None => {
+                for e in 0..n {
+                    out[e] += a * ka[e];
+                }
+            }
+            Some((b, kb)) => {
+                for e in 0..n {
+                    out[e] = out[e] + a * ka[e] + b * kb[e];
+                }
+            }
+        }
+    }
+}
+
+/// The sensitivities' step, with the machine's widest vectors (which round as any others: products and sums are not
+/// fused).
+struct TangentStep<'c, 'a> {
+    core: &'c mut Core<'a>,
+    h: f64,
+}
+
+impl WithSimd for TangentStep<'_, '_> {
+    type Output = ();
+
+    #[inline(always)]
+    fn with_simd<S: Simd>(self, _: S) {
+        let TangentStep { core, h } = self;
+        // Loops of known length for the usual widths.
+        match core.width {
+            4 => core.tangent_step_of(h, 4),
+            8 => core.tangent_step_of(h, 8),
+            12 => core.tangent_step_of(h, 12),
+            16 => core.tangent_step_of(h, 16),
+            width => core.tangent_step_of(h, width),
+        }
+    }
+}
+
+/// The stride of a row of `lanes` tangents: a multiple of four, whose spare lanes are zero.
+pub(super) fn width(lanes: usize) -> usize {
+    if lanes > 2 { lanes.next_multiple_of(4) } else { lanes }
+}
+
+impl Core<'_> {
+    /// Tangents of all registers at stage `b` for the tangents of the state at the step's start.
+    pub(super) fn tangent_here(&mut self, b: usize) {
+        let width = self.width;
+        self.d[System::STATES * width..][..self.dx.len()].copy_from_slice(&self.dx);
+        self.tangent_at(b, width);
+    }
+
+    /// Tangents of all registers at stage `b` for the state tangents that stand in `self.d`.
+    #[inline(always)]
+    fn tangent_at(&mut self, b: usize, width: usize) {
+        let system = self.system;
+        let st = &self.stages[b];
+        if !self.seeds.signals.inputs.is_empty() {
+            let first = self.seeds.parameters.len() + self.seeds.initial.len();
+            let count = self.seeds.signals.lanes;
+            let (k, w) = locate(st.s, st.mid, self.env.dt, self.env.len);
+            for (i, change) in &self.seeds.signals.inputs {
+                let row = &mut self.d[(system.inputs() + i) * width + first..][..count];
+                lerp(change, k, w, self.env.len, count, row);
+            }
+        }
+        if !system.rhs.delays.is_empty() {
+            self.tangent_delays(b);
+        }
+        let st = &self.stages[b];
+        system.rhs.tangent(&self.tangents, &st.regs, &self.modes, width, &mut self.d);
+    }
+
+    /// Tangents of the delayed values of stage `b`.
+    fn tangent_delays(&mut self, b: usize) {
+        let (lanes, width) = (self.lanes, self.width);
+        let st = &self.stages[b];
+        for (i, delay) in self.system.rhs.delays.iter().enumerate() {
+            let tau = delay.tau as usize;
+            let slope = st.delayed_slopes[i];
+            let leaf = delay.leaf as usize;
+            for l in 0..lanes {
+                self.d[leaf * width + l] = -slope * self.d[tau * width + l];
+            }
+            if self.delayed_input(delay.arg_leaf).is_none() {
+                let history = &self.rhs_history[i];
+                let at = st.s - st.regs[tau].max(0.0);
+                let (_, _, j, w) = history.at(at);
+                if !history.s.is_empty() {
+                    let next = (j + 1).min(history.s.len() - 1);
+                    for l in 0..lanes {
+                        let (a, b) = (history.lanes[j * lanes + l], history.lanes[next * lanes + l]);
+                        self.d[leaf * width + l] += a + w * (b - a);
+                    }
+                }
+            }
+        }
+    }
+
+    /// Derivative of stage `b`'s ẋ along the lanes into `self.dk[b]`, for the state tangents that stand in `self.d`.
+    #[inline(always)]
+    fn tangent_stage(&mut self, b: usize, width: usize) {
+        self.tangent_at(b, width);
+        let system = self.system;
+        let (nx, nz) = (system.nx, system.nz);
+        let outputs = &system.rhs.outputs;
+        let st = &self.stages[b];
+        for i in 0..nz {
+            let row = &mut self.b[i * width..][..width];
+            let h = &self.d[outputs[nz * nz + i] as usize * width..][..width];
+            for (r, h) in row.iter_mut().zip(h) {
+                *r = -h;
+            }
+            for j in 0..nz {
+                let reg = outputs[i * nz + j];
+                if self.tangents.is_active(reg) {
+                    let z = st.regs[system.highest() + j];
+                    for (r, m) in row.iter_mut().zip(&self.d[reg as usize * width..][..width]) {
+                        *r -= m * z;
+                    }
+                }
+            }
+        }
+        if !self.seeds.signals.force.is_empty() {
+            self.tangent_forces(b);
+        }
+        let st = &self.stages[b];
+        small::solve_rows(&st.lu, &st.pivots, nz, &mut self.b, width);
+        let dk = &mut self.dk[b * nx * width..][..nx * width];
+        for (dk, &source) in dk.chunks_exact_mut(width).zip(&self.source) {
+            let from = match source.checked_sub(system.highest()) {
+                Some(j) => &self.b[j * width..][..width],
+                None => &self.d[source * width..][..width],
+            };
+            dk.copy_from_slice(from);
+        }
+        if !self.sticking.is_empty() && st.held.ok {
+            self.tangent_sticking(b);
+        }
+    }
+
+    /// The lanes of exogenous forces, into the right-hand side of the equations' tangents.
+    fn tangent_forces(&mut self, b: usize) {
+        let st = &self.stages[b];
+        let signals = &self.seeds.signals;
+        let first = self.seeds.parameters.len() + self.seeds.initial.len();
+        let count = signals.lanes;
+        let (k, w) = locate(st.s, st.mid, self.env.dt, self.env.len);
+        let a = &signals.force[k * count..][..count];
+        let c = &signals.force[(k + 1).min(self.env.len - 1) * count..][..count];
+        for i in 0..self.system.nz {
+            let weights = &signals.weights[i * count..][..count];
+            let row = &mut self.b[i * self.width + first..][..count];
+            for l in 0..count {
+                row[l] -= weights[l] * (a[l] + w * (c[l] - a[l]));
+            }
+        }
+    }
+
+    /// dλ keeps the derivative of ġ zero: ∇g·(dẋ + Σ pull dλ) = 0.
+    fn tangent_sticking(&mut self, b: usize) {
+        let (nx, width) = (self.system.nx, self.width);
+        let held = &self.stages[b].held;
+        let dk = &mut self.dk[b * nx * width..][..nx * width];
+        let m = self.sticking.len();
+        let dl = &mut self.dl;
+        dl.clear();
+        dl.resize(m * width, 0.0);
+        for i in 0..m {
+            for r in 0..nx {
+                let g = held.gradient[i * nx + r];
+                if g != 0.0 {
+                    for l in 0..width {
+                        dl[i * width + l] -= g * dk[r * width + l];
+                    }
+                }
+            }
+        }
+        small::solve(&held.b, &held.pivots, m, dl, width);
+        for i in 0..m {
+            for r in 0..nx {
+                let p = held.pull[i * nx + r];
+                if p != 0.0 {
+                    for l in 0..width {
+                        dk[r * width + l] += p * dl[i * width + l];
+                    }
+                }
+            }
+        }
+    }
+
+    /// Derivatives along the lanes of ẋ at the step's start, stage 0, into `self.dk[0]`.
+    pub(super) fn rate_here(&mut self) {
+        let width = self.width;
+        self.d[System::STATES * width..][..self.dx.len()].copy_from_slice(&self.dx);
+        self.tangent_stage(0, width);
+    }
+
+    /// The sensitivities' step that belongs to the trial step of length `h`.
+    pub(super) fn tangent_step(&mut self, h: f64) {
+        self.arch.dispatch(TangentStep { core: self, h });
+    }
+
+    #[inline(always)]
+    fn tangent_step_of(&mut self, h: f64, width: usize) {
+        let n = self.system.nx * width;
+        let tableau = self.tableau;
+        for i in 0..tableau.b.len() {
+            let rows = &mut self.d[System::STATES * width..][..n];
+            tangents_along(rows, &self.dx[..n], &self.dk, tableau.a[i], h);
+            self.tangent_stage(i, width);
+        }
+        let rows = &mut self.d[System::STATES * width..][..n];
+        tangents_along(rows, &self.dx[..n], &self.dk, tableau.b, h);
+        self.dx.copy_from_slice(rows);
+    }
+}
