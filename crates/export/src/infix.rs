@@ -22,7 +22,7 @@ pub(crate) trait Dialect {
 
 /// How tightly text must hold together where it stands.
 #[derive(Clone, Copy, PartialEq, Eq, PartialOrd, Ord)]
-enum Hold {
+enum Tightness {
     /// Anything; a sign may lead.
     Sum,
     /// A product.
@@ -35,7 +35,7 @@ enum Hold {
 
 /// The expression in the dialect.
 pub(crate) fn text<D: Dialect>(e: &Expr, dialect: &mut D) -> String {
-    write(e, Hold::Sum, dialect)
+    write(e, Tightness::Sum, dialect)
 }
 
 /// The shortest text that reads back as the same number.
@@ -43,7 +43,12 @@ pub(crate) fn number(v: f64) -> String {
     if v.fract() == 0.0 && v.abs() < 1e15 { format!("{v}") } else { format!("{v:?}") }
 }
 
-fn write<D: Dialect>(e: &Expr, needed: Hold, dialect: &mut D) -> String {
+/// The expression, with parentheses unless it holds together.
+pub(crate) fn atom<D: Dialect>(e: &Expr, dialect: &mut D) -> String {
+    write(e, Tightness::Atom, dialect)
+}
+
+fn write<D: Dialect>(e: &Expr, needed: Tightness, dialect: &mut D) -> String {
     if let Expr::Bin(BinOp::Pow, a, b) = e
         && let Some(call) = dialect.power(a, b)
     {
@@ -51,20 +56,20 @@ fn write<D: Dialect>(e: &Expr, needed: Hold, dialect: &mut D) -> String {
     }
     let (text, own) = match e {
         // A leading sign stands only where a sum may.
-        Expr::Num(v) => (number(*v), if v.is_sign_negative() { Hold::Sum } else { Hold::Atom }),
-        Expr::Var { name, primes } => (dialect.symbol(name, *primes), Hold::Atom),
-        Expr::Neg(a) => (format!("-{}", write(a, Hold::Factor, dialect)), Hold::Sum),
+        Expr::Num(v) => (number(*v), if v.is_sign_negative() { Tightness::Sum } else { Tightness::Atom }),
+        Expr::Var { name, primes } => (dialect.symbol(name, *primes), Tightness::Atom),
+        Expr::Neg(a) => (format!("-{}", write(a, Tightness::Factor, dialect)), Tightness::Sum),
         Expr::Bin(op, a, b) => {
             let (left, sign, right, own) = match op {
-                BinOp::Add => (Hold::Sum, " + ", Hold::Product, Hold::Sum),
-                BinOp::Sub => (Hold::Sum, " - ", Hold::Product, Hold::Sum),
-                BinOp::Mul => (Hold::Product, "*", Hold::Factor, Hold::Product),
-                BinOp::Div => (Hold::Product, "/", Hold::Factor, Hold::Product),
-                BinOp::Pow => (Hold::Atom, D::POWER, Hold::Atom, Hold::Factor),
+                BinOp::Add => (Tightness::Sum, " + ", Tightness::Product, Tightness::Sum),
+                BinOp::Sub => (Tightness::Sum, " - ", Tightness::Product, Tightness::Sum),
+                BinOp::Mul => (Tightness::Product, "*", Tightness::Factor, Tightness::Product),
+                BinOp::Div => (Tightness::Product, "/", Tightness::Factor, Tightness::Product),
+                BinOp::Pow => (Tightness::Atom, D::POWER, Tightness::Atom, Tightness::Factor),
             };
             (format!("{}{sign}{}", write(a, left, dialect), write(b, right, dialect)), own)
         }
-        Expr::Call(f, arguments) => (dialect.call(*f, arguments), Hold::Atom),
+        Expr::Call(f, arguments) => (dialect.call(*f, arguments), Tightness::Atom),
     };
     if own < needed { format!("({text})") } else { text }
 }

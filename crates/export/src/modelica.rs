@@ -3,11 +3,10 @@
 use std::fmt::Write as _;
 
 use greybox_model::expr::Func;
-use greybox_model::system::CompileError;
 use greybox_model::{Dimension, Expr, Model, System, Unit};
 
 use crate::error::ExportError;
-use crate::infix::{Dialect, number, text};
+use crate::infix::{Dialect, atom, number, text};
 use crate::names::{Names, ascii};
 
 /// Keywords of Modelica (Language Specification 3.6, 2.3.3), its functions and predefined types, and names
@@ -171,7 +170,7 @@ const TAKEN: &[&str] = &[
 /// # Errors
 /// [`ExportError::Compile`] for a model that was edited by hand into nonsense.
 pub fn modelica(model: &Model) -> Result<String, ExportError> {
-    System::compile(model).map_err(|e: CompileError| ExportError::Compile(e))?;
+    System::compile(model)?;
     let mut names = Names::new(TAKEN);
     let class = names.fresh(&class_name(&model.name));
     for p in &model.parameters {
@@ -265,23 +264,21 @@ impl Dialect for Text<'_> {
 
     fn call(&mut self, function: Func, arguments: &[Expr]) -> String {
         let written: Vec<String> = arguments.iter().map(|a| text(a, self)).collect();
-        let (a, b) = (&written[0], written.last().map_or("", String::as_str));
+        let a = &written[0];
+        // Behind a sign.
+        let b = atom(arguments.get(1).unwrap_or(&arguments[0]), self);
         let name = match function {
             Func::Sign => {
                 self.signs = true;
                 return format!(
-                    "(if ({a}) > sign_width then 1 elseif ({a}) < -sign_width then -1 else ({a})/sign_width)"
+                    "(if {a} > sign_width then 1 elseif {a} < -sign_width then -1 else {b}/sign_width)"
                 );
             }
             Func::Deadzone => {
-                return format!(
-                    "(if ({a}) > ({b}) then ({a}) - ({b}) elseif ({a}) < -({b}) then ({a}) + ({b}) else 0)"
-                );
+                return format!("(if {a} > {b} then {a} - {b} elseif {a} < -{b} then {a} + {b} else 0)");
             }
-            Func::Saturate => {
-                return format!("(if ({a}) > ({b}) then ({b}) elseif ({a}) < -({b}) then -({b}) else ({a}))");
-            }
-            Func::Step => return format!("(if ({a}) < ({b}) then 0 else 1)"),
+            Func::Saturate => return format!("(if {a} > {b} then {b} elseif {a} < -{b} then -{b} else {a})"),
+            Func::Step => return format!("(if {a} < {b} then 0 else 1)"),
             Func::Ln => "log",
             // Modelica's own, with its events.
             _ => function.name(),

@@ -4,7 +4,7 @@ use std::fmt::Write as _;
 
 use greybox_model::expr::Func;
 use greybox_model::system::CompileError;
-use greybox_model::{Expr, Hold, Model, System};
+use greybox_model::{Expr, Hold, Model, System, Unit};
 
 use crate::error::ExportError;
 use crate::infix::{Dialect, number, text};
@@ -187,7 +187,7 @@ impl Module<'_> {
         let signature = "t, _x, _z, _u, _d, _p";
         let _ = writeln!(out, "\n\ndef _outputs({signature}):\n    \"\"\"What the channels show.\"\"\"");
         let all: Vec<&Expr> = model.measurements.iter().map(|m| &m.expr).collect();
-        self.unpack(&mut out, &all);
+        self.unpack(&mut out, &all, true);
         list(&mut out, "    return [", &shown);
         self.delays(&mut out, "_delayed", "_delay_times", "_DELAYED", &equations.delays);
         self.delays(&mut out, "_delayed_output", "_output_delay_times", "_DELAYED_OUTPUTS", &channels.delays);
@@ -286,8 +286,9 @@ impl Module<'_> {
             "# What an input does between its samples: zero | linear | band_limited\nHOLDS = {{{}}}",
             holds.join(", ")
         );
-        tuple(out, "INPUTS", model.inputs.iter().map(|i| i.name.clone()));
-        tuple(out, "CHANNELS", model.measurements.iter().map(|m| m.channel.clone()));
+        out.push_str("# name: unit in the model, and SI value of one\n");
+        units(out, "INPUTS", model.inputs.iter().map(|i| (&i.name, &i.unit)));
+        units(out, "CHANNELS", model.measurements.iter().map(|m| (&m.channel, &m.unit)));
         let written = |delays: &[(Expr, Expr)]| -> Vec<String> {
             delays
                 .iter()
@@ -318,10 +319,10 @@ impl Module<'_> {
     fn equations(&self, out: &mut String, equations: &Text<'_>, mass: &[Vec<String>], force: &[String]) {
         out.push_str("\n\ndef _equations(t, _x, _u, _d, _p, _switch):\n    \"\"\"M and h of M z + h = 0, row by row as in EQUATIONS.\"\"\"\n");
         let residuals: Vec<Expr> = self.model.equations.iter().map(|e| e.residual()).collect();
-        self.unpack(out, &residuals.iter().collect::<Vec<_>>());
+        self.unpack(out, &residuals.iter().collect::<Vec<_>>(), false);
         for (k, (function, arguments)) in equations.switches.iter().flatten().enumerate() {
             let call = Expr::call(*function, arguments.clone()).to_string();
-            let _ = writeln!(out, "   {}", comment(&format!("_switch({k}): {call}")));
+            let _ = writeln!(out, "  {}", comment(&format!("_switch({k}): {call}")));
         }
         let rows: Vec<String> = mass.iter().map(|row| format!("[{}]", row.join(", "))).collect();
         list(out, "    _mass = [", &rows);
@@ -329,20 +330,17 @@ impl Module<'_> {
         out.push_str("    return _mass, _force\n");
     }
 
-    /// Names for what the expressions read.
-    fn unpack(&self, out: &mut String, expressions: &[&Expr]) {
-        let n = self.model.states.len();
+    /// Names for what the expressions read; the highest derivatives only where they are at hand.
+    fn unpack(&self, out: &mut String, expressions: &[&Expr], highest: bool) {
+        let model = self.model;
         let reads = |name: &str| expressions.iter().any(|e| e.mentions(name));
-        let of_states = self.model.states.iter().any(|s| reads(&s.name));
-        let highest = (0..n).any(|k| {
-            let s = &self.model.states[k];
-            expressions.iter().any(|e| e.contains(&s.name, s.order as u8))
-        });
+        let of_highest =
+            model.states.iter().any(|s| expressions.iter().any(|e| e.contains(&s.name, s.order as u8)));
         let groups = [
-            (&self.parameters, "_p", self.model.parameters.iter().any(|p| reads(&p.name))),
-            (&self.states, "_x", of_states),
-            (&self.highest, "_z", highest && out.ends_with("channels show.\"\"\"\n")),
-            (&self.inputs, "_u", self.model.inputs.iter().any(|i| reads(&i.name))),
+            (&self.parameters, "_p", model.parameters.iter().any(|p| reads(&p.name))),
+            (&self.states, "_x", model.states.iter().any(|s| reads(&s.name))),
+            (&self.highest, "_z", highest && of_highest),
+            (&self.inputs, "_u", model.inputs.iter().any(|i| reads(&i.name))),
         ];
         for (names, from, read) in groups {
             if read {
@@ -360,7 +358,7 @@ impl Module<'_> {
             let mut inner = Text { delays: delays[..k].to_vec(), ..self.text() };
             let value = text(argument, &mut inner);
             let _ = writeln!(out, "\n\ndef {function}_{k}(t, _x, _u, _d, _p):");
-            self.unpack(out, &[argument]);
+            self.unpack(out, &[argument], false);
             let _ = writeln!(out, "    return {value}");
             let on_state = self.model.states.iter().any(|s| argument.mentions(&s.name));
             let mut nested = false;
@@ -372,7 +370,7 @@ impl Module<'_> {
         }
         let _ = writeln!(out, "\n\ndef {times}(_p):");
         let all: Vec<&Expr> = delays.iter().map(|(_, tau)| tau).collect();
-        self.unpack(out, &all);
+        self.unpack(out, &all, false);
         list(out, "    return [", &taus);
         if function == "_delayed" {
             out.push_str(
@@ -417,7 +415,7 @@ impl Module<'_> {
                 .collect();
             let _ = writeln!(out, "\n\ndef _sign_rate_{k}(t, _x, _u, _slopes, _p):");
             let all: Vec<&Expr> = gradient.iter().chain(rate.iter().map(|(e, _)| e)).collect();
-            self.unpack(out, &all);
+            self.unpack(out, &all, false);
             if rate.iter().any(|(_, slope)| slope.is_some()) {
                 wrapped(out, &self.slopes, "_slopes");
             }
@@ -428,6 +426,14 @@ impl Module<'_> {
         out.push_str("\n\n");
         list(out, "_SIGN_RATES = [", &table);
     }
+}
+
+/// `NAME = {"a": ("mm", 0.001)}`
+fn units<'a>(out: &mut String, name: &str, entries: impl Iterator<Item = (&'a String, &'a Unit)>) {
+    let entries: Vec<String> = entries
+        .map(|(name, unit)| format!("{}: ({}, {})", literal(name), literal(&unit.text), number(unit.factor)))
+        .collect();
+    let _ = writeln!(out, "{name} = {{{}}}", entries.join(", "));
 }
 
 /// `NAME = ("a", "b")`
@@ -469,7 +475,8 @@ fn wrapped(out: &mut String, names: &[String], from: &str) {
         let _ = write!(out, "{name}, ");
         width += name.len() + 2;
     }
-    out.truncate(out.trim_end().len());
+    // A tuple of one keeps its comma.
+    out.truncate(out.len() - if names.len() > 1 { 2 } else { 1 });
     let _ = writeln!(out, ") = {from}");
 }
 
