@@ -67,7 +67,7 @@ fn the_python_module_computes_what_simulate_computes() {
         } else {
             bench.json(&["new", name, "--out", &model]);
         }
-        bench.write("run.csv", &driven(inputs, channels, 800, dt, amplitude));
+        bench.write("run.csv", &driven(inputs, channels, 600, dt, amplitude));
         let answer = compare(&python, &bench, &model, "run.csv");
         let differences = answer["difference"].as_object().unwrap();
         assert_eq!(differences.len(), channels.len(), "{name}: {answer}");
@@ -83,6 +83,28 @@ fn the_python_module_computes_what_simulate_computes() {
             assert!(answer["events"].as_u64().unwrap() >= 2, "the axis never sticks: {answer}");
         }
     }
+}
+
+/// The book's page says what its own code prints.
+#[test]
+fn the_page_of_the_book_says_what_its_code_prints() {
+    let page = Path::new(env!("CARGO_MANIFEST_DIR")).join("../../docs/src/export.md");
+    let page = fs::read_to_string(page).unwrap().replace("\r\n", "\n");
+    let block = |language: &str| {
+        let behind = page.split(&format!("```{language}\n")).nth(1).unwrap();
+        behind.split("```").next().unwrap().to_owned()
+    };
+    let bench = Bench::empty();
+    bench.write("axis.toml", &block("toml"));
+    bench.write("use.py", &block("python"));
+    bench.json(&["export", "axis.toml", "--to", "python", "--out", "axis.py"]);
+    let Some(python) = python() else {
+        eprintln!("skipped: no Python with SciPy; `cargo xtask python` makes one for $GREYBOX_PYTHON");
+        return;
+    };
+    let output = Command::new(python).arg("use.py").current_dir(bench.path(".")).output().unwrap();
+    assert!(output.status.success(), "{}", String::from_utf8_lossy(&output.stderr));
+    assert_eq!(String::from_utf8_lossy(&output.stdout).replace("\r\n", "\n"), block("text"));
 }
 
 #[test]
