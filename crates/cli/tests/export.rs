@@ -17,6 +17,10 @@ mod recordings;
 /// names that are words of Python.
 const EVERYTHING: &str = include_str!("common/everything.toml");
 
+/// Two slides that stick at times of their own, one by a load that is zero at the start; an accelerometer, and a delayed
+/// measurement of a speed.
+const CONTACT: &str = include_str!("common/contact.toml");
+
 /// A Python that has SciPy: the one of `$GREYBOX_PYTHON` (`cargo xtask python` makes one), or the system's.
 fn python() -> Option<String> {
     let stated = std::env::var("GREYBOX_PYTHON").ok();
@@ -26,6 +30,9 @@ fn python() -> Option<String> {
     assert!(has_scipy || stated.is_none(), "$GREYBOX_PYTHON is {candidate:?}, which has no SciPy");
     has_scipy.then_some(candidate)
 }
+
+/// Name of the model, inputs, channels, step in s, amplitude of the inputs, largest difference over the spread.
+type Case = (&'static str, &'static [&'static str], &'static [&'static str], f64, f64, f64);
 
 /// The largest difference of each channel over its spread, and the number of events.
 fn compare(python: &str, bench: &Bench, model: &str, recording: &str) -> Value {
@@ -48,9 +55,9 @@ fn the_python_module_computes_what_simulate_computes() {
         return;
     };
     let bench = Bench::empty();
-    // Inputs, channels, step in s, amplitude of the inputs. What `simulate` itself is right to bounds the
+    // What `simulate` itself is right to bounds the
     // agreement: 1e-6 of the spread, and for a delayed sensor the cubic between its samples.
-    let cases: [(&str, &[&str], &[&str], f64, f64, f64); 8] = [
+    let cases: [Case; 9] = [
         ("servo", &["v"], &["theta"], 0.005, 3.0, 1e-9),
         ("two_mass_drive", &["i"], &["motor", "load"], 0.001, 1.0, 1e-9),
         ("pendulum", &["tau"], &["theta"], 0.01, 1.0, 1e-7),
@@ -59,13 +66,14 @@ fn the_python_module_computes_what_simulate_computes() {
         ("oscillator", &["f"], &["x"], 0.01, 3.0, 1e-9),
         ("linear_axis", &["i"], &["x"], 0.002, 1.0, 1e-7),
         ("everything", &["v", "w", "q"], &["x", "lambda", "sensor"], 0.005, 1.0, 1e-4),
+        ("contact", &["u"], &["x", "y", "acc", "lag"], 0.005, 1.0, 1e-8),
     ];
     for (name, inputs, channels, dt, amplitude, bound) in cases {
         let model = format!("{name}.toml");
-        if name == "everything" {
-            bench.write(&model, EVERYTHING);
-        } else {
-            bench.json(&["new", name, "--out", &model]);
+        match name {
+            "everything" => bench.write(&model, EVERYTHING),
+            "contact" => bench.write(&model, CONTACT),
+            _ => assert_eq!(bench.json(&["new", name, "--out", &model])["template"], name),
         }
         bench.write("run.csv", &driven(inputs, channels, 600, dt, amplitude));
         let answer = compare(&python, &bench, &model, "run.csv");

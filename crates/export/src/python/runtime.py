@@ -382,11 +382,10 @@ class _Run:
             self.flow(0.0, self.x.tolist())
             self.natural_modes()
         self.note_scale()
-        at_zero = [k for k, kind in enumerate(SWITCHES) if kind == "sign" and self.modes[k] == 0]
-        for k in at_zero:
-            self.modes[k] = 1
-        for k in at_zero:
-            self.decide(k)
+        for k, kind in enumerate(SWITCHES):
+            if kind == "sign" and self.modes[k] == 0:
+                self.modes[k] = 1
+                self.decide(k)
 
     def settle(self):
         """Modes at the start of a stretch: an input may have jumped."""
