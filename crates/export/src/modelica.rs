@@ -163,7 +163,7 @@ const TAKEN: &[&str] = &[
 /// )?;
 /// let text = greybox_export::modelica(&model)?;
 /// assert!(text.contains("parameter Real k(unit = \"1/s2\") = 40;"));
-/// assert!(text.contains("der(x_dot) + k*x = 0;"));
+/// assert!(text.contains("der(x_dot) + k*x = 0 \"cart\";"));
 /// # Ok::<(), Box<dyn std::error::Error>>(())
 /// ```
 ///
