@@ -121,11 +121,16 @@ fn text_of_a_model_is_never_code() {
         text.lines().map(|l| l.split(['"', '#']).next().unwrap().trim_end().to_owned()).collect()
     };
     assert_eq!(begins(&python), begins(&benign));
+    let name = r#"NAME = "x\"\"\"\U0000000a'''\\\"*/ end; import os\U0000000d\U00002028%$\\input{a}""#;
+    assert!(python.lines().any(|line| line == name), "{python}");
     // What else ends a line in Python.
     assert!(!python.contains(['\r', '\u{2028}']), "{python}");
     let modelica = modelica(&model).unwrap();
     assert_eq!(modelica.lines().count(), greybox_export::modelica(&axis()).unwrap().lines().count());
-    assert!(!modelica.contains("x\"\""), "{modelica}");
+    assert!(
+        modelica.starts_with(r#"model XEndImportOsInputA "x\"\"\" '''\\\"*/ end; import os"#),
+        "{modelica}"
+    );
     let document = latex_document(&model);
     assert!(!document.contains("\\input{a}") && !document.contains("%$"), "{document}");
     assert!(document.contains("\\textbackslash{}input\\{a\\}"), "{document}");
