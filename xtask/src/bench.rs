@@ -9,7 +9,7 @@ mod control;
 mod instructions;
 mod page;
 mod peak;
-mod peer;
+pub(crate) mod peer;
 mod scale;
 mod simulation;
 mod sparse;
@@ -140,7 +140,11 @@ pub(crate) fn run(root: &Path, arguments: &Arguments) -> Result<Ending> {
     if arguments.write_docs && !arguments.peers {
         bail!("--write-docs needs --peers or --scale");
     }
-    let python = if arguments.peers { Some(peer::environment(root, &target)?) } else { None };
+    let python = if arguments.peers {
+        Some(peer::environment(root, &target.join("bench").join("python"), &[])?)
+    } else {
+        None
+    };
     let one = rayon::ThreadPoolBuilder::new().num_threads(1).build()?;
     let bench = Bench { root, target: &target, python: python.as_deref(), arguments, one };
     let mut report = Report { machine: Machine::here(), peak: None, rows: Vec::new() };

@@ -40,6 +40,8 @@ enum Task {
         #[arg(long)]
         check: bool,
     },
+    /// Make a Python with NumPy and SciPy, as bench/requirements.txt pins them, and print its path for $GREYBOX_PYTHON
+    Python,
     /// Run what the continuous integration runs (.ci/run)
     Ci,
     /// Print the commands of the README's block behind `<!-- MARKER -->`
@@ -66,6 +68,7 @@ fn main() -> ExitCode {
         Task::Reproduce(arguments) => reproduce::run(&root(), &arguments),
         Task::Bench(arguments) => bench::run(&root(), &arguments),
         Task::Docs { check } => docs::run(&root(), check),
+        Task::Python => python(&root()),
         Task::Ci => ci(&root()),
         Task::ReadmeCommand { marker } => print_command(&root(), &marker),
     };
@@ -84,6 +87,12 @@ fn main() -> ExitCode {
 fn root() -> PathBuf {
     let here = Path::new(env!("CARGO_MANIFEST_DIR"));
     here.parent().unwrap_or(here).to_path_buf()
+}
+
+fn python(root: &Path) -> Result<Ending> {
+    let folder = process::target(root).join("python");
+    println!("{}", bench::peer::environment(root, &folder, &["numpy", "scipy"])?.display());
+    Ok(Ending::Done)
 }
 
 fn ci(root: &Path) -> Result<Ending> {

@@ -7,7 +7,9 @@ use clap::error::ErrorKind;
 use clap::{Args, Parser, Subcommand};
 
 use crate::answer::Answer;
-use crate::commands::{calibrate, check, control, demo, diagnose, identify, mechanisms, simulate};
+use crate::commands::{
+    calibrate, check, control, demo, diagnose, export, identify, mechanisms, new, shell, simulate,
+};
 use crate::failure::Failure;
 use crate::loading::{self, LoadedModel};
 use crate::output::OutputFolder;
@@ -28,6 +30,8 @@ use greybox_recording::Recording;
   greybox simulate result/improved.toml run3.csv --out simulated.csv
   greybox identify run1.csv --states x --inputs f --holdout run2.csv --out found
   greybox control result/improved.toml --track theta --to 0.5 --out controller
+  greybox export result/improved.toml --to python --out machine.py
+  greybox new servo --out servo.toml
 
 Exit status: 0 finished, whatever the verdict; 2 bad usage or bad input; 1 internal failure."
 )]
@@ -133,8 +137,12 @@ pub(crate) enum Command {
     Simulate(simulate::Arguments),
     Check(check::Arguments),
     Control(control::Arguments),
+    Export(export::Arguments),
+    New(new::Arguments),
     Mechanisms(mechanisms::Arguments),
     Demo(demo::Arguments),
+    Completions(shell::Completions),
+    Man(shell::Man),
 }
 
 impl Command {
@@ -146,8 +154,12 @@ impl Command {
             Command::Simulate(arguments) => simulate::run(arguments),
             Command::Check(arguments) => check::run(arguments),
             Command::Control(arguments) => control::run(arguments),
+            Command::Export(arguments) => export::run(arguments),
+            Command::New(arguments) => new::run(arguments),
             Command::Mechanisms(arguments) => mechanisms::run(arguments),
             Command::Demo(arguments) => demo::run(arguments),
+            Command::Completions(arguments) => shell::completions(arguments),
+            Command::Man(arguments) => shell::man(arguments),
         }
     }
 }
@@ -162,7 +174,8 @@ impl Cli {
             }
             Err(e) if e.kind() == ErrorKind::DisplayHelpOnMissingArgumentOrSubcommand => {
                 Err(Failure::input("no command is given").mend(
-                    "name one: `greybox diagnose`, `identify`, `calibrate`, `simulate`, `check`, `control`, `mechanisms` or `demo`; \
+                    "name one: `greybox diagnose`, `identify`, `calibrate`, `simulate`, `check`, `control`, `export`, \
+                     `new`, `mechanisms` or `demo`; \
                      `greybox --help` explains them",
                 ))
             }

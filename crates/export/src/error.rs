@@ -1,3 +1,5 @@
+use greybox_model::system::CompileError;
+
 /// Why a function cannot be written as code.
 #[derive(Debug, Clone, PartialEq, thiserror::Error)]
 #[non_exhaustive]
@@ -39,5 +41,22 @@ pub enum ExportError {
     Twice {
         /// The name.
         name: String,
+    },
+    /// A model that does not compile.
+    #[error(transparent)]
+    Compile(#[from] CompileError),
+    /// A model that a language cannot hold as it stands.
+    #[error("equation \"{equation}\": `{function}` cannot be written in {language}: {reason}; mend: {mend}")]
+    Refused {
+        /// Name of the equation.
+        equation: String,
+        /// Function of the model language.
+        function: &'static str,
+        /// Language to write.
+        language: &'static str,
+        /// Why not.
+        reason: &'static str,
+        /// What to do.
+        mend: &'static str,
     },
 }

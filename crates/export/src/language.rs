@@ -6,6 +6,7 @@ use greybox_model::expr::Func;
 
 use crate::function::{Function, symbol};
 use crate::graph::{Graph, Node, Operator};
+use crate::names::ascii;
 
 /// A language that functions are written in.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -139,17 +140,7 @@ fn is_temporary(name: &str) -> bool {
 
 /// A name for a constant of the model, whatever it is called there.
 fn constant_name(function: &Function, name: &str) -> String {
-    let plain: String =
-        name.chars()
-            .map(|c| {
-                if c.is_ascii_alphanumeric() || c == '_' {
-                    c.to_string()
-                } else {
-                    format!("_u{:x}_", c as u32)
-                }
-            })
-            .collect();
-    let mut candidate = plain.clone();
+    let mut candidate = ascii(name);
     let taken = |c: &str| c == function.name || function.arguments.iter().any(|g| g.name == c);
     let other = |c: &str| function.constants.iter().any(|o| o.name != name && o.name == c);
     while !is_identifier(&candidate) || taken(&candidate) || (candidate != name && other(&candidate)) {

@@ -3,8 +3,16 @@
 mod error;
 mod function;
 mod graph;
+mod infix;
 mod language;
+mod latex;
+mod modelica;
+mod names;
+mod python;
 
 pub use error::ExportError;
 pub use function::{Constant, Function, Group, Member, Vector};
 pub use language::Language;
+pub use latex::{latex, latex_document};
+pub use modelica::modelica;
+pub use python::python;

@@ -10,11 +10,15 @@ use serde::Deserialize;
 
 use super::case::{Answer, Case};
 
-/// The interpreter of the environment, which is made (again) when `requirements.txt` is not what it was made from.
-pub(crate) fn environment(root: &Path, target: &Path) -> Result<PathBuf> {
+/// The interpreter of the environment in `folder` with the packages of `requirements.txt`, those in `only` where it names
+/// some. It is made (again) when they are not what it was made from.
+pub(crate) fn environment(root: &Path, folder: &Path, only: &[&str]) -> Result<PathBuf> {
     let list = root.join("bench").join("requirements.txt");
-    let wanted = fs::read_to_string(&list).with_context(|| format!("{} cannot be read", list.display()))?;
-    let folder = target.join("bench").join("python");
+    let pinned = fs::read_to_string(&list).with_context(|| format!("{} cannot be read", list.display()))?;
+    let named =
+        |line: &&str| only.is_empty() || line.split("==").next().is_some_and(|name| only.contains(&name));
+    let packages: Vec<&str> = pinned.lines().filter(named).collect();
+    let wanted = packages.join("\n");
     let made_from = folder.join("made-from.txt");
     let python = match cfg!(windows) {
         true => folder.join("Scripts").join("python.exe"),
@@ -23,18 +27,19 @@ pub(crate) fn environment(root: &Path, target: &Path) -> Result<PathBuf> {
     if python.exists() && fs::read_to_string(&made_from).is_ok_and(|found| found == wanted) {
         return Ok(python);
     }
-    eprintln!("making the peers' Python environment in {}", folder.display());
+    eprintln!("making a Python environment in {}", folder.display());
     let system = if cfg!(windows) { "python" } else { "python3" };
-    succeed(Command::new(system).args(["-m", "venv", "--clear"]).arg(&folder))?;
-    succeed(Command::new(&python).args(["-m", "pip", "install", "--quiet", "--no-deps", "-r"]).arg(&list))?;
+    succeed(Command::new(system).args(["-m", "venv", "--clear"]).arg(folder))?;
+    succeed(Command::new(&python).args(["-m", "pip", "install", "--quiet", "--no-deps"]).args(&packages))?;
     fs::write(&made_from, wanted).with_context(|| format!("{} cannot be written", made_from.display()))?;
     Ok(python)
 }
 
 fn succeed(command: &mut Command) -> Result<()> {
     let text = format!("{command:?}");
-    let status =
-        command.stdin(Stdio::null()).status().with_context(|| format!("{text} could not be started"))?;
+    // Standard output is for the answer of the task.
+    let command = command.stdin(Stdio::null()).stdout(Stdio::null());
+    let status = command.status().with_context(|| format!("{text} could not be started"))?;
     if !status.success() {
         bail!("{text} failed ({status})");
     }

@@ -24,7 +24,9 @@ use crate::progress::Progress;
 
 OUT.csv has the times of the recording and one column per measured channel, under the same names and in the
 same units. Rows that the simulation does not reach (a piece too short to use, a simulation that diverges)
-have empty cells.")]
+have empty cells.
+
+With --json, `initial_si` holds the initial state of each piece.")]
 pub(crate) struct Arguments {
     /// Model (TOML)
     #[arg(value_name = "MODEL.toml")]
@@ -86,9 +88,22 @@ pub(crate) fn run(arguments: &Arguments) -> Result<Answer, Failure> {
         "rows": rows,
         "empty_rows": empty,
         "diverged": free_run.diverged,
+        "initial_si": free_run.starts.iter().map(|x0| initial_json(model, x0)).collect::<Vec<_>>(),
         "fit": channels.iter().zip(&scores).map(|(c, s)| ((*c).to_owned(), score_json(s))).collect::<Map<_, _>>(),
     });
     Ok(Answer::new(text, json))
+}
+
+/// The initial state of a piece: each coordinate with its derivatives, SI.
+fn initial_json(model: &Model, x0: &[f64]) -> serde_json::Value {
+    let mut rest = x0;
+    let mut chains = Map::new();
+    for state in &model.states {
+        let (chain, behind) = rest.split_at(state.order.min(rest.len()));
+        chains.insert(state.name.clone(), json!(chain));
+        rest = behind;
+    }
+    chains.into()
 }
 
 fn score_json(score: &Score) -> serde_json::Value {
