@@ -96,7 +96,7 @@ impl<const W: usize> WithSimd for Tile<'_, W> {
     }
 }
 
-/// Q = P R⁻¹ for the columns P of a panel and an upper triangle R (column-major): one column of Q after the other.
+/// Q = P R⁻¹ for the columns P of a panel and an upper triangle R (column-major): a few columns of Q after the others.
 pub(crate) fn divide(columns: &[&[f64]], r: &[f64], out: &mut [f64]) {
     Arch::new().dispatch(Division { columns, r, out });
 }
@@ -107,42 +107,87 @@ struct Division<'a> {
     out: &'a mut [f64],
 }
 
-/// Vectors of a column that are worked on together.
-const GROUP: usize = 8;
-
 impl WithSimd for Division<'_> {
     type Output = ();
 
     #[inline(always)]
     fn with_simd<S: Simd>(self, simd: S) {
-        let (m, n) = (self.columns.len(), self.columns[0].len());
-        let width = GROUP * (size_of::<S::f64s>() / size_of::<f64>());
+        // Vectors of a column, and columns, that are worked on together: as many as the registers hold.
+        if size_of::<S::f64s>() == 64 { self.groups::<S, 8, 3>(simd) } else { self.groups::<S, 4, 3>(simd) }
+    }
+}
+
+impl Division<'_> {
+    /// Rows in groups of V vectors, C columns at a time, so that C·V products need V + C loads.
+    #[inline(always)]
+    fn groups<S: Simd, const V: usize, const C: usize>(self, simd: S) {
+        let Division { columns, r, out } = self;
+        let (m, n) = (columns.len(), columns[0].len());
+        let width = V * (size_of::<S::f64s>() / size_of::<f64>());
         let whole = n - n % width;
         for start in (0..whole).step_by(width) {
-            for (j, column) in self.columns.iter().enumerate() {
-                let (before, rest) = self.out.split_at_mut(j * n);
-                let from = S::as_simd_f64s(&column[start..start + width]).0;
-                let mut sums = [simd.splat_f64s(0.0); GROUP];
-                sums.copy_from_slice(from);
-                let factors = &self.r[j * m..j * m + j];
-                for (&factor, known) in factors.iter().zip(before.chunks_exact(n)) {
-                    let factor = simd.splat_f64s(-factor);
-                    let known = &S::as_simd_f64s(&known[start..start + width]).0[..GROUP];
-                    for t in 0..GROUP {
-                        sums[t] = simd.mul_add_f64s(factor, known[t], sums[t]);
-                    }
-                }
-                let inverse = simd.splat_f64s(1.0 / self.r[j * m + j]);
-                let to = S::as_mut_simd_f64s(&mut rest[start..start + width]).0;
-                for t in 0..GROUP {
-                    to[t] = simd.mul_f64s(sums[t], inverse);
-                }
+            let mut first = 0;
+            while first + C <= m {
+                simd.vectorize(Group::<V, C> { columns, r, out, start, first });
+                first += C;
+            }
+            for first in first..m {
+                simd.vectorize(Group::<V, 1> { columns, r, out, start, first });
             }
         }
         for row in whole..n {
-            for (j, column) in self.columns.iter().enumerate() {
-                let known: f64 = (0..j).map(|i| self.r[j * m + i] * self.out[i * n + row]).sum();
-                self.out[j * n + row] = (column[row] - known) / self.r[j * m + j];
+            for (j, column) in columns.iter().enumerate() {
+                let known: f64 = (0..j).map(|i| r[j * m + i] * out[i * n + row]).sum();
+                out[j * n + row] = (column[row] - known) / r[j * m + j];
+            }
+        }
+    }
+}
+
+/// V vectors, from row `start` on, of C columns from `first` on.
+struct Group<'a, const V: usize, const C: usize> {
+    columns: &'a [&'a [f64]],
+    r: &'a [f64],
+    out: &'a mut [f64],
+    start: usize,
+    first: usize,
+}
+
+impl<const V: usize, const C: usize> WithSimd for Group<'_, V, C> {
+    type Output = ();
+
+    #[inline(always)]
+    fn with_simd<S: Simd>(self, simd: S) {
+        let Group { columns, r, out, start, first } = self;
+        let (m, n) = (columns.len(), columns[0].len());
+        let rows = start..start + V * (size_of::<S::f64s>() / size_of::<f64>());
+        let (before, rest) = out.split_at_mut(first * n);
+        let mut sums = [[simd.splat_f64s(0.0); V]; C];
+        for c in 0..C {
+            sums[c].copy_from_slice(S::as_simd_f64s(&columns[first + c][rows.clone()]).0);
+        }
+        for (i, known) in before.chunks_exact(n).enumerate() {
+            let known = &S::as_simd_f64s(&known[rows.clone()]).0[..V];
+            for c in 0..C {
+                let factor = simd.splat_f64s(-r[(first + c) * m + i]);
+                for v in 0..V {
+                    sums[c][v] = simd.mul_add_f64s(factor, known[v], sums[c][v]);
+                }
+            }
+        }
+        for c in 0..C {
+            let factors = &r[(first + c) * m + first..][..=c];
+            for b in 0..c {
+                let factor = simd.splat_f64s(-factors[b]);
+                for v in 0..V {
+                    sums[c][v] = simd.mul_add_f64s(factor, sums[b][v], sums[c][v]);
+                }
+            }
+            let inverse = simd.splat_f64s(1.0 / factors[c]);
+            let to = S::as_mut_simd_f64s(&mut rest[c * n..][rows.clone()]).0;
+            for v in 0..V {
+                sums[c][v] = simd.mul_f64s(sums[c][v], inverse);
+                to[v] = sums[c][v];
             }
         }
     }
