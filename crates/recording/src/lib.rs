@@ -44,7 +44,10 @@ mod finding;
 mod grid;
 pub mod health;
 pub mod interpolate;
+#[cfg(feature = "mat")]
+pub mod mat;
 pub mod noise;
+mod read;
 mod recording;
 pub mod smooth;
 mod spectrum;
@@ -52,4 +55,7 @@ mod spectrum;
 pub use crate::csv::{CsvBlocks, parse_csv, read_csv, write_csv, write_csv_file};
 pub use crate::error::{Place, RecordingError};
 pub use crate::finding::{Finding, Severity};
+#[cfg(feature = "mat")]
+pub use crate::mat::parse_mat;
+pub use crate::read::{EXTENSIONS, read};
 pub use crate::recording::{Channel, MIN_SAMPLES, Piece, Recording};
