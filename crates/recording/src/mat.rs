@@ -22,8 +22,9 @@ mod layout;
 mod level5;
 
 use crate::error::{Place, RecordingError};
+use crate::read::ROOM;
 use crate::recording::Recording;
-use level5::{Fault, ROOM};
+use level5::Fault;
 
 /// Reads a recording called `name` from the bytes of a MAT-file.
 ///

@@ -11,6 +11,30 @@ use std::path::Path;
 /// (`mat`, `parquet`); [`read`] tells which is missing.
 pub const EXTENSIONS: [&str; 3] = ["csv", "mat", "parquet"];
 
+/// Names of the time in files that do not say which column it is; the first found counts. `tout` is what Simulink
+/// calls it.
+#[cfg(any(feature = "mat", feature = "parquet"))]
+pub(crate) const TIMES: [&str; 4] = ["t", "time", "Time", "tout"];
+
+/// Most bytes that the values of a file may need, unpacked. A variable of a MAT-file has at most so many anyway.
+#[cfg(any(feature = "mat", feature = "parquet"))]
+pub(crate) const ROOM: u64 = 2 << 30;
+
+/// Most variables or columns that a sentence names.
+#[cfg(any(feature = "mat", feature = "parquet"))]
+const TOLD: usize = 8;
+
+/// A list for a sentence, cut where it gets long.
+#[cfg(any(feature = "mat", feature = "parquet"))]
+pub(crate) fn told(mut all: Vec<String>) -> String {
+    if all.len() > TOLD {
+        let more = all.len() - TOLD;
+        all.truncate(TOLD);
+        all.push(format!("{more} more"));
+    }
+    all.join(", ")
+}
+
 /// Reads the recording in the file at `path`: a MAT-file where the name ends in `.mat`, a Parquet file where it ends
 /// in `.parquet`, CSV else.
 ///

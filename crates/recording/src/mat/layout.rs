@@ -4,10 +4,8 @@ use super::level5::{Array, Value, Variable};
 use crate::csv::{header_cell, seconds};
 use crate::error::{Place, RecordingError};
 use crate::finding::{Finding, Severity};
+use crate::read::{TIMES, told};
 use crate::recording::{Channel, MIN_SAMPLES, Recording};
-
-/// Names of the time, the first found counts. `tout` is what Simulink calls it.
-const TIMES: [&str; 4] = ["t", "time", "Time", "tout"];
 
 /// Names of a list of column names, alone or behind the matrix's name and `_`.
 const NAMES: [&str; 6] = ["names", "labels", "columns", "channels", "header", "headers"];
@@ -17,9 +15,6 @@ const NAMELESS: [&str; 4] = ["values", "data", "Values", "Data"];
 
 /// What a structure calls the signal in it.
 const LABELS: [&str; 3] = ["label", "name", "Name"];
-
-/// Most variables that a sentence names.
-const TOLD: usize = 8;
 
 /// A signal that is sampled at the times of its clock.
 struct Signal {
@@ -244,13 +239,7 @@ impl Found {
             let size: Vec<String> = a.array.dimensions.iter().map(usize::to_string).collect();
             format!("`{}` ({})", a.path, size.join("×"))
         });
-        let mut all: Vec<String> = arrays.chain(self.others.iter().cloned()).collect();
-        if all.len() > TOLD {
-            let more = all.len() - TOLD;
-            all.truncate(TOLD);
-            all.push(format!("{more} more"));
-        }
-        all.join(", ")
+        told(arrays.chain(self.others.iter().cloned()).collect())
     }
 }
 

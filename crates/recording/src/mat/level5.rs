@@ -5,11 +5,9 @@
 //!
 //! Nothing is reserved on the word of the file: what is read is there, what is unpacked counts against [`ROOM`].
 
+use crate::read::ROOM;
 use flate2::bufread::ZlibDecoder;
 use std::io::Read;
-
-/// Most bytes that the values of a file may need, unpacked; a variable of `-v7` has at most so many anyway.
-pub(crate) const ROOM: u64 = 2 << 30;
 
 /// Deepest nesting of structures and cells.
 const MAX_DEPTH: usize = 32;
