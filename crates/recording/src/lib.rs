@@ -20,7 +20,7 @@
 //! | [`interpolate`] | what an input did between its samples (band-limited, linear) |
 //! | [`health`] | is this recording good enough to identify anything from, in plain sentences |
 //!
-//! The functions of `noise`, `smooth` and `interpolate` take slices and return values; only [`read`] and
+//! The functions of `noise`, `smooth` and `interpolate` take slices and return values; only [`read()`] and
 //! [`csv`](mod@csv) touch files.
 //!
 //! ```
