@@ -219,7 +219,7 @@ fn check_takes_folders_and_finds_clocks_that_disagree() {
     let words = bench.greybox(&["check", "runs", "--inputs", "u"]).stdout;
     for part in [
         "warning  y: Recorded about 12 samples (0.12 s) later than `x`",
-        "This is sure: 8 of 8 parts",
+        "The lag is sure: 8 of 8 parts",
         "mend: If the machine does not explain it, move the column `y` up by 12 rows",
     ] {
         assert!(words.contains(part), "`{part}` is not in: {words}");

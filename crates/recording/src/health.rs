@@ -441,6 +441,9 @@ fn record_length(channel: &Channel, full: &[f64], spectrum: &Periodogram) -> Opt
     Some(finding.on(&channel.name).value(100.0 * slow, Some("%")))
 }
 
+/// Correlations larger than this multiple of [`chance`] are none.
+const BEYOND: f64 = 6.0;
+
 /// How one channel follows another.
 #[derive(Debug, Clone, Copy, PartialEq)]
 struct Lag {
@@ -450,24 +453,33 @@ struct Lag {
     correlation: f64,
 }
 
-/// Lag of the largest correlation between two signals (no missing samples), both differenced and whitened
-/// (autoregression). A minimum-phase plant vanishes in the whitening, so that a pure delay is what is left.
-fn lag(u: &[f64], y: &[f64]) -> Option<Lag> {
+/// Correlation of two signals (no missing samples), both differenced and whitened (autoregression), at lags from as many
+/// samples below zero as above.
+fn whitened_correlation(u: &[f64], y: &[f64]) -> Option<Vec<f64>> {
     let n = u.len();
     if n < 64 {
         return None;
     }
     let order = (n / 20).min(32);
-    let u = whiten(u, order)?;
-    let y = whiten(y, order)?;
-    let reach = (n / 4).min(2000);
-    let c = correlation(&u, &y, reach);
+    Some(correlation(&whiten(u, order)?, &whiten(y, order)?, (n / 4).min(2000)))
+}
+
+/// What a correlation is where there is none: the robust standard deviation over all lags.
+fn chance(correlation: &[f64]) -> f64 {
+    1.4826 * median(&correlation.iter().map(|v| v.abs()).collect::<Vec<_>>())
+}
+
+/// Lag of the largest [`whitened_correlation`]. A minimum-phase plant vanishes in the whitening, so that a pure delay is
+/// what is left.
+fn lag(u: &[f64], y: &[f64]) -> Option<Lag> {
+    let c = whitened_correlation(u, y)?;
+    let (n, reach) = (u.len(), c.len() / 2);
     let size = |k: usize| c[k].abs();
     let largest = (0..c.len()).map(size).fold(0.0, f64::max);
     // A periodic input repeats the peak every period: of nearly equal peaks, the one closest to no lag.
     let best = (0..c.len()).filter(|&k| size(k) >= 0.95 * largest).min_by_key(|k| k.abs_diff(reach))?;
-    let noise = 1.4826 * median(&c.iter().map(|v| v.abs()).collect::<Vec<_>>());
-    if largest.is_nan() || largest < 0.3 || largest < 8.0 / (n as f64).sqrt() || largest < 6.0 * noise {
+    if largest.is_nan() || largest < 0.3 || largest < 8.0 / (n as f64).sqrt() || largest < BEYOND * chance(&c)
+    {
         return None;
     }
     Some(Lag { samples: best as isize - reach as isize, correlation: c[best] })
@@ -508,7 +520,31 @@ fn counted(samples: isize, dt: f64) -> String {
     if samples == 1 { format!("1 sample ({seconds} s)") } else { format!("{samples} samples ({seconds} s)") }
 }
 
-/// Smallest offset that is told, in samples: what one sample more or less is may be the sampling alone.
+/// The [`lag`], also where noise drowns it in the single samples: of these, of averages of two, four and eight. With it
+/// the samples by which it may be wrong: that of averages is looked for again among the single samples nearby.
+fn averaged_lag(a: &[f64], b: &[f64]) -> Option<(Lag, isize)> {
+    let average = |y: &[f64], count: usize| -> Vec<f64> {
+        y.chunks_exact(count).map(|y| y.iter().sum::<f64>() / count as f64).collect()
+    };
+    let (count, rough) = [1, 2, 4, 8]
+        .into_iter()
+        .find_map(|count| Some((count, lag(&average(a, count), &average(b, count))?)))?;
+    let width = count as isize;
+    let near = rough.samples * width;
+    let fine = whitened_correlation(a, b).and_then(|c| {
+        let reach = (c.len() / 2) as isize;
+        let size = |samples: &isize| c.get((samples + reach) as usize).map_or(0.0, |v| v.abs());
+        let nearby = near - width..=near + width;
+        nearby.max_by(|x, y| size(x).total_cmp(&size(y))).filter(|best| size(best) > BEYOND * chance(&c))
+    });
+    Some(match fine {
+        Some(samples) => (Lag { samples, ..rough }, 1),
+        None => (Lag { samples: near, ..rough }, width),
+    })
+}
+
+/// Smallest offset that is told, in samples (or times what the lag may be wrong by): what one sample more or less is may
+/// be the sampling alone.
 const LEAST_OFFSET: isize = 2;
 
 /// Parts of a recording that are asked one by one, and fewest samples of one.
@@ -522,6 +558,8 @@ struct Offset {
     pair: [usize; 2],
     /// How far it is behind; at least [`LEAST_OFFSET`].
     lag: Lag,
+    /// Samples by which that may be wrong.
+    within: isize,
     /// Parts of the recording that say so, and those that can tell.
     parts: [usize; 2],
 }
@@ -530,8 +568,9 @@ struct Offset {
 ///
 /// Asked is every pair of outputs, and every output that runs ahead of an input; with no roles stated, every pair. Of two
 /// channels that move with one cause, what is left after whitening must meet at the same sample. It is told where the
-/// longest piece shows a lag of two samples or more and three of four of its parts, asked one by one, show the same
-/// within a sample: an offset is constant, and an accident is not. A sensor's own delay looks the same.
+/// longest piece shows a lag of two samples or more and three of four of its parts, asked one by one, show the same within
+/// a sample (some samples, where only averages of a few samples stand out of the noise): an offset is constant, and an accident is not. A sensor's own delay looks the same, and with no roles
+/// stated so does an input with a late answer: then it is no more than information.
 pub fn clock_offsets(recording: &Recording, inputs: &[&str], outputs: &[&str]) -> Vec<Finding> {
     let Some(piece) = recording.longest_piece() else { return Vec::new() };
     let columns: Vec<Vec<f64>> = piece.columns.iter().map(|column| fill_missing(column)).collect();
@@ -559,7 +598,10 @@ pub fn clock_offsets(recording: &Recording, inputs: &[&str], outputs: &[&str]) -
         else {
             break;
         };
-        findings.push(told(recording, &strongest, piece.dt, roles && is(inputs, strongest.pair[1])));
+        let finding = told(recording, &strongest, piece.dt, roles && is(inputs, strongest.pair[1]));
+        // Without roles it may be an input and its answer.
+        let severity = if roles { Severity::Warning } else { Severity::Info };
+        findings.push(Finding { severity, ..finding });
         offsets.retain(|o| !o.pair.contains(&late));
     }
     findings
@@ -567,23 +609,23 @@ pub fn clock_offsets(recording: &Recording, inputs: &[&str], outputs: &[&str]) -
 
 /// The offset between two columns, where the data tell it.
 fn offset(columns: &[Vec<f64>], a: usize, b: usize) -> Option<Offset> {
-    let whole = lag(&columns[a], &columns[b])?;
-    if whole.samples.abs() < LEAST_OFFSET {
+    let (whole, within) = averaged_lag(&columns[a], &columns[b])?;
+    if whole.samples.abs() < LEAST_OFFSET * within {
         return None;
     }
     let length = (columns[a].len() / PARTS).max(PART).max(4 * whole.samples.unsigned_abs());
     let (mut agree, mut tell) = (0, 0);
     for (a, b) in columns[a].chunks_exact(length).zip(columns[b].chunks_exact(length)) {
-        if let Some(part) = lag(a, b) {
+        if let Some((part, also)) = averaged_lag(a, b) {
             tell += 1;
-            agree += usize::from(part.samples.abs_diff(whole.samples) <= 1);
+            agree += usize::from((part.samples - whole.samples).abs() <= within.max(also));
         }
     }
     if tell < 2 || 4 * agree < 3 * tell {
         return None;
     }
     let (pair, samples) = if whole.samples > 0 { ([a, b], whole.samples) } else { ([b, a], -whole.samples) };
-    Some(Offset { pair, lag: Lag { samples, ..whole }, parts: [agree, tell] })
+    Some(Offset { pair, lag: Lag { samples, ..whole }, within, parts: [agree, tell] })
 }
 
 /// The channel in most of the offsets; of two such, the later one.
@@ -616,9 +658,10 @@ fn told(recording: &Recording, offset: &Offset, dt: f64, acausal: bool) -> Findi
         Severity::Warning,
         "clock_offset",
         format!(
-            "Recorded about {} later than `{early}`: {cause}. This is {sure}: {agree} of {tell} parts of the recording \
-             that can tell show the same within a sample (correlation {} of the whitened signals).",
+            "Recorded about {} later than `{early}`: {cause}. The lag is {sure}: {agree} of {tell} parts of the recording \
+             that can tell show the same within {} (correlation {} of the whitened signals).",
             counted(samples, dt),
+            counted(offset.within, dt),
             number(correlation)
         ),
     )
