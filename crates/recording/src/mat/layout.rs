@@ -275,7 +275,7 @@ fn time_scale(time: &Named) -> Option<f64> {
 }
 
 fn is_vector(array: &Array) -> bool {
-    array.dimensions.iter().any(|&d| d == array.values.len())
+    array.dimensions.contains(&array.values.len())
 }
 
 /// The signals of `n` samples in an array: all of a vector, the columns of a matrix, or the rows where it has `n` columns;
