@@ -658,8 +658,10 @@ fn told(recording: &Recording, offset: &Offset, dt: f64, acausal: bool) -> Findi
         Severity::Warning,
         "clock_offset",
         format!(
-            "Recorded about {} later than `{early}`: {cause}. The lag is {sure}: {agree} of {tell} parts of the recording \
+            "Recorded {} {} later than `{early}`: {cause}. The lag is {sure}: {agree} of {tell} parts of the recording \
              that can tell show the same within {} (correlation {} of the whitened signals).",
+            // What the motion itself takes hides as much of it.
+            if acausal { "at least" } else { "about" },
             counted(samples, dt),
             counted(offset.within, dt),
             number(correlation)
