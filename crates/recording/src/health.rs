@@ -472,14 +472,18 @@ fn chance(correlation: &[f64]) -> f64 {
 /// Lag of the largest [`whitened_correlation`]. A minimum-phase plant vanishes in the whitening, so that a pure delay is
 /// what is left.
 fn lag(u: &[f64], y: &[f64]) -> Option<Lag> {
+    peak(u, y, (8.0 / (u.len() as f64).sqrt()).max(0.3))
+}
+
+/// Lag of the largest [`whitened_correlation`], where that is at least so large and beyond [`chance`].
+fn peak(u: &[f64], y: &[f64], least: f64) -> Option<Lag> {
     let c = whitened_correlation(u, y)?;
-    let (n, reach) = (u.len(), c.len() / 2);
+    let reach = c.len() / 2;
     let size = |k: usize| c[k].abs();
     let largest = (0..c.len()).map(size).fold(0.0, f64::max);
     // A periodic input repeats the peak every period: of nearly equal peaks, the one closest to no lag.
     let best = (0..c.len()).filter(|&k| size(k) >= 0.95 * largest).min_by_key(|k| k.abs_diff(reach))?;
-    if largest.is_nan() || largest < 0.3 || largest < 8.0 / (n as f64).sqrt() || largest < BEYOND * chance(&c)
-    {
+    if largest.is_nan() || largest < least || largest < BEYOND * chance(&c) {
         return None;
     }
     Some(Lag { samples: best as isize - reach as isize, correlation: c[best] })
@@ -522,7 +526,7 @@ fn counted(samples: isize, dt: f64) -> String {
 
 /// The [`lag`], also where noise drowns it in the single samples: of these, of averages of two, four and eight. With it
 /// the samples by which it may be wrong: that of averages is looked for again among the single samples nearby.
-fn averaged_lag(a: &[f64], b: &[f64]) -> Option<(Lag, isize)> {
+fn averaged_lag(a: &[f64], b: &[f64], lag: impl Fn(&[f64], &[f64]) -> Option<Lag>) -> Option<(Lag, isize)> {
     let average = |y: &[f64], count: usize| -> Vec<f64> {
         y.chunks_exact(count).map(|y| y.iter().sum::<f64>() / count as f64).collect()
     };
@@ -609,14 +613,15 @@ pub fn clock_offsets(recording: &Recording, inputs: &[&str], outputs: &[&str]) -
 
 /// The offset between two columns, where the data tell it.
 fn offset(columns: &[Vec<f64>], a: usize, b: usize) -> Option<Offset> {
-    let (whole, within) = averaged_lag(&columns[a], &columns[b])?;
+    let (whole, within) = averaged_lag(&columns[a], &columns[b], lag)?;
     if whole.samples.abs() < LEAST_OFFSET * within {
         return None;
     }
     let length = (columns[a].len() / PARTS).max(PART).max(4 * whole.samples.unsigned_abs());
     let (mut agree, mut tell) = (0, 0);
     for (a, b) in columns[a].chunks_exact(length).zip(columns[b].chunks_exact(length)) {
-        if let Some((part, also)) = averaged_lag(a, b) {
+        // That parts agree tells more than how large the correlation is in each.
+        if let Some((part, also)) = averaged_lag(a, b, |a, b| peak(a, b, 0.0)) {
             tell += 1;
             agree += usize::from((part.samples - whole.samples).abs() <= within.max(also));
         }
