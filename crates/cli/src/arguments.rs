@@ -14,7 +14,8 @@ use crate::failure::Failure;
 use crate::loading::{self, LoadedModel};
 use crate::output::OutputFolder;
 use greybox_calibrate::Data;
-use greybox_recording::Recording;
+use greybox_model::Unit;
+use greybox_recording::{Recording, Rename, RenameError};
 
 /// Give greybox a recording and the simulation you believe in: it tells you what physics is missing,
 /// where it acts, how sure it is, and hands back a simulation that fits.
@@ -27,6 +28,7 @@ use greybox_recording::Recording;
   greybox demo
   greybox check run1.csv --model link.toml
   greybox diagnose link.toml run1.csv run2.csv --holdout run3.csv --out result
+  greybox diagnose link.toml run1.mat --map \"theta=sensor_3 [deg]\" --out result
   greybox simulate result/improved.toml run3.csv --out simulated.csv
   greybox identify run1.csv --states x --inputs f --holdout run2.csv --out found
   greybox control result/improved.toml --track theta --to 0.5 --out controller
@@ -48,16 +50,37 @@ pub(crate) struct Cli {
     pub(crate) log: bool,
 }
 
+/// What the model calls the channels of the recordings.
+#[derive(Debug, Args)]
+pub(crate) struct Channels {
+    /// Name of the model for a channel of the recordings, with its unit where they state none, such as
+    /// "theta=sensor_3 [deg]"; may be repeated
+    #[arg(long, value_name = "NAME=CHANNEL", value_parser = rename)]
+    pub(crate) map: Vec<Rename>,
+}
+
+/// A [`Rename`] whose unit, if it has one, is a unit.
+fn rename(text: &str) -> Result<Rename, String> {
+    let rename: Rename = text.parse().map_err(|e: RenameError| e.to_string())?;
+    match rename.unit.as_deref().map(Unit::parse) {
+        Some(Err(error)) => Err(error.to_string()),
+        _ => Ok(rename),
+    }
+}
+
 /// The recordings of a command that learns from some and is judged on others, and where its results go.
 #[derive(Debug, Args)]
 pub(crate) struct Study {
-    /// Recordings to choose and fit with (CSV)
+    /// Recordings to choose and fit with (CSV, MAT-file or Parquet)
     #[arg(value_name = "TRAIN.csv", required = true)]
     pub(crate) train: Vec<PathBuf>,
 
     /// Recordings that only judge the result
     #[arg(long, value_name = "TEST.csv", num_args = 1..)]
     pub(crate) holdout: Vec<PathBuf>,
+
+    #[command(flatten)]
+    pub(crate) channels: Channels,
 
     /// Folder for the results; made where it is missing
     #[arg(long, value_name = "DIR")]
@@ -77,7 +100,7 @@ impl Study {
     /// # Errors
     /// As [`loading::train_and_holdout`].
     pub(crate) fn recordings(&self) -> Result<Recordings, Failure> {
-        let (train, holdout) = loading::train_and_holdout(&self.train, &self.holdout)?;
+        let (train, holdout) = loading::train_and_holdout(&self.train, &self.holdout, &self.channels.map)?;
         Ok(Recordings { train, holdout })
     }
 

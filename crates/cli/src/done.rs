@@ -28,6 +28,9 @@ pub(crate) struct Inputs {
     pub(crate) model: Fingerprint,
     pub(crate) recording: Fingerprint,
     pub(crate) holdout: Vec<Fingerprint>,
+    /// New names of channels.
+    #[serde(default, skip_serializing_if = "Vec::is_empty")]
+    pub(crate) map: Vec<String>,
     /// Mechanisms beside the built-in ones.
     pub(crate) mechanisms: Vec<Fingerprint>,
 }
@@ -103,6 +106,7 @@ mod tests {
             model: Fingerprint::of("m.toml", b"model"),
             recording: Fingerprint::of("r.csv", recording),
             holdout: vec![],
+            map: vec![],
             mechanisms: vec![],
         }
     }

@@ -9,8 +9,8 @@ use std::process::ExitCode;
 use greybox_calibrate::DataError;
 use greybox_diagnose::{DiagnoseError, MechanismError};
 use greybox_identify::IdentifyError;
-use greybox_model::ModelError;
-use greybox_recording::RecordingError;
+use greybox_model::{ModelError, nearest};
+use greybox_recording::{RecordingError, RenameError};
 use serde_json::{Map, Value, json};
 
 use crate::answer::{self, Manner};
@@ -270,6 +270,26 @@ impl From<RecordingError> for Failure {
             failure = failure.at("column", *number).at("channel", name.as_str());
         }
         failure
+    }
+}
+
+/// The message holds its own mend, but for the name that was meant.
+impl From<RenameError> for Failure {
+    fn from(error: RenameError) -> Failure {
+        let failure = Failure::input(error.to_string());
+        match error {
+            RenameError::Unknown { file, channel, available } => {
+                let mend = match nearest(&channel, available.iter().map(String::as_str)) {
+                    Some(near) => format!("did you mean `{near}`?"),
+                    None => "name one of these after the `=` of `--map`".to_owned(),
+                };
+                failure.at("file", file).at("channel", channel).mend(mend)
+            }
+            RenameError::Unit { file, channel, .. } | RenameError::Taken { file, name: channel } => {
+                failure.at("file", file).at("channel", channel)
+            }
+            _ => failure,
+        }
     }
 }
 

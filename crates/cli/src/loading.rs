@@ -6,7 +6,7 @@ use std::path::{Path, PathBuf};
 
 use greybox_diagnose::library::{self, Library};
 use greybox_model::{Model, Problem};
-use greybox_recording::{CsvBlocks, Recording, RecordingError, read_csv};
+use greybox_recording::{CsvBlocks, EXTENSIONS, Recording, RecordingError, Rename};
 
 use crate::failure::Failure;
 use crate::output::same_file;
@@ -74,7 +74,7 @@ pub(crate) fn mechanisms(folder: &Path) -> Result<Mechanisms, Failure> {
         return Err(Failure::file(folder, "this is a file, but `--mechanisms` takes a folder")
             .mend("name the folder that holds the mechanism files"));
     }
-    let files = files_of(folder, "toml")?;
+    let files = files_of(folder, &["toml"])?;
     if files.is_empty() {
         return Err(Failure::file(folder, "this folder holds no mechanism (`*.toml`)")
             .mend("`greybox mechanisms --example` prints one to start from"));
@@ -87,11 +87,25 @@ pub(crate) fn mechanisms(folder: &Path) -> Result<Mechanisms, Failure> {
     Ok(Mechanisms { library, files, texts })
 }
 
-/// The files of a folder with this extension, in the order of their names.
+/// The recordings of a folder, in the order of their names.
+///
+/// # Errors
+/// Bad input: as [`files_of`], or no recording in it.
+pub(crate) fn recordings_of(folder: &Path) -> Result<Vec<PathBuf>, Failure> {
+    let recordings = files_of(folder, &EXTENSIONS)?;
+    if recordings.is_empty() {
+        let endings = EXTENSIONS.map(|e| format!("`*.{e}`")).join(", ");
+        return Err(Failure::file(folder, format!("this folder holds no recording ({endings})"))
+            .mend("name the folder that holds the recordings themselves, or the files one by one"));
+    }
+    Ok(recordings)
+}
+
+/// The files of a folder with one of these extensions, in the order of their names.
 ///
 /// # Errors
 /// Bad input: no such folder, or one that cannot be read.
-pub(crate) fn files_of(folder: &Path, extension: &str) -> Result<Vec<PathBuf>, Failure> {
+pub(crate) fn files_of(folder: &Path, extensions: &[&str]) -> Result<Vec<PathBuf>, Failure> {
     let entries = fs::read_dir(folder).map_err(|e| match e.kind() {
         ErrorKind::NotFound => {
             Failure::file(folder, "no such folder").mend("check the path and the spelling")
@@ -100,7 +114,7 @@ pub(crate) fn files_of(folder: &Path, extension: &str) -> Result<Vec<PathBuf>, F
     })?;
     let mut files: Vec<PathBuf> = entries
         .filter_map(|entry| entry.ok().map(|e| e.path()))
-        .filter(|path| has_extension(path, extension) && path.is_file())
+        .filter(|path| extensions.iter().any(|e| has_extension(path, e)) && path.is_file())
         .collect();
     files.sort();
     Ok(files)
@@ -125,16 +139,19 @@ pub(crate) fn file_name(path: &Path) -> String {
     path.file_name().map_or_else(|| path.display().to_string(), |n| n.to_string_lossy().into_owned())
 }
 
-/// Reads the recordings at `paths`. Recordings that share a file name are called by their paths.
+/// Reads the recordings at `paths` and renames their channels. Recordings that share a file name are called by their
+/// paths.
 ///
 /// # Errors
-/// Bad input: a file that is missing, a model or a folder in its place, one named twice, or any fault in it.
-pub(crate) fn recordings(paths: &[PathBuf]) -> Result<Vec<Recording>, Failure> {
+/// Bad input: a file that is missing, a model or a folder in its place, one named twice, any fault in it, or a channel
+/// to rename that it does not have.
+pub(crate) fn recordings(paths: &[PathBuf], map: &[Rename]) -> Result<Vec<Recording>, Failure> {
     no_twins(paths)?;
     let mut read = Vec::with_capacity(paths.len());
     for path in paths {
-        let mut recording = read_csv(path).map_err(|error| unreadable(path, error))?;
+        let mut recording = greybox_recording::read(path).map_err(|error| unreadable(path, error))?;
         recording.name = called(path, paths);
+        recording.rename(map)?;
         read.push(recording);
     }
     Ok(read)
@@ -161,7 +178,7 @@ pub(crate) fn no_twins<'a>(paths: impl IntoIterator<Item = &'a PathBuf>) -> Resu
 
 fn unreadable(path: &Path, error: RecordingError) -> Failure {
     if path.is_file() && looks_like_model(path) {
-        return Failure::file(path, "this is a model (TOML), but a recording (CSV) is needed here")
+        return Failure::file(path, "this is a model (TOML), but a recording is needed here")
             .mend("name the model once, before the recordings");
     }
     error.into()
@@ -170,14 +187,25 @@ fn unreadable(path: &Path, error: RecordingError) -> Failure {
 /// The recordings at `paths` one after the other, in blocks of `rows` rows.
 ///
 /// # Errors
-/// As [`recordings`]; what is wrong with a block comes in its place.
+/// As [`recordings`], and for a recording that is no CSV; what is wrong with a block comes in its place.
 pub(crate) fn blocks(
     paths: &[PathBuf],
     rows: usize,
+    map: &[Rename],
 ) -> Result<impl Iterator<Item = Result<Recording, Failure>>, Failure> {
-    let open = |path: &PathBuf| CsvBlocks::open(path, rows).map_err(|error| unreadable(path, error));
+    let open = |path: &PathBuf| {
+        if EXTENSIONS.iter().any(|e| *e != "csv" && has_extension(path, e)) {
+            return Err(Failure::file(path, "only CSV files are read in blocks")
+                .mend("leave `--block` out, or export the recording as CSV"));
+        }
+        CsvBlocks::open(path, rows).map_err(|error| unreadable(path, error))
+    };
     let files = paths.iter().map(open).collect::<Result<Vec<_>, _>>()?;
-    Ok(files.into_iter().flatten().map(|block| block.map_err(Failure::from)))
+    Ok(files.into_iter().flatten().map(move |block| {
+        let mut block = block?;
+        block.rename(map)?;
+        Ok(block)
+    }))
 }
 
 /// How the recording at `path` is called among those at `paths`: by its file name, unless another has it too.
@@ -196,9 +224,10 @@ pub(crate) fn called(path: &Path, paths: &[PathBuf]) -> String {
 pub(crate) fn train_and_holdout(
     train: &[PathBuf],
     holdout: &[PathBuf],
+    map: &[Rename],
 ) -> Result<(Vec<Recording>, Vec<Recording>), Failure> {
     let paths: Vec<PathBuf> = train.iter().chain(holdout).cloned().collect();
-    let mut train_recordings = recordings(&paths)?;
+    let mut train_recordings = recordings(&paths, map)?;
     let held = train_recordings.split_off(train.len());
     Ok((train_recordings, held))
 }

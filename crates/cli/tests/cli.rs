@@ -238,9 +238,13 @@ fn paths_that_lead_to_the_wrong_thing() {
     for arguments in with_both("nowhere.toml", "run1.csv") {
         bench.refuses(&arguments, &["nowhere.toml", "no such file", "mend"]);
     }
-    // `diagnose` takes a folder of recordings.
-    for arguments in &with_both("model.toml", "folder")[1..] {
-        bench.refuses(arguments, &["folder", "this is a folder"]);
+    // `diagnose` and `check` take a folder of recordings.
+    for arguments in with_both("model.toml", "folder") {
+        let found = match arguments[0] {
+            "diagnose" | "check" => "this folder holds no recording",
+            _ => "this is a folder",
+        };
+        bench.refuses(&arguments, &["folder", found]);
     }
     for arguments in with_both("folder", "run1.csv") {
         bench.refuses(&arguments, &["folder", "this is a folder", "mend"]);

@@ -84,6 +84,7 @@ mod write;
 pub use error::{ModelError, Place, Problem};
 pub use expr::{BinOp, Expr, Func};
 pub use model::{Equation, Hold, Input, Measurement, Model, Parameter, State};
+pub use nearest::nearest;
 pub use parse::{Parsed, ParsedEquation, SyntaxError, parse, parse_equation};
 pub use system::System;
 pub use units::{Dimension, Unit, UnitError};

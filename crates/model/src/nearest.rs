@@ -2,7 +2,11 @@
 
 /// The candidate with the smallest edit distance to `wanted`, if it is near enough to be a slip of
 /// the hand: at most one edit per three characters (at least one), ties to the first candidate.
-pub(crate) fn nearest<'a>(wanted: &str, candidates: impl IntoIterator<Item = &'a str>) -> Option<&'a str> {
+///
+/// ```
+/// assert_eq!(greybox_model::nearest("thta", ["alpha", "theta"]), Some("theta"));
+/// ```
+pub fn nearest<'a>(wanted: &str, candidates: impl IntoIterator<Item = &'a str>) -> Option<&'a str> {
     let allowed = (wanted.chars().count() / 3).max(1);
     let mut best: Option<(usize, &str)> = None;
     for candidate in candidates {

@@ -45,6 +45,11 @@ const fn dim(m: f64, kg: f64, s: f64, a: f64) -> Dimension {
 /// Symbols of the SI base units in the order of [`Dimension`].
 const BASE: [&str; 7] = ["m", "kg", "s", "A", "K", "mol", "cd"];
 
+/// m/s², m and kg, exact by definition.
+const STANDARD_GRAVITY: f64 = 9.80665;
+const INCH: f64 = 0.0254;
+const POUND: f64 = 0.453_592_37;
+
 /// symbol, factor to SI, dimension, whether SI prefixes may stand before it
 const SYMBOLS: &[(&str, f64, Dimension, bool)] = &[
     ("m", 1.0, dim(1.0, 0.0, 0.0, 0.0), true),
@@ -77,12 +82,23 @@ const SYMBOLS: &[(&str, f64, Dimension, bool)] = &[
     ("\u{b0}", PI / 180.0, dim(0.0, 0.0, 0.0, 0.0), false),
     ("rev", 2.0 * PI, dim(0.0, 0.0, 0.0, 0.0), false),
     ("rpm", PI / 30.0, dim(0.0, 0.0, -1.0, 0.0), false),
+    ("rps", 2.0 * PI, dim(0.0, 0.0, -1.0, 0.0), false),
+    ("arcmin", PI / 10_800.0, dim(0.0, 0.0, 0.0, 0.0), false),
+    ("arcsec", PI / 648_000.0, dim(0.0, 0.0, 0.0, 0.0), false),
     ("%", 1e-2, dim(0.0, 0.0, 0.0, 0.0), false),
     ("min", 60.0, dim(0.0, 0.0, 1.0, 0.0), false),
     ("h", 3600.0, dim(0.0, 0.0, 1.0, 0.0), false),
     ("bar", 1e5, dim(-1.0, 1.0, -2.0, 0.0), true),
     ("L", 1e-3, dim(3.0, 0.0, 0.0, 0.0), true),
     ("l", 1e-3, dim(3.0, 0.0, 0.0, 0.0), true),
+    // What test rigs are labelled with besides SI; `gn` is the standard gravity of accelerometers.
+    ("gn", STANDARD_GRAVITY, dim(1.0, 0.0, -2.0, 0.0), false),
+    ("kgf", STANDARD_GRAVITY, dim(1.0, 1.0, -2.0, 0.0), false),
+    ("atm", 101_325.0, dim(-1.0, 1.0, -2.0, 0.0), false),
+    ("in", INCH, dim(1.0, 0.0, 0.0, 0.0), false),
+    ("ft", 12.0 * INCH, dim(1.0, 0.0, 0.0, 0.0), false),
+    ("lbf", POUND * STANDARD_GRAVITY, dim(1.0, 1.0, -2.0, 0.0), false),
+    ("psi", POUND * STANDARD_GRAVITY / (INCH * INCH), dim(-1.0, 1.0, -2.0, 0.0), false),
 ];
 
 const PREFIXES: &[(&str, f64)] = &[
@@ -555,6 +571,20 @@ mod tests {
             ("g", 1e-3, dim(0.0, 1.0, 0.0, 0.0)),
             ("min", 60.0, dim(0.0, 0.0, 1.0, 0.0)),
             ("mrad", 1e-3, Dimension::NONE),
+            ("deg/s", PI / 180.0, dim(0.0, 0.0, -1.0, 0.0)),
+            ("rev/min", PI / 30.0, dim(0.0, 0.0, -1.0, 0.0)),
+            ("rps", 2.0 * PI, dim(0.0, 0.0, -1.0, 0.0)),
+            ("arcmin", PI / 180.0 / 60.0, Dimension::NONE),
+            ("arcsec", PI / 180.0 / 3600.0, Dimension::NONE),
+            ("um", 1e-6, dim(1.0, 0.0, 0.0, 0.0)),
+            ("in", 0.0254, dim(1.0, 0.0, 0.0, 0.0)),
+            ("ft", 0.3048, dim(1.0, 0.0, 0.0, 0.0)),
+            ("lbf", 4.448_221_615_260_5, dim(1.0, 1.0, -2.0, 0.0)),
+            ("psi", 6_894.757_293_168_361, dim(-1.0, 1.0, -2.0, 0.0)),
+            ("kgf", 9.80665, dim(1.0, 1.0, -2.0, 0.0)),
+            ("gn", 9.80665, dim(1.0, 0.0, -2.0, 0.0)),
+            ("atm", 101_325.0, dim(-1.0, 1.0, -2.0, 0.0)),
+            ("mbar", 100.0, dim(-1.0, 1.0, -2.0, 0.0)),
         ] {
             let unit = Unit::parse(text).unwrap_or_else(|e| panic!("{text}: {e}"));
             assert!((unit.factor / factor - 1.0).abs() < 1e-14, "{text}: {}", unit.factor);

@@ -6,10 +6,11 @@
 //! that names the cell.
 
 use crate::error::{Place, RecordingError};
+use crate::read::{check_file, unread};
 use crate::recording::{Channel, Recording};
 use ::csv::{ByteRecord, ReaderBuilder, WriterBuilder};
 use std::fs;
-use std::io::{BufRead, BufReader, ErrorKind, Read, Write};
+use std::io::{BufRead, BufReader, Read, Write};
 use std::path::Path;
 
 /// Reads the recording in the file at `path`.
@@ -17,27 +18,8 @@ use std::path::Path;
 /// # Errors
 /// Any [`RecordingError`]; its place names the file as given, the line and the column.
 pub fn read_csv(path: impl AsRef<Path>) -> Result<Recording, RecordingError> {
-    let path = path.as_ref();
-    let (label, name) = check_file(path)?;
-    let bytes = fs::read(path).map_err(|source| unread(&label, source))?;
+    let (bytes, label, name) = crate::read::bytes(path.as_ref())?;
     parse(&bytes, &label, &name, 0)
-}
-
-/// What errors call the file at `path`, and its name; an error where there is no file.
-fn check_file(path: &Path) -> Result<(String, String), RecordingError> {
-    let label = path.display().to_string();
-    if fs::metadata(path).map_err(|source| unread(&label, source))?.is_dir() {
-        return Err(RecordingError::IsDirectory { place: Place::file(&label) });
-    }
-    let name = path.file_name().map_or_else(|| label.clone(), |name| name.to_string_lossy().into_owned());
-    Ok((label, name))
-}
-
-fn unread(label: &str, source: std::io::Error) -> RecordingError {
-    match source.kind() {
-        ErrorKind::NotFound => RecordingError::NotFound { place: Place::file(label) },
-        _ => RecordingError::Io { place: Place::file(label), action: "read", source },
-    }
 }
 
 /// A CSV file read block by block, for recordings larger than memory: an iterator of recordings of about `rows` rows,
@@ -306,7 +288,7 @@ impl Source<'_> {
 }
 
 /// Parses a header and rows; `above` lines of the file stand before them.
-fn parse(bytes: &[u8], label: &str, name: &str, above: u64) -> Result<Recording, RecordingError> {
+pub(crate) fn parse(bytes: &[u8], label: &str, name: &str, above: u64) -> Result<Recording, RecordingError> {
     let text = check_text(bytes, label, above)?;
     let source = Source { text, label, above };
     let mut reader = ReaderBuilder::new().has_headers(false).flexible(true).from_reader(text);
@@ -470,11 +452,12 @@ fn header(record: &ByteRecord, place: &Place, text: &[u8]) -> Result<Header, Rec
         |mend: String| RecordingError::TimeColumn { place: place.clone(), found: first.clone(), mend };
     let time = header_cell(&first, || place.clone().column(0, &first));
     let time_scale = match &time {
-        Ok((name, unit)) if name == "t" => match unit.as_deref() {
-            None | Some("s") => 1.0,
-            Some("ms") => 1e-3,
-            Some("us" | "µs" | "μs") => 1e-6,
-            Some(unit) => return Err(time_column(format!("convert the times from {unit} to s"))),
+        Ok((name, unit)) if name == "t" => match seconds(unit.as_deref()) {
+            Some(scale) => scale,
+            None => {
+                let unit = unit.as_deref().unwrap_or_default();
+                return Err(time_column(format!("convert the times from {unit} to s")));
+            }
         },
         Ok(_) | Err(_) => {
             let elsewhere = parsed.as_ref().ok().and_then(|p| p.iter().position(|(name, _)| name == "t"));
@@ -500,8 +483,21 @@ fn header(record: &ByteRecord, place: &Place, text: &[u8]) -> Result<Header, Rec
     Ok(Header { time_scale, columns: parsed.into_iter().skip(1).collect() })
 }
 
+/// Seconds per unit of a time; `None` for a unit that times do not have.
+pub(crate) fn seconds(unit: Option<&str>) -> Option<f64> {
+    match unit {
+        None | Some("s") => Some(1.0),
+        Some("ms") => Some(1e-3),
+        Some("us" | "µs" | "μs") => Some(1e-6),
+        Some(_) => None,
+    }
+}
+
 /// `name` or `name [unit]`.
-fn header_cell(cell: &str, place: impl Fn() -> Place) -> Result<(String, Option<String>), RecordingError> {
+pub(crate) fn header_cell(
+    cell: &str,
+    place: impl Fn() -> Place,
+) -> Result<(String, Option<String>), RecordingError> {
     let refuse = |mend| RecordingError::HeaderCell { place: place(), found: cell.to_owned(), mend };
     let (name, unit) = match cell.split_once('[') {
         Some((name, rest)) => match rest.strip_suffix(']') {

@@ -236,6 +236,92 @@ pub enum RecordingError {
         /// Samples a piece needs.
         needed: usize,
     },
+    /// This build of greybox leaves the format out.
+    #[error(
+        "{place}: this build of greybox does not read {format}: build it with the feature `{feature}` (`cargo install \
+         --features {feature} …`), or export the recording as CSV"
+    )]
+    NotBuiltIn {
+        /// The file.
+        place: Place,
+        /// `MAT-files`, ….
+        format: &'static str,
+        /// Name of the feature.
+        feature: &'static str,
+    },
+    /// The file is of another format than its name says, or of a version that is not read.
+    #[error("{place}: {found}, which greybox does not read; {mend}")]
+    Format {
+        /// The file.
+        place: Place,
+        /// What it is.
+        found: String,
+        /// How to mend it.
+        mend: &'static str,
+    },
+    /// The file is cut off, or bytes of it were changed.
+    #[error(
+        "{place}: the file is damaged{}: {found}; copy it again from where it was recorded, or write it again",
+        variable.as_ref().map(|v| format!(" in the variable `{v}`")).unwrap_or_default()
+    )]
+    Damaged {
+        /// The file.
+        place: Place,
+        /// The variable or column, where that is known.
+        variable: Option<String>,
+        /// What was found.
+        found: String,
+    },
+    /// The values of the file need more memory than greybox gives a file.
+    #[error(
+        "{place}: its values need more than {limit_gib} GiB unpacked{}; save fewer variables, or several shorter files",
+        variable.as_ref().map(|v| format!(" (at the variable `{v}`)")).unwrap_or_default()
+    )]
+    TooLarge {
+        /// The file.
+        place: Place,
+        /// The variable at which the limit was met, where that is known.
+        variable: Option<String>,
+        /// The limit, GiB.
+        limit_gib: u64,
+    },
+    /// No variable or column is the time.
+    #[error("{place}: there is no time among what the file holds ({found}); {mend}")]
+    NoTime {
+        /// The file.
+        place: Place,
+        /// The variables or columns, in words.
+        found: String,
+        /// How to mend it.
+        mend: &'static str,
+    },
+    /// Signals of the file were sampled at different times.
+    #[error(
+        "{place}: the file holds {} recordings with times of their own ({}); one file holds one recording: save each in a \
+         file of its own",
+        times.len(), times.join(", ")
+    )]
+    SeveralTimes {
+        /// The file.
+        place: Place,
+        /// The variables that are times.
+        times: Vec<String>,
+    },
+    /// There is a time, and no variable or column has a value for each.
+    #[error(
+        "{place}: no other variable has the {rows} values of the time `{time}` ({found}); save signals and time with one \
+         value per sample"
+    )]
+    NoSignals {
+        /// The file.
+        place: Place,
+        /// The time.
+        time: String,
+        /// Its length.
+        rows: usize,
+        /// The other variables or columns, in words.
+        found: String,
+    },
     /// A column to be built or written has another length than the time.
     #[error("{place}: the column has {found} values, the time has {expected}; give one value per time")]
     ColumnLength {
@@ -271,6 +357,13 @@ impl RecordingError {
             | Self::TimeNotIncreasing { place, .. }
             | Self::TooFewRows { place, .. }
             | Self::NoUsablePiece { place, .. }
+            | Self::NotBuiltIn { place, .. }
+            | Self::Format { place, .. }
+            | Self::Damaged { place, .. }
+            | Self::TooLarge { place, .. }
+            | Self::NoTime { place, .. }
+            | Self::SeveralTimes { place, .. }
+            | Self::NoSignals { place, .. }
             | Self::ColumnLength { place, .. } => place,
         }
     }

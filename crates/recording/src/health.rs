@@ -441,56 +441,240 @@ fn record_length(channel: &Channel, full: &[f64], spectrum: &Periodogram) -> Opt
     Some(finding.on(&channel.name).value(100.0 * slow, Some("%")))
 }
 
-/// Lag of the largest correlation between input and output, both differenced and whitened (autoregression), in
-/// the longest piece. A minimum-phase plant vanishes in the whitening, so that a pure delay is what is left.
+/// Correlations larger than this multiple of [`chance`] are none.
+const BEYOND: f64 = 6.0;
+
+/// How one channel follows another.
+#[derive(Debug, Clone, Copy, PartialEq)]
+struct Lag {
+    /// Samples by which the second follows the first.
+    samples: isize,
+    /// Correlation of the whitened signals at that lag.
+    correlation: f64,
+}
+
+/// Correlation of two signals (no missing samples), both differenced and whitened (autoregression), at lags from as many
+/// samples below zero as above.
+fn whitened_correlation(u: &[f64], y: &[f64]) -> Option<Vec<f64>> {
+    let n = u.len();
+    if n < 64 {
+        return None;
+    }
+    let order = (n / 20).min(32);
+    Some(correlation(&whiten(u, order)?, &whiten(y, order)?, (n / 4).min(2000)))
+}
+
+/// What a correlation is where there is none: the robust standard deviation over all lags.
+fn chance(correlation: &[f64]) -> f64 {
+    1.4826 * median(&correlation.iter().map(|v| v.abs()).collect::<Vec<_>>())
+}
+
+/// Lag of the largest [`whitened_correlation`]. A minimum-phase plant vanishes in the whitening, so that a pure delay is
+/// what is left.
+fn lag(u: &[f64], y: &[f64]) -> Option<Lag> {
+    peak(u, y, (8.0 / (u.len() as f64).sqrt()).max(0.3))
+}
+
+/// Lag of the largest [`whitened_correlation`], where that is at least so large and beyond [`chance`].
+fn peak(u: &[f64], y: &[f64], least: f64) -> Option<Lag> {
+    let c = whitened_correlation(u, y)?;
+    let reach = c.len() / 2;
+    let size = |k: usize| c[k].abs();
+    let largest = (0..c.len()).map(size).fold(0.0, f64::max);
+    // A periodic input repeats the peak every period: of nearly equal peaks, the one closest to no lag.
+    let best = (0..c.len()).filter(|&k| size(k) >= 0.95 * largest).min_by_key(|k| k.abs_diff(reach))?;
+    if largest.is_nan() || largest < least || largest < BEYOND * chance(&c) {
+        return None;
+    }
+    Some(Lag { samples: best as isize - reach as isize, correlation: c[best] })
+}
+
+/// The [`lag`] from an input to an output in the longest piece, in words.
 fn delay(recording: &Recording, input: &str, output: &str) -> Option<Finding> {
     let piece = recording.longest_piece()?;
     let (i, o) = (recording.channel_index(input)?, recording.channel_index(output)?);
     if i == o {
         return None;
     }
-    let (u, y) = (fill_missing(&piece.columns[i]), fill_missing(&piece.columns[o]));
-    let n = piece.len;
-    if n < 64 {
-        return None;
-    }
-    let order = (n / 20).min(32);
-    let u = whiten(&u, order)?;
-    let y = whiten(&y, order)?;
-    let reach = (n / 4).min(2000);
-    let c = correlation(&u, &y, reach);
-    let size = |k: usize| c[k].abs();
-    let largest = (0..c.len()).map(size).fold(0.0, f64::max);
-    // A periodic input repeats the peak every period: of nearly equal peaks, the one closest to no lag.
-    let best = (0..c.len()).filter(|&k| size(k) >= 0.95 * largest).min_by_key(|k| k.abs_diff(reach))?;
-    let noise = 1.4826 * median(&c.iter().map(|v| v.abs()).collect::<Vec<_>>());
-    if largest.is_nan() || largest < 0.3 || largest < 8.0 / (n as f64).sqrt() || largest < 6.0 * noise {
-        return None;
-    }
-    let lag = best as isize - reach as isize;
-    let seconds = lag as f64 * piece.dt;
-    let sense = match lag {
+    let Lag { samples, correlation } =
+        lag(&fill_missing(&piece.columns[i]), &fill_missing(&piece.columns[o]))?;
+    let seconds = samples as f64 * piece.dt;
+    let sense = match samples {
         0 => format!("The output answers `{input}` within one sample"),
-        1.. => format!(
-            "The output follows `{input}` after about {lag} sample{} ({} s)",
-            if lag == 1 { "" } else { "s" },
-            number(seconds)
-        ),
+        1.. => format!("The output follows `{input}` after about {}", counted(samples, piece.dt)),
         _ => format!(
-            "The output runs ahead of `{input}` by about {} sample{} ({} s), as behind a feedback loop or with \
-             clocks that disagree",
-            -lag,
-            if lag == -1 { "" } else { "s" },
-            number(-seconds)
+            "The output runs ahead of `{input}` by about {}, as behind a feedback loop or with clocks that disagree",
+            counted(-samples, piece.dt)
         ),
     };
     Some(
         Finding::new(
             Severity::Info,
             "delay",
-            format!("{sense} (correlation {} of the whitened signals).", number(c[best])),
+            format!("{sense} (correlation {} of the whitened signals).", number(correlation)),
         )
         .on(output)
         .value(seconds, Some("s")),
     )
+}
+
+/// `3 samples (0.03 s)`.
+fn counted(samples: isize, dt: f64) -> String {
+    let seconds = number(samples as f64 * dt);
+    if samples == 1 { format!("1 sample ({seconds} s)") } else { format!("{samples} samples ({seconds} s)") }
+}
+
+/// The [`lag`], also where noise drowns it in the single samples: of these, of averages of two, four and eight. With it
+/// the samples by which it may be wrong: that of averages is looked for again among the single samples nearby.
+fn averaged_lag(a: &[f64], b: &[f64], lag: impl Fn(&[f64], &[f64]) -> Option<Lag>) -> Option<(Lag, isize)> {
+    let average = |y: &[f64], count: usize| -> Vec<f64> {
+        y.chunks_exact(count).map(|y| y.iter().sum::<f64>() / count as f64).collect()
+    };
+    let (count, rough) = [1, 2, 4, 8]
+        .into_iter()
+        .find_map(|count| Some((count, lag(&average(a, count), &average(b, count))?)))?;
+    let width = count as isize;
+    let near = rough.samples * width;
+    let fine = whitened_correlation(a, b).and_then(|c| {
+        let reach = (c.len() / 2) as isize;
+        let size = |samples: &isize| c.get((samples + reach) as usize).map_or(0.0, |v| v.abs());
+        let nearby = near - width..=near + width;
+        nearby.max_by(|x, y| size(x).total_cmp(&size(y))).filter(|best| size(best) > BEYOND * chance(&c))
+    });
+    Some(match fine {
+        Some(samples) => (Lag { samples, ..rough }, 1),
+        None => (Lag { samples: near, ..rough }, width),
+    })
+}
+
+/// Smallest offset that is told, in samples (or times what the lag may be wrong by): what one sample more or less is may
+/// be the sampling alone.
+const LEAST_OFFSET: isize = 2;
+
+/// Parts of a recording that are asked one by one, and fewest samples of one.
+const PARTS: usize = 8;
+const PART: usize = 256;
+
+/// A channel that seems late, and by how much.
+#[derive(Debug, Clone, Copy)]
+struct Offset {
+    /// Positions of the channels; the second is the later one.
+    pair: [usize; 2],
+    /// How far it is behind; at least [`LEAST_OFFSET`].
+    lag: Lag,
+    /// Samples by which that may be wrong.
+    within: isize,
+    /// Parts of the recording that say so, and those that can tell.
+    parts: [usize; 2],
+}
+
+/// Channels that were recorded later than others by a constant number of samples, as by another logger.
+///
+/// Asked is every pair of outputs, and every output that runs ahead of an input; with no roles stated, every pair. Of two
+/// channels that move with one cause, what is left after whitening must meet at the same sample. It is told where the
+/// longest piece shows a lag of two samples or more and three of four of its parts, asked one by one, show the same within
+/// a sample (some samples, where only averages of a few samples stand out of the noise): an offset is constant, and an accident is not. A sensor's own delay looks the same, and with no roles
+/// stated so does an input with a late answer: then it is no more than information.
+pub fn clock_offsets(recording: &Recording, inputs: &[&str], outputs: &[&str]) -> Vec<Finding> {
+    let Some(piece) = recording.longest_piece() else { return Vec::new() };
+    let columns: Vec<Vec<f64>> = piece.columns.iter().map(|column| fill_missing(column)).collect();
+    let is = |names: &[&str], c: usize| names.contains(&recording.channels[c].name.as_str());
+    let roles = !inputs.is_empty() && !outputs.is_empty();
+    let mut offsets = Vec::new();
+    for a in 0..columns.len() {
+        for b in a + 1..columns.len() {
+            let known = [a, b].iter().all(|&c| is(inputs, c) || is(outputs, c));
+            if (roles && !known) || (is(inputs, a) && is(inputs, b)) {
+                continue;
+            }
+            let Some(offset) = offset(&columns, a, b) else { continue };
+            // That an output comes after its input is what outputs do.
+            if !(roles && is(inputs, offset.pair[0])) {
+                offsets.push(offset);
+            }
+        }
+    }
+    let mut findings = Vec::new();
+    while let Some(late) = odd_one(&offsets, columns.len()) {
+        let against = offsets.iter().filter(|o| o.pair.contains(&late));
+        let Some(strongest) =
+            against.max_by(|a, b| a.lag.correlation.abs().total_cmp(&b.lag.correlation.abs())).copied()
+        else {
+            break;
+        };
+        let finding = told(recording, &strongest, piece.dt, roles && is(inputs, strongest.pair[1]));
+        // Without roles it may be an input and its answer.
+        let severity = if roles { Severity::Warning } else { Severity::Info };
+        findings.push(Finding { severity, ..finding });
+        offsets.retain(|o| !o.pair.contains(&late));
+    }
+    findings
+}
+
+/// The offset between two columns, where the data tell it.
+fn offset(columns: &[Vec<f64>], a: usize, b: usize) -> Option<Offset> {
+    let (whole, within) = averaged_lag(&columns[a], &columns[b], lag)?;
+    if whole.samples.abs() < LEAST_OFFSET * within {
+        return None;
+    }
+    let length = (columns[a].len() / PARTS).max(PART).max(4 * whole.samples.unsigned_abs());
+    let (mut agree, mut tell) = (0, 0);
+    for (a, b) in columns[a].chunks_exact(length).zip(columns[b].chunks_exact(length)) {
+        // That parts agree tells more than how large the correlation is in each.
+        if let Some((part, also)) = averaged_lag(a, b, |a, b| peak(a, b, 0.0)) {
+            tell += 1;
+            agree += usize::from((part.samples - whole.samples).abs() <= within.max(also));
+        }
+    }
+    if tell < 2 || 4 * agree < 3 * tell {
+        return None;
+    }
+    let (pair, samples) = if whole.samples > 0 { ([a, b], whole.samples) } else { ([b, a], -whole.samples) };
+    Some(Offset { pair, lag: Lag { samples, ..whole }, within, parts: [agree, tell] })
+}
+
+/// The channel in most of the offsets; of two such, the later one.
+fn odd_one(offsets: &[Offset], channels: usize) -> Option<usize> {
+    let times = |c: usize| {
+        let pairs = offsets.iter().filter(|o| o.pair.contains(&c)).count();
+        (pairs, offsets.iter().filter(|o| o.pair[1] == c).count())
+    };
+    (0..channels).max_by_key(|&c| times(c)).filter(|&c| times(c).0 > 0)
+}
+
+fn told(recording: &Recording, offset: &Offset, dt: f64, acausal: bool) -> Finding {
+    let [early, late] = offset.pair.map(|c| recording.channels[c].name.as_str());
+    let Lag { samples, correlation } = offset.lag;
+    let [agree, tell] = offset.parts;
+    let sure = match (agree == tell, tell >= 4) {
+        (true, true) => "sure",
+        (true, false) => "likely",
+        (false, _) => "probable",
+    };
+    let cause = match acausal {
+        true => format!(
+            "`{early}` cannot answer before its cause: unless `{late}` is computed from it (feedback), their clocks disagree"
+        ),
+        false => {
+            "as with the clock of another logger, or a delay of its sensor or of the motion itself".to_owned()
+        }
+    };
+    Finding::new(
+        Severity::Warning,
+        "clock_offset",
+        format!(
+            "Recorded {} {} later than `{early}`: {cause}. The lag is {sure}: {agree} of {tell} parts of the recording \
+             that can tell show the same within {} (correlation {} of the whitened signals).",
+            // What the motion itself takes hides as much of it.
+            if acausal { "at least" } else { "about" },
+            counted(samples, dt),
+            counted(offset.within, dt),
+            number(correlation)
+        ),
+    )
+    .mend(format!(
+        "If the machine does not explain it, move the column `{late}` up by {samples} rows, or record all channels with one clock."
+    ))
+    .on(late)
+    .value(samples as f64 * dt, Some("s"))
 }

@@ -1,4 +1,4 @@
-//! Recordings of experiments: time series with units, read from CSV, checked and smoothed.
+//! Recordings of experiments: time series with units, read from files, checked and smoothed.
 //!
 //! A recording is one continuous experiment: a strictly increasing time tᵢ and, for every channel c, the
 //! samples y_c(tᵢ) in the channel's unit, some of them missing (NaN). The reader turns it into *pieces*, each
@@ -14,13 +14,14 @@
 //! | module | what it answers |
 //! |---|---|
 //! | [`csv`](mod@csv) | what stands in the file, or exactly which cell is wrong and how to mend it |
+//! | `mat`, `parquet` | the same for MAT-files and Parquet files, each behind a feature of its name |
 //! | [`noise`] | how large the measurement noise is, and whether a channel is quantised |
 //! | [`smooth`] | value, first and second derivative of a noisy channel (Savitzky–Golay) |
 //! | [`interpolate`] | what an input did between its samples (band-limited, linear) |
 //! | [`health`] | is this recording good enough to identify anything from, in plain sentences |
 //!
-//! The functions of `noise`, `smooth` and `interpolate` take slices and return values; only [`csv`](mod@csv)
-//! touches files.
+//! The functions of `noise`, `smooth` and `interpolate` take slices and return values; only [`read()`] and
+//! [`csv`](mod@csv) touch files.
 //!
 //! ```
 //! use greybox_recording::{health, parse_csv};
@@ -44,12 +45,24 @@ mod finding;
 mod grid;
 pub mod health;
 pub mod interpolate;
+#[cfg(feature = "mat")]
+pub mod mat;
 pub mod noise;
+#[cfg(feature = "parquet")]
+pub mod parquet;
+mod read;
 mod recording;
+mod rename;
 pub mod smooth;
 mod spectrum;
 
 pub use crate::csv::{CsvBlocks, parse_csv, read_csv, write_csv, write_csv_file};
 pub use crate::error::{Place, RecordingError};
 pub use crate::finding::{Finding, Severity};
+#[cfg(feature = "mat")]
+pub use crate::mat::parse_mat;
+#[cfg(feature = "parquet")]
+pub use crate::parquet::parse_parquet;
+pub use crate::read::{EXTENSIONS, read};
 pub use crate::recording::{Channel, MIN_SAMPLES, Piece, Recording};
+pub use crate::rename::{Rename, RenameError};

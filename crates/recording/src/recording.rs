@@ -82,8 +82,19 @@ impl Recording {
     /// A length that differs from the time's, a time that is not finite or does not increase, an infinite
     /// value, fewer than 8 rows, or gaps that leave no piece of 8 samples. Lines count rows from 1 here.
     pub fn from_columns(name: &str, time: Vec<f64>, channels: Vec<Channel>) -> Result<Self, RecordingError> {
+        Self::checked(name, name, time, channels, 0.0)
+    }
+
+    /// As [`from_columns`](Self::from_columns); `label` and `resolution` as in [`assemble`](Self::assemble).
+    pub(crate) fn checked(
+        label: &str,
+        name: &str,
+        time: Vec<f64>,
+        channels: Vec<Channel>,
+        resolution: f64,
+    ) -> Result<Self, RecordingError> {
         for (k, &t) in time.iter().enumerate() {
-            let place = || Place::line(name, k as u64 + 1).column(0, "t");
+            let place = || Place::line(label, k as u64 + 1).column(0, "t");
             if !t.is_finite() {
                 return Err(RecordingError::NotFinite { place: place(), found: t.to_string() });
             }
@@ -99,19 +110,19 @@ impl Recording {
         for (c, channel) in channels.iter().enumerate() {
             if channel.values.len() != time.len() {
                 return Err(RecordingError::ColumnLength {
-                    place: Place::file(name).column(c + 1, &channel.name),
+                    place: Place::file(label).column(c + 1, &channel.name),
                     found: channel.values.len(),
                     expected: time.len(),
                 });
             }
             if let Some(k) = channel.values.iter().position(|v| v.is_infinite()) {
                 return Err(RecordingError::NotFinite {
-                    place: Place::line(name, k as u64 + 1).column(c + 1, &channel.name),
+                    place: Place::line(label, k as u64 + 1).column(c + 1, &channel.name),
                     found: channel.values[k].to_string(),
                 });
             }
         }
-        Self::assemble(name, name, time, channels, 0.0)
+        Self::assemble(label, name, time, channels, resolution)
     }
 
     /// Builds the pieces; `label` names the file in errors, `resolution` is the last printed digit of the

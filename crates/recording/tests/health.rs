@@ -3,7 +3,7 @@
 // Helpers of a test file are tests too; the lint configuration knows only the annotated functions.
 #![allow(clippy::unwrap_used)]
 
-use greybox_recording::health::check;
+use greybox_recording::health::{check, clock_offsets};
 use greybox_recording::{Channel, Finding, Recording, Severity};
 use rand::SeedableRng;
 use rand_distr::{Distribution, Normal};
@@ -233,4 +233,68 @@ fn the_delay_is_found_through_the_dynamics() {
     }
     let unrelated = check(&recording(&[("u", u), ("y", white(13, 1.0))]), &["u"], &["y"]);
     assert!(find(&unrelated, "delay").is_none());
+}
+
+/// A first-order lag driven by `u`.
+fn lagged(u: &[f64]) -> Vec<f64> {
+    let mut x = 0.0;
+    u.iter()
+        .map(|u| {
+            x += 0.2 * (u - x);
+            x
+        })
+        .collect()
+}
+
+/// `y` as a logger has it that is `samples` behind.
+fn late(y: &[f64], samples: usize) -> Vec<f64> {
+    (0..y.len()).map(|k| if k >= samples { y[k - samples] } else { y[0] }).collect()
+}
+
+#[test]
+fn a_clock_that_is_behind_is_found() {
+    let u = white(12, 1.0);
+    let (y, z) = (driven(&u, 0, 1e-6), lagged(&u));
+    let found = |u: &[f64], y: &[f64], z: &[f64], roles: bool| {
+        let recording = recording(&[("u", u.to_vec()), ("y", y.to_vec()), ("z", z.to_vec())]);
+        let (inputs, outputs): (&[&str], &[&str]) = if roles { (&["u"], &["y", "z"]) } else { (&[], &[]) };
+        clock_offsets(&recording, inputs, outputs)
+    };
+    for roles in [true, false] {
+        for (channel, samples, findings) in [
+            ("y", 9, found(&u, &late(&y, 9), &z, roles)),
+            ("z", 30, found(&u, &y, &late(&z, 30), roles)),
+            ("u", 12, found(&late(&u, 12), &y, &z, roles)),
+        ] {
+            assert_eq!(findings.len(), 1, "{channel}, {roles}: {findings:?}");
+            let finding = &findings[0];
+            assert_eq!((finding.code, finding.channel.as_deref()), ("clock_offset", Some(channel)));
+            assert_eq!(finding.severity, if roles { Severity::Warning } else { Severity::Info });
+            assert!((finding.value.unwrap() / DT - f64::from(samples)).abs() < 2.1, "{finding}");
+            assert!(finding.message.contains("The lag is sure: 8 of 8 parts"), "{finding}");
+            // The plant's own answer hides a part of what its input is late.
+            let acausal = roles && channel == "u";
+            assert_eq!(finding.message.contains("Recorded at least"), acausal, "{finding}");
+        }
+        assert_eq!(found(&u, &y, &z, roles), [], "clocks that agree");
+        assert_eq!(found(&u, &white(13, 1.0), &white(14, 1.0), roles), [], "nothing in common");
+        let wave = |shift: f64| -> Vec<f64> { (0..N).map(|k| (0.1 * (k as f64 - shift)).sin()).collect() };
+        assert_eq!(found(&wave(0.0), &wave(9.0), &wave(17.0), roles), [], "a sine tells no delay");
+    }
+    // Noise that hides the lag in the single samples leaves it in averages: the damped positions are slow.
+    let noisy =
+        |y: &[f64], seed: u64| -> Vec<f64> { y.iter().zip(white(seed, 2e-4)).map(|(y, e)| y + e).collect() };
+    let slow = |y: &[f64]| lagged(&lagged(y));
+    let (p, q) = (
+        noisy(&driven(&u, 0, 1e-6), 21),
+        noisy(&slow(&slow(&u)).iter().map(|z| 0.02 * z).collect::<Vec<_>>(), 22),
+    );
+    let findings = found(&u, &late(&p, 16), &q, true);
+    assert_eq!(findings.len(), 1, "{findings:?}");
+    assert_eq!(findings[0].channel.as_deref(), Some("y"));
+    assert!((findings[0].value.unwrap() / DT - 16.0).abs() < 4.1, "{}", findings[0]);
+    assert_eq!(found(&u, &p, &q, true), []);
+    // Behind for half of the recording is no clock's offset.
+    let half: Vec<f64> = late(&y, 9)[..N / 2].iter().chain(&y[N / 2..]).copied().collect();
+    assert_eq!(found(&u, &half, &z, true), []);
 }

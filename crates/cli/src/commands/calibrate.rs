@@ -21,6 +21,7 @@ use crate::story;
 #[derive(Debug, Args)]
 #[command(after_help = "Example:
   greybox calibrate link.toml run1.csv run2.csv --holdout run3.csv --out calibrated
+  greybox calibrate link.toml run1.mat --map \"theta=sensor_3 [deg]\" --out calibrated
 
 DIR receives model.toml (the model with the new values, comments kept) and report.json. Parameters with
 `fixed = true` stay; `std` is a prior. With no --holdout, the last fifth of each recording is held out.")]

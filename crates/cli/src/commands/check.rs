@@ -12,17 +12,22 @@ use serde::Serialize;
 use serde_json::json;
 
 use crate::answer::Answer;
+use crate::arguments::Channels;
 use crate::failure::Failure;
 use crate::loading;
 
-/// Check the health of recordings: sampling, gaps, clipping, quantisation, outliers, excitation, delay
+/// Check the health of recordings: sampling, gaps, clipping, quantisation, outliers, excitation, delay, clocks
 #[derive(Debug, Args)]
 #[command(after_help = "Examples:
   greybox check run1.csv run2.csv
+  greybox check recordings --model link.toml --map \"theta=sensor_3 [deg]\"
   greybox check run1.csv --inputs v
-  greybox check run1.csv --model link.toml --json")]
+  greybox check run1.csv --model link.toml --json
+
+A folder stands for all its recordings (*.csv, *.mat, *.parquet).")]
 pub(crate) struct Arguments {
-    /// Recordings (CSV; first column `t` in seconds, header cells `name` or `name [unit]`)
+    /// Recordings, or folders of them (CSV: first column `t` in seconds, header cells `name` or `name [unit]`;
+    /// MAT-file; Parquet)
     #[arg(value_name = "RECORDING.csv", required = true)]
     recordings: Vec<PathBuf>,
 
@@ -33,6 +38,9 @@ pub(crate) struct Arguments {
     /// Channels that drive the system; the others are taken as its response
     #[arg(long, value_name = "NAME", value_delimiter = ',')]
     inputs: Vec<String>,
+
+    #[command(flatten)]
+    channels: Channels,
 }
 
 /// What is said of one recording.
@@ -58,7 +66,14 @@ struct ChannelUse {
 
 pub(crate) fn run(arguments: &Arguments) -> Result<Answer, Failure> {
     let loaded = arguments.model.as_deref().map(loading::model).transpose()?;
-    let recordings = loading::recordings(&arguments.recordings)?;
+    let mut paths = Vec::new();
+    for path in &arguments.recordings {
+        match path.is_dir() {
+            true => paths.extend(loading::recordings_of(path)?),
+            false => paths.push(path.clone()),
+        }
+    }
+    let recordings = loading::recordings(&paths, &arguments.channels.map)?;
     let model = loaded.as_ref().map(|l| &l.model);
     if let Some(model) = model {
         Data::new(model, &recordings)?;
@@ -71,7 +86,8 @@ pub(crate) fn run(arguments: &Arguments) -> Result<Answer, Failure> {
         .map(|recording| match model {
             Some(model) => {
                 let feeds = |name: &str, unit: Option<&str>| feeds(model, name, unit);
-                describe(recording, check_for_model(recording, model), feeds)
+                let (inputs, outputs) = roles(model);
+                describe(recording, findings(recording, &inputs, &outputs), feeds)
             }
             None => {
                 let findings = check_with_inputs(recording, &arguments.inputs);
@@ -98,9 +114,22 @@ fn known(recording: &Recording, inputs: &[String]) -> Result<(), Failure> {
 
 /// The health of a recording, its channels in the roles that the model gives them.
 pub(crate) fn check_for_model(recording: &Recording, model: &Model) -> Vec<Finding> {
-    let inputs: Vec<&str> = model.inputs.iter().map(|i| i.channel.as_str()).collect();
-    let outputs: Vec<&str> = model.measurements.iter().map(|m| m.channel.as_str()).collect();
+    let (inputs, outputs) = roles(model);
     health::check(recording, &inputs, &outputs)
+}
+
+/// The channels that a model takes as inputs, and as measurements.
+fn roles(model: &Model) -> (Vec<&str>, Vec<&str>) {
+    let inputs = model.inputs.iter().map(|i| i.channel.as_str()).collect();
+    let outputs = model.measurements.iter().map(|m| m.channel.as_str()).collect();
+    (inputs, outputs)
+}
+
+/// The health of a recording, and whether its channels were recorded with one clock.
+fn findings(recording: &Recording, inputs: &[&str], outputs: &[&str]) -> Vec<Finding> {
+    let mut findings = health::check(recording, inputs, outputs);
+    findings.extend(health::clock_offsets(recording, inputs, outputs));
+    findings
 }
 
 fn check_with_inputs(recording: &Recording, inputs: &[String]) -> Vec<Finding> {
@@ -110,7 +139,7 @@ fn check_with_inputs(recording: &Recording, inputs: &[String]) -> Vec<Finding> {
     } else {
         recording.channels.iter().map(|c| c.name.as_str()).filter(|name| !named.contains(name)).collect()
     };
-    health::check(recording, &named, &others)
+    findings(recording, &named, &others)
 }
 
 /// What the channel feeds in the model, in words.

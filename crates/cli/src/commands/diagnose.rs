@@ -23,13 +23,14 @@ use crate::story;
 #[command(after_help = "Example:
   greybox diagnose link.toml run1.csv run2.csv --holdout run3.csv --out result
   greybox diagnose link.toml run1.csv --mechanisms mine --out result
+  greybox diagnose link.toml run1.mat --map \"theta=sensor_3 [deg]\" --out result
   greybox diagnose link.toml recordings --out results
 
 DIR receives report.json, report.html (self-contained, with plots) and improved.toml. With no --holdout, the
 last fifth of each recording is held out. The same seed and inputs give the same results.
 
-A folder in the place of TRAIN.csv stands alone: each of its *.csv files that is not held out is diagnosed by
-itself, into a folder of its own in DIR, and summary.html and summary.json say what all say together. A run that
+A folder in the place of TRAIN.csv stands alone: each of its recordings (*.csv, *.mat, *.parquet) that is not held out is diagnosed
+by itself, into a folder of its own in DIR, and summary.html and summary.json say what all say together. A run that
 was ended is gone on with by the same command: what is done is not done again.")]
 pub(crate) struct Arguments {
     #[command(flatten)]

@@ -18,6 +18,7 @@ use crate::story;
 #[command(after_help = "Examples:
   greybox identify run1.csv --states x --inputs f --holdout run2.csv --out found
   greybox identify run1.csv run2.csv --states theta,alpha --inputs v --library separate,friction --out found
+  greybox identify run1.mat --states x --inputs f --map x=encoder --out found
   greybox identify run1.csv --states x --inputs f --delay x --longest 0.5 --out found
   greybox identify a_week.csv --states x --inputs f --block 20000 --out found
 
@@ -151,10 +152,10 @@ pub(crate) fn run(arguments: &Arguments) -> Result<Answer, Failure> {
             (found, recordings, out, progress)
         }
         Some(rows) => {
-            let paths = &arguments.study.train;
+            let (paths, map) = (&arguments.study.train, &arguments.study.channels.map);
             loading::no_twins(paths.iter().chain(&arguments.study.holdout))?;
-            let holdout = loading::recordings(&arguments.study.holdout)?;
-            let open = || loading::blocks(paths, rows as usize);
+            let holdout = loading::recordings(&arguments.study.holdout, map)?;
+            let open = || loading::blocks(paths, rows as usize, map);
             // A file that is missing or empty is told before anything is written.
             drop(open()?);
             let out = arguments.study.folder(&FILES, [])?;

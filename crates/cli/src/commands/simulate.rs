@@ -12,6 +12,7 @@ use greybox_report::format;
 use serde_json::{Map, json};
 
 use crate::answer::Answer;
+use crate::arguments::Channels;
 use crate::failure::Failure;
 use crate::loading;
 use crate::output::OutputFile;
@@ -21,6 +22,7 @@ use crate::progress::Progress;
 #[derive(Debug, Args)]
 #[command(after_help = "Example:
   greybox simulate improved.toml run3.csv --out simulated.csv
+  greybox simulate improved.toml run3.mat --map theta=sensor_3 --out simulated.csv
 
 OUT.csv has the times of the recording and one column per measured channel, under the same names and in the
 same units. Rows that the simulation does not reach (a piece too short to use, a simulation that diverges)
@@ -32,9 +34,12 @@ pub(crate) struct Arguments {
     #[arg(value_name = "MODEL.toml")]
     model: PathBuf,
 
-    /// Recording whose inputs drive the model
+    /// Recording whose inputs drive the model (CSV, MAT-file or Parquet)
     #[arg(value_name = "INPUT.csv")]
     input: PathBuf,
+
+    #[command(flatten)]
+    channels: Channels,
 
     /// File to write
     #[arg(long, value_name = "OUT.csv")]
@@ -43,7 +48,7 @@ pub(crate) struct Arguments {
 
 pub(crate) fn run(arguments: &Arguments) -> Result<Answer, Failure> {
     let loaded = loading::model(&arguments.model)?;
-    let recordings = loading::recordings(std::slice::from_ref(&arguments.input))?;
+    let recordings = loading::recordings(std::slice::from_ref(&arguments.input), &arguments.channels.map)?;
     let [recording] = recordings.as_slice() else {
         return Err(Failure::internal("one recording was named, but not read"));
     };

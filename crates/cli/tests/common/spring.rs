@@ -6,7 +6,7 @@ use std::fmt::Write as _;
 use noise::Noise;
 
 #[path = "noise.rs"]
-mod noise;
+pub(crate) mod noise;
 
 /// The nominal model.
 pub(crate) const MODEL: &str = r#"name = "Mass on a spring"

@@ -8,6 +8,7 @@ use std::thread;
 
 use greybox_calibrate::Data;
 use greybox_diagnose::{Options, Quiet};
+use greybox_recording::Rename;
 use greybox_report::contract::{ModelId, Producer};
 use greybox_report::summary::Statistics;
 use greybox_report::{Report, merge};
@@ -29,6 +30,7 @@ const SUMMARY: [&str; 2] = ["summary.json", "summary.html"];
 struct Batch<'a> {
     loaded: LoadedModel,
     holdout: &'a [PathBuf],
+    map: &'a [Rename],
     options: Options,
     /// Those beside the built-in ones.
     mechanisms: Vec<Fingerprint>,
@@ -52,9 +54,10 @@ struct Diagnosed {
 pub(super) fn run(arguments: &Arguments, folder: &Path, own: Option<&Mechanisms>) -> Result<Answer, Failure> {
     let (model, place) = (&arguments.inputs.model, &arguments.inputs.study.out);
     let holdout = &arguments.inputs.study.holdout;
+    let map = &arguments.inputs.study.channels.map;
     let loaded = loading::model(model)?;
     // A fault in what judges all recordings is told once.
-    Data::new(&loaded.model, &loading::recordings(holdout)?)?;
+    Data::new(&loaded.model, &loading::recordings(holdout, map)?)?;
     let recordings = recordings(folder, holdout)?;
     let inputs = || [model].into_iter().chain(holdout).chain(own.iter().flat_map(|own| &own.files));
     let out = OutputFolder::prepare(place)?;
@@ -66,6 +69,7 @@ pub(super) fn run(arguments: &Arguments, folder: &Path, own: Option<&Mechanisms>
     let batch = Batch {
         loaded,
         holdout,
+        map,
         options: arguments.options(own),
         mechanisms: own
             .iter()
@@ -128,11 +132,7 @@ pub(super) fn run(arguments: &Arguments, folder: &Path, own: Option<&Mechanisms>
 
 /// The recordings of the folder that are not held out.
 fn recordings(folder: &Path, holdout: &[PathBuf]) -> Result<Vec<PathBuf>, Failure> {
-    let mut recordings = loading::files_of(folder, "csv")?;
-    if recordings.is_empty() {
-        return Err(Failure::file(folder, "this folder holds no recording (`*.csv`)")
-            .mend("name the folder that holds the recordings themselves, or the files one by one"));
-    }
+    let mut recordings = loading::recordings_of(folder)?;
     recordings.retain(|path| !holdout.iter().any(|held| same_file(held, path)));
     if recordings.is_empty() {
         return Err(Failure::file(folder, "every recording of this folder is held out")
@@ -205,7 +205,7 @@ impl Batch<'_> {
             return Ok(Diagnosed { statistics, before: true });
         }
         let (train, holdout) =
-            loading::train_and_holdout(std::slice::from_ref(&task.recording), self.holdout)?;
+            loading::train_and_holdout(std::slice::from_ref(&task.recording), self.holdout, self.map)?;
         let diagnosis =
             greybox_diagnose::diagnose(&self.loaded.model, &train, &holdout, &self.options, &Quiet)?;
         let results = Results::of(&diagnosis, &self.loaded, &train, &holdout)?;
@@ -235,6 +235,7 @@ impl Batch<'_> {
             model: Fingerprint::of(&self.loaded.file, self.loaded.text.as_bytes()),
             recording: fingerprint(recording)?,
             holdout: self.holdout.iter().map(|path| fingerprint(path)).collect::<Result<_, Failure>>()?,
+            map: self.map.iter().map(Rename::to_string).collect(),
             mechanisms: self.mechanisms.clone(),
         })
     }

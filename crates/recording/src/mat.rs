@@ -1,0 +1,57 @@
+//! Reading MAT-files of MATLAB and Simulink (feature `mat`).
+//!
+//! Read are files of level 5: those of `save` with `-v6` and `-v7` (compressed), also those that SciPy and Octave
+//! write. A file of `-v7.3` (HDF5) is an error that names the mend.
+//!
+//! The time is the vector `t`, `time` or `tout`, in s; every real array with a value for each time is a signal:
+//!
+//! | in the file | channels |
+//! |---|---|
+//! | vectors `t`, `theta`, `v` | `theta`, `v` |
+//! | structure `s` with the fields `t`, `theta`, `v` | `theta`, `v` |
+//! | matrix `y`, one column (or row) per signal | `y_1`, `y_2`, … |
+//! | matrix `y` and texts `y_names`, `names`, `labels`, `columns` or `channels` | the texts, each `name` or `name [unit]`; one may be the time |
+//! | structure with time of Simulink: `time`, `signals(k).values`, `signals(k).label` | the labels; without, the variable's name |
+//! | one matrix alone, its first column (or row) increasing | the matrix's name with `_1`, `_2`, … |
+//! | structure `units` with a text per signal | units of the signals |
+//!
+//! Structures within structures are looked through. A name that would stand twice gets the structures' names before
+//! it (`hub_theta`). NaN is a missing sample. What is left out is told in the warnings of the recording.
+
+mod layout;
+mod level5;
+
+use crate::error::{Place, RecordingError};
+use crate::read::ROOM;
+use crate::recording::Recording;
+use level5::Fault;
+
+/// Reads a recording called `name` from the bytes of a MAT-file.
+///
+/// # Errors
+/// [`RecordingError::Format`], [`RecordingError::Damaged`] or [`RecordingError::TooLarge`] where the bytes cannot be read;
+/// [`RecordingError::NoTime`], [`RecordingError::SeveralTimes`] or [`RecordingError::NoSignals`] where they make no recording;
+/// else as [`Recording::from_columns`].
+///
+/// ```
+/// let error = greybox_recording::parse_mat(b"t,u\n0,1\n", "run1.mat").unwrap_err();
+/// assert!(error.to_string().starts_with("run1.mat: the file is damaged"));
+/// ```
+pub fn parse_mat(bytes: &[u8], name: &str) -> Result<Recording, RecordingError> {
+    parse(bytes, name, name)
+}
+
+pub(crate) fn parse(bytes: &[u8], label: &str, name: &str) -> Result<Recording, RecordingError> {
+    let variables = level5::variables(bytes).map_err(|fault| told(fault, Place::file(label)))?;
+    layout::recording(&variables, label, name)
+}
+
+fn told(fault: Fault, place: Place) -> RecordingError {
+    match fault {
+        Fault::Format(found, mend) => RecordingError::Format { place, found: found.to_owned(), mend },
+        Fault::Damaged { variable, what, at } => {
+            RecordingError::Damaged { place, variable, found: format!("{what} (byte {at})") }
+        }
+        Fault::TooLarge { variable } => RecordingError::TooLarge { place, variable, limit_gib: ROOM >> 30 },
+    }
+}

@@ -1,0 +1,112 @@
+//! Parquet files, written by the same library that reads them, and damaged ones.
+#![cfg(feature = "parquet")]
+// Helpers of a test file are tests too; the lint configuration knows only the annotated functions.
+#![allow(clippy::unwrap_used)]
+
+use std::sync::Arc;
+
+use greybox_recording::{RecordingError, parse_parquet};
+use parquet::basic::{Compression, ZstdLevel};
+use parquet::data_type::{BoolType, ByteArrayType, DoubleType, FloatType, Int64Type};
+use parquet::file::properties::WriterProperties;
+use parquet::file::writer::SerializedFileWriter;
+use parquet::schema::parser::parse_message_type;
+
+const ROWS: usize = 60;
+
+/// Two row groups with every kind of column; `time` is the definition of the first one, `unit` its ticks per second.
+fn file(time: &str, unit: f64, compression: Compression) -> Vec<u8> {
+    let schema = format!(
+        "message m {{ required int64 {time}; optional double theta; required float v; required boolean on;
+         required binary note (UTF8); }}"
+    );
+    let properties = Arc::new(WriterProperties::builder().set_compression(compression).build());
+    let schema = Arc::new(parse_message_type(&schema).unwrap());
+    let mut writer = SerializedFileWriter::new(Vec::new(), schema, properties).unwrap();
+    for rows in [0..ROWS / 2, ROWS / 2..ROWS] {
+        let mut group = writer.next_row_group().unwrap();
+        let mut column = group.next_column().unwrap().unwrap();
+        let ticks: Vec<i64> = rows.clone().map(|k| START + (0.01 * k as f64 * unit).round() as i64).collect();
+        column.typed::<Int64Type>().write_batch(&ticks, None, None).unwrap();
+        column.close().unwrap();
+        let mut column = group.next_column().unwrap().unwrap();
+        let present: Vec<usize> = rows.clone().filter(|k| k % 7 != 3).collect();
+        let theta: Vec<f64> = present.iter().map(|&k| (k as f64).cos()).collect();
+        let levels: Vec<i16> = rows.clone().map(|k| i16::from(k % 7 != 3)).collect();
+        column.typed::<DoubleType>().write_batch(&theta, Some(&levels), None).unwrap();
+        column.close().unwrap();
+        let mut column = group.next_column().unwrap().unwrap();
+        let v: Vec<f32> = rows.clone().map(|k| k as f32 / 4.0).collect();
+        column.typed::<FloatType>().write_batch(&v, None, None).unwrap();
+        column.close().unwrap();
+        let mut column = group.next_column().unwrap().unwrap();
+        let on: Vec<bool> = rows.clone().map(|k| k % 2 == 1).collect();
+        column.typed::<BoolType>().write_batch(&on, None, None).unwrap();
+        column.close().unwrap();
+        let mut column = group.next_column().unwrap().unwrap();
+        let notes: Vec<_> = rows.map(|k| format!("row {k}").as_str().into()).collect();
+        column.typed::<ByteArrayType>().write_batch(&notes, None, None).unwrap();
+        column.close().unwrap();
+        group.close().unwrap();
+    }
+    writer.into_inner().unwrap()
+}
+
+/// Ticks of the first row: a timestamp of today is of this size.
+const START: i64 = 1_700_000_000_000_000;
+
+#[test]
+fn columns_become_channels() {
+    for compression in [
+        Compression::UNCOMPRESSED,
+        Compression::SNAPPY,
+        Compression::LZ4_RAW,
+        Compression::ZSTD(ZstdLevel::default()),
+        Compression::GZIP(Default::default()),
+    ] {
+        let bytes = file("time (TIMESTAMP(MICROS,true))", 1e6, compression);
+        let recording = parse_parquet(bytes, "run.parquet").unwrap();
+        assert_eq!(recording.dt(), 0.01);
+        assert_eq!(recording.time.len(), ROWS);
+        let names: Vec<&str> = recording.channels.iter().map(|c| c.name.as_str()).collect();
+        assert_eq!(names, ["theta", "v", "on"]);
+        for k in 0..ROWS {
+            let value = |name: &str| recording.channel(name).unwrap().values[k];
+            assert!((recording.time[k] - 0.01 * k as f64).abs() < 1e-12);
+            assert_eq!(value("theta").is_nan(), k % 7 == 3);
+            assert!(k % 7 == 3 || value("theta") == (k as f64).cos());
+            assert_eq!((value("v"), value("on")), (k as f64 / 4.0, (k % 2) as f64));
+        }
+        assert_eq!(recording.warnings[0].code, "left_out");
+        assert!(recording.warnings[0].message.contains("`note`"), "{}", recording.warnings[0].message);
+    }
+}
+
+#[test]
+fn a_file_without_time_names_its_columns() {
+    let error = parse_parquet(file("tick", 1e6, Compression::SNAPPY), "bad.parquet").unwrap_err();
+    assert!(matches!(error, RecordingError::NoTime { .. }));
+    for part in
+        ["bad.parquet: there is no time", "`tick`, `theta`, `v`, `on`, `note`", "call the column of times"]
+    {
+        assert!(error.to_string().contains(part), "{error}");
+    }
+}
+
+#[test]
+fn no_cut_and_no_changed_byte_makes_a_fault() {
+    let whole = file("t", 1e3, Compression::SNAPPY);
+    for end in 0..whole.len() {
+        let error = parse_parquet(whole[..end].to_vec(), "cut.parquet").unwrap_err();
+        assert!(matches!(error, RecordingError::Damaged { .. }), "{end}: {error}");
+    }
+    let mut refused = 0;
+    for at in 0..whole.len() {
+        for change in [0x01, 0x80, 0xff] {
+            let mut changed = whole.clone();
+            changed[at] ^= change;
+            refused += usize::from(parse_parquet(changed, "changed.parquet").is_err());
+        }
+    }
+    assert!(refused > 100, "{refused}");
+}
