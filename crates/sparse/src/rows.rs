@@ -188,6 +188,16 @@ mod tests {
     }
 
     #[test]
+    fn the_first_bad_value_is_found_wherever_it_is() {
+        let mut values = vec![1.0; 5000];
+        assert_eq!(first_not_finite(&values), None);
+        for at in [4999, 3000, 1024, 1023, 0] {
+            values[at] = f64::NAN;
+            assert_eq!(first_not_finite(&values), Some(at));
+        }
+    }
+
+    #[test]
     #[allow(clippy::single_range_in_vec_init)]
     fn ranges_must_ascend() {
         assert!(check_ranges(&[0..2, 2..4], 4).is_ok());
