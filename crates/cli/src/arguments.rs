@@ -10,7 +10,7 @@ use crate::answer::Answer;
 use crate::commands::{
     calibrate, check, control, demo, diagnose, export, identify, mechanisms, new, shell, simulate,
 };
-use crate::failure::Failure;
+use crate::failure::{self, Failure};
 use crate::loading::{self, LoadedModel};
 use crate::output::OutputFolder;
 use greybox_calibrate::Data;
@@ -202,7 +202,7 @@ impl Cli {
                      `greybox --help` explains them",
                 ))
             }
-            Err(e) => Err(Failure::usage(&e.render().to_string())),
+            Err(e) => Err(failure::usage(&e.render().to_string())),
         }
     }
 }

@@ -8,11 +8,9 @@ mod arguments;
 mod commands;
 mod done;
 mod failure;
-mod loading;
 mod log;
 mod output;
 mod progress;
-mod story;
 
 use std::ffi::OsString;
 use std::process::ExitCode;
@@ -20,15 +18,16 @@ use std::process::ExitCode;
 use answer::Manner;
 use arguments::Cli;
 use failure::Failure;
+use greybox_commands::{loading, story};
 
 fn main() -> ExitCode {
     let arguments: Vec<OsString> = std::env::args_os().collect();
     let manner = if arguments.iter().any(|a| a == "--json") { Manner::Json } else { Manner::Text };
     match std::panic::catch_unwind(|| run(arguments)) {
         Ok(Ok(answer)) => answer.print(manner),
-        Ok(Err(failure)) => failure.print(manner),
+        Ok(Err(failure)) => failure::print(&failure, manner),
         // The default hook has said where on standard error.
-        Err(_) => Failure::fault().print(manner),
+        Err(_) => failure::print(&Failure::fault(), manner),
     }
 }
 

@@ -6,6 +6,7 @@ use std::path::{Path, PathBuf};
 use std::sync::atomic::{AtomicUsize, Ordering};
 
 use crate::failure::Failure;
+use crate::loading::same_file;
 
 /// A folder for the results of one command.
 ///
@@ -198,14 +199,6 @@ impl Kept {
             // Not empty, or gone: either way it is not ours.
             let _ = fs::remove_dir(folder);
         }
-    }
-}
-
-/// Whether both paths lead to one existing file.
-pub(crate) fn same_file(a: &Path, b: &Path) -> bool {
-    match (fs::canonicalize(a), fs::canonicalize(b)) {
-        (Ok(a), Ok(b)) => a == b,
-        _ => false,
     }
 }
 

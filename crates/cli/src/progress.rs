@@ -5,6 +5,7 @@ use std::sync::mpsc::{RecvTimeoutError, Sender, channel};
 use std::thread::JoinHandle;
 use std::time::Duration;
 
+use greybox_commands::{diagnose, identify};
 use greybox_diagnose::{Observer, Stage};
 use indicatif::{ProgressBar, ProgressDrawTarget, ProgressStyle};
 
@@ -71,33 +72,13 @@ impl Progress {
 
 impl Observer for Progress {
     fn stage(&self, stage: Stage) {
-        Progress::stage(
-            self,
-            match stage {
-                Stage::Calibrating => "calibrating the model as it is".to_owned(),
-                Stage::Screening { candidates, found } => {
-                    format!("screening {candidates} candidates ({found} found so far)")
-                }
-                Stage::Fitting { candidates } => format!("fitting the best {candidates}"),
-                Stage::Lengthening { segments } => format!("going on with {segments} longer segments"),
-                Stage::Whitening => "searching again with coloured noise modelled".to_owned(),
-                Stage::Simulating => "simulating whole recordings".to_owned(),
-            },
-        );
+        Progress::stage(self, diagnose::told(stage));
     }
 }
 
 impl greybox_identify::Observer for Progress {
     fn stage(&self, name: &str) {
-        Progress::stage(
-            self,
-            match name {
-                "weak form" => "first estimates (weak form)",
-                "output error" => "choosing and fitting terms on simulated outputs",
-                "precision" => "intervals and resampled choices",
-                other => other,
-            },
-        );
+        Progress::stage(self, identify::told(name));
     }
 }
 

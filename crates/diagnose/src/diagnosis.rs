@@ -1218,7 +1218,16 @@ pub struct Calibration {
     pub window: f64,
     /// The data.
     pub data: Arc<Data>,
+    /// Held-out data.
+    pub held: Arc<Data>,
+    /// Free runs on the training recordings: nominal, calibrated.
+    pub train_runs: (FreeRun, FreeRun),
+    /// Free runs on the held-out recordings.
+    pub holdout_runs: (FreeRun, FreeRun),
 }
+
+/// Scores and free runs of two models.
+type Both = ((Vec<Score>, Vec<Score>), (FreeRun, FreeRun));
 
 /// Refits the parameters of a model, with uncertainties.
 ///
@@ -1253,23 +1262,29 @@ pub fn calibrate(
         })
         .collect();
     let spread: Vec<f64> = train.spread.iter().map(|s| s.max(1e-300)).collect();
-    let scores = |data: &Arc<Data>| -> Result<(Vec<Score>, Vec<Score>), DiagnoseError> {
+    let runs = |data: &Arc<Data>| -> Result<Both, DiagnoseError> {
         let mut setup = Setup::new(model, data.clone(), Vec::new())?;
         setup.method = fitted.setup.method;
         let before = setup.free_run(&nominal.values(), &spread);
         let after = setup.free_run(values, &scale);
-        Ok((
+        let scores = (
             setup.scores(&before, &nominal.values(), window, None),
             setup.scores(&after, values, window, None),
-        ))
+        );
+        Ok((scores, (before, after)))
     };
+    let (train_scores, train_runs) = runs(&train)?;
+    let (holdout_scores, holdout_runs) = runs(&holdout)?;
     Ok(Calibration {
         model: calibrated,
         parameters,
-        train: scores(&train)?,
-        holdout: scores(&holdout)?,
+        train: train_scores,
+        holdout: holdout_scores,
         holdout_source: source,
         window,
         data: train,
+        held: holdout,
+        train_runs,
+        holdout_runs,
     })
 }

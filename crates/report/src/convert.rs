@@ -7,7 +7,7 @@ pub mod identification;
 use greybox_calibrate::{Data, FreeRun};
 use greybox_diagnose::diagnosis::{Estimate as Estimated, Finding as Found, Role as RoleRuns, Run};
 use greybox_diagnose::locate::{Location as Located, spectrum};
-use greybox_diagnose::{Diagnosis, Verdict as Answer};
+use greybox_diagnose::{Calibration, Diagnosis, Verdict as Answer};
 use greybox_model::{Model, Unit, WriteOptions};
 use greybox_recording::{Recording, Severity as Level, health};
 
@@ -499,6 +499,17 @@ fn recordings(
                     }),
                 })
                 .collect(),
+        })
+        .collect()
+}
+
+/// The recordings of a calibration with the free runs of the nominal and the calibrated model.
+pub fn calibrated_recordings(calibration: &Calibration) -> Vec<page::Recording> {
+    let c = calibration;
+    [(&c.data, page::Role::Train, &c.train_runs), (&c.held, page::Role::Holdout, &c.holdout_runs)]
+        .into_iter()
+        .flat_map(|(data, kind, (nominal, calibrated))| {
+            recordings(data, &c.model, kind, [Some(nominal), Some(calibrated), None])
         })
         .collect()
 }

@@ -1,15 +1,9 @@
 //! `greybox check`: are these recordings good enough, and do they fit the model?
 
-use std::fmt::Write as _;
-use std::path::{Path, PathBuf};
+use std::path::PathBuf;
 
 use clap::Args;
-use greybox_calibrate::Data;
-use greybox_model::{Model, Unit};
-use greybox_recording::{Finding, Recording, Severity, health};
-use greybox_report::format;
-use serde::Serialize;
-use serde_json::json;
+use greybox_commands::check;
 
 use crate::answer::Answer;
 use crate::arguments::Channels;
@@ -43,27 +37,6 @@ pub(crate) struct Arguments {
     channels: Channels,
 }
 
-/// What is said of one recording.
-#[derive(Debug, Serialize)]
-struct Health {
-    file: String,
-    rows: usize,
-    pieces: usize,
-    dt_s: f64,
-    duration_s: f64,
-    channels: Vec<ChannelUse>,
-    findings: Vec<Finding>,
-}
-
-/// A channel and what it feeds.
-#[derive(Debug, Serialize)]
-struct ChannelUse {
-    name: String,
-    unit: Option<String>,
-    /// In plain language; `null` where the model does not use the channel, or none was given.
-    feeds: Option<String>,
-}
-
 pub(crate) fn run(arguments: &Arguments) -> Result<Answer, Failure> {
     let loaded = arguments.model.as_deref().map(loading::model).transpose()?;
     let mut paths = Vec::new();
@@ -75,153 +48,6 @@ pub(crate) fn run(arguments: &Arguments) -> Result<Answer, Failure> {
     }
     let recordings = loading::recordings(&paths, &arguments.channels.map)?;
     let model = loaded.as_ref().map(|l| &l.model);
-    if let Some(model) = model {
-        Data::new(model, &recordings)?;
-    }
-    for recording in &recordings {
-        known(recording, &arguments.inputs)?;
-    }
-    let checked: Vec<Health> = recordings
-        .iter()
-        .map(|recording| match model {
-            Some(model) => {
-                let feeds = |name: &str, unit: Option<&str>| feeds(model, name, unit);
-                let (inputs, outputs) = roles(model);
-                describe(recording, findings(recording, &inputs, &outputs), feeds)
-            }
-            None => {
-                let findings = check_with_inputs(recording, &arguments.inputs);
-                describe(recording, findings, |name, _| {
-                    arguments.inputs.iter().any(|i| i == name).then(|| "input".to_owned())
-                })
-            }
-        })
-        .collect();
-    let text = checked.iter().map(in_words).collect::<Vec<_>>().join("\n");
-    let json = json!({ "model": loaded.as_ref().map(|l| &l.model.name), "recordings": checked });
-    Ok(Answer::new(text, json))
-}
-
-/// Sees that the recording has every channel named after `--inputs`.
-fn known(recording: &Recording, inputs: &[String]) -> Result<(), Failure> {
-    let Some(unknown) = inputs.iter().find(|name| recording.channel(name).is_none()) else {
-        return Ok(());
-    };
-    let names: Vec<String> = recording.channels.iter().map(|c| format!("`{}`", c.name)).collect();
-    let message = format!("there is no channel `{unknown}`, which `--inputs` names");
-    Err(Failure::file(Path::new(&recording.name), message).mend(format!("name one of {}", names.join(", "))))
-}
-
-/// The health of a recording, its channels in the roles that the model gives them.
-pub(crate) fn check_for_model(recording: &Recording, model: &Model) -> Vec<Finding> {
-    let (inputs, outputs) = roles(model);
-    health::check(recording, &inputs, &outputs)
-}
-
-/// The channels that a model takes as inputs, and as measurements.
-fn roles(model: &Model) -> (Vec<&str>, Vec<&str>) {
-    let inputs = model.inputs.iter().map(|i| i.channel.as_str()).collect();
-    let outputs = model.measurements.iter().map(|m| m.channel.as_str()).collect();
-    (inputs, outputs)
-}
-
-/// The health of a recording, and whether its channels were recorded with one clock.
-fn findings(recording: &Recording, inputs: &[&str], outputs: &[&str]) -> Vec<Finding> {
-    let mut findings = health::check(recording, inputs, outputs);
-    findings.extend(health::clock_offsets(recording, inputs, outputs));
-    findings
-}
-
-fn check_with_inputs(recording: &Recording, inputs: &[String]) -> Vec<Finding> {
-    let named: Vec<&str> = inputs.iter().map(String::as_str).collect();
-    let others: Vec<&str> = if inputs.is_empty() {
-        Vec::new()
-    } else {
-        recording.channels.iter().map(|c| c.name.as_str()).filter(|name| !named.contains(name)).collect()
-    };
-    findings(recording, &named, &others)
-}
-
-/// What the channel feeds in the model, in words.
-fn feeds(model: &Model, channel: &str, header: Option<&str>) -> Option<String> {
-    let input = model.inputs.iter().filter(|i| i.channel == channel);
-    let measured = model.measurements.iter().filter(|m| m.channel == channel);
-    let uses: Vec<String> = input
-        .map(|i| format!("input {} ({}, {} hold)", i.name, conversion(header, &i.unit), i.hold.name()))
-        .chain(measured.map(|m| format!("measurement of {} ({})", m.expr, conversion(header, &m.unit))))
-        .collect();
-    (!uses.is_empty()).then(|| uses.join(" and "))
-}
-
-/// How header units become the model's: `deg → rad`, or the one unit where they agree.
-fn conversion(header: Option<&str>, unit: &Unit) -> String {
-    match header {
-        Some(header) if header != unit.text => format!("{header} → {}", unit.text),
-        Some(_) => unit.text.clone(),
-        None => format!("taken as {}", unit.text),
-    }
-}
-
-fn describe(
-    recording: &Recording,
-    findings: Vec<Finding>,
-    feeds: impl Fn(&str, Option<&str>) -> Option<String>,
-) -> Health {
-    Health {
-        file: recording.name.clone(),
-        rows: recording.time.len(),
-        pieces: recording.pieces.len(),
-        dt_s: recording.dt(),
-        duration_s: recording.duration(),
-        channels: recording
-            .channels
-            .iter()
-            .map(|c| ChannelUse {
-                name: c.name.clone(),
-                unit: c.unit.clone(),
-                feeds: feeds(&c.name, c.unit.as_deref()),
-            })
-            .collect(),
-        findings,
-    }
-}
-
-/// The table of one recording: a verdict, the channels, then the findings, those that matter most first.
-fn in_words(health: &Health) -> String {
-    let count = |severity| health.findings.iter().filter(|f| f.severity == severity).count();
-    let verdict = match (count(Severity::Problem), count(Severity::Warning)) {
-        (0, 0) => "healthy".to_owned(),
-        (0, w) => format!("usable, {}", plural(w, "warning")),
-        (p, 0) => plural(p, "problem"),
-        (p, w) => format!("{}, {}", plural(p, "problem"), plural(w, "warning")),
-    };
-    let mut text = format!("{}: {verdict}\n", health.file);
-    let width = health.channels.iter().map(|c| c.name.chars().count()).max().unwrap_or(0);
-    for channel in &health.channels {
-        let unit = channel.unit.as_deref().map_or(String::new(), |u| format!("[{}]", format::unit(u)));
-        let feeds = channel.feeds.as_deref().unwrap_or_default();
-        let line = format!("  {:width$}  {unit:10}  {feeds}", channel.name);
-        let _ = writeln!(text, "{}", line.trim_end());
-    }
-    let mut ordered: Vec<&Finding> = health.findings.iter().collect();
-    ordered.sort_by_key(|f| std::cmp::Reverse(f.severity));
-    for finding in ordered {
-        text.push_str(&finding_in_words(finding));
-    }
-    text
-}
-
-/// One finding: severity, channel, sentence; the mend on a line of its own.
-pub(crate) fn finding_in_words(finding: &Finding) -> String {
-    let severity = finding.severity.to_string();
-    let channel = finding.channel.as_deref().map_or(String::new(), |c| format!("{c}: "));
-    let mut text = format!("  {severity:8} {channel}{}\n", finding.message);
-    if let Some(mend) = &finding.mend {
-        let _ = writeln!(text, "           mend: {mend}");
-    }
-    text
-}
-
-fn plural(count: usize, word: &str) -> String {
-    if count == 1 { format!("1 {word}") } else { format!("{count} {word}s") }
+    let checked = check::check(&recordings, model, &arguments.inputs)?;
+    Ok(Answer::new(check::story(&checked), check::to_json(model, &checked)))
 }

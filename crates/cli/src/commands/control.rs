@@ -1,38 +1,15 @@
 //! `greybox control`: from a model to a controller, its closed loop, and its law as code.
 
-use std::fmt::Write as _;
 use std::path::{Path, PathBuf};
 
 use clap::{Args, ValueEnum};
-use greybox_control::{
-    ClosedLoop, Controller, DesignOptions, Family, FamilyOptions, LoopOptions, Method, Metrics, Plant,
-    PlantOptions, Pole, Reference, Run, design,
-};
-use greybox_export::{Constant, Function, Group, Language, Member};
-use greybox_model::Model;
-use greybox_recording::write_csv;
-use greybox_report::contract::Producer;
-use greybox_report::convert::control::{self as convert, ControlSources};
-use greybox_report::{ControlPage, format, sentence};
-use serde_json::{Value, json};
+use greybox_commands::control::{self as commands, FILES, Request};
 
 use crate::answer::Answer;
 use crate::failure::Failure;
 use crate::loading;
 use crate::output::OutputFolder;
 use crate::progress::Progress;
-
-/// Files of a result and what they hold; the page names those beside it.
-const FILES: [(&str, &str); 6] = [
-    ("report.html", "this page"),
-    ("report.json", "its numbers"),
-    ("closed_loop.csv", "the simulated loop"),
-    ("law.c", "the law as C99"),
-    ("law.rs", "the law as Rust without the standard library"),
-    ("vectors.csv", "states and set points with the command that the code must give"),
-];
-/// States at which the exported code must agree, for each set point.
-const VECTORS: usize = 32;
 
 /// Design a controller for a model, simulate its closed loop, and write its law as code
 #[derive(Debug, Args)]
@@ -137,131 +114,39 @@ enum Way {
     Smc,
 }
 
-pub(crate) fn run(arguments: &Arguments) -> Result<Answer, Failure> {
-    let loaded = loading::model(&arguments.model)?;
-    let model = &loaded.model;
-    let out = OutputFolder::prepare(&arguments.out)?;
-    out.spares(&FILES.map(|(name, _)| name), [&arguments.model])?;
-    let refused = |e: greybox_control::ControlError| Failure::file(&arguments.model, e);
-
-    let plant = Plant::of(model, &input(arguments, model)?, &options(arguments)?).map_err(refused)?;
-    let tracked = match &arguments.track {
-        Some(name) => name.clone(),
-        None => plant.state_names().first().cloned().unwrap_or_default(),
-    };
-    let progress = Progress::steps(3);
-    progress.stage("designing");
-    let wanted = DesignOptions {
-        limit: arguments.limit,
-        compensate_friction: arguments.compensate_friction,
-        ..DesignOptions::new(&tracked, &[-arguments.to, arguments.to], arguments.dt)
-    };
-    let controller = design(&plant, &method(arguments), &wanted).map_err(refused)?;
-    progress.advance();
-    progress.stage("simulating");
-    let closed = ClosedLoop::new(model, &controller, &LoopOptions::default()).map_err(refused)?;
-    let reference = Reference::square(arguments.to, arguments.hold, 4);
-    let run = closed.run(&reference).map_err(refused)?;
-    progress.advance();
-    progress.stage("perturbing");
-    let deviations = match &arguments.report {
-        Some(path) => reported(path, model)?,
-        None => stated(model),
-    };
-    let family = if deviations.is_empty() || arguments.members == 0 {
-        None
-    } else {
-        let options = FamilyOptions {
-            deviations: deviations.clone(),
-            members: arguments.members,
-            seed: arguments.seed,
-        };
-        Some(closed.family(&reference, &options).map_err(refused)?)
-    };
-    progress.advance();
-    drop(progress);
-    let producer = Producer { version: env!("CARGO_PKG_VERSION").into(), seed: arguments.seed };
-    let page = convert::page(&ControlSources {
-        model_file: &loaded.file,
-        model,
-        controller: &controller,
-        run: &run,
-        family: family.as_ref().map(|f| (f, deviations.as_slice())),
-        producer: &producer,
-        files: &FILES[1..],
-    });
-
-    let function = function(model, &controller, &loaded.file);
-    let written = |e: greybox_export::ExportError| Failure::file(&arguments.model, e);
-    let (c, rust) =
-        (function.code(Language::C99).map_err(written)?, function.code(Language::Rust).map_err(written)?);
-    let vectors = vectors(&function, &controller, arguments.to).map_err(written)?;
-    let report = report(&page, &controller, &run, family.as_ref());
-    let closed_loop = series(&run)?;
-    let html = page.to_html().map_err(|e| Failure::internal(e.to_string()))?;
-    out.write(&[
-        ("report.html", html.as_bytes()),
-        ("report.json", format!("{report:#}\n").as_bytes()),
-        ("closed_loop.csv", &closed_loop),
-        ("law.c", c.as_bytes()),
-        ("law.rs", rust.as_bytes()),
-        ("vectors.csv", vectors.as_bytes()),
-    ])?;
-    Ok(Answer::new(in_words(arguments, &controller, &run, family.as_ref()), report))
-}
-
-/// Standard deviations that the model states.
-fn stated(model: &Model) -> Vec<(String, f64)> {
-    let free = model.parameters.iter().filter(|p| !p.fixed);
-    free.filter_map(|p| Some((p.name.clone(), p.std.filter(|s| *s > 0.0)?))).collect()
-}
-
-/// Standard deviations from the 95 % intervals of a report, SI.
-fn reported(path: &Path, model: &Model) -> Result<Vec<(String, f64)>, Failure> {
-    let text = std::fs::read_to_string(path)
-        .map_err(|e| Failure::file(path, format!("the report cannot be read: {e}")).mend("check the path"))?;
-    let report: Value = serde_json::from_str(&text).map_err(|e| {
-        Failure::file(path, format!("this is no report: {e}"))
-            .mend("give the report.json of `greybox diagnose`")
-    })?;
-    let mechanisms = report["mechanisms"].as_array().into_iter().flatten().map(|m| &m["parameters"]);
-    let tables: Vec<&Value> = [&report["parameters"]].into_iter().chain(mechanisms).collect();
-    let deviation = |name: &str| {
-        let interval = tables.iter().find_map(|t| t.get(name)?.get("ci95")?.as_array())?;
-        let (low, high) = (interval.first()?.as_f64()?, interval.get(1)?.as_f64()?);
-        Some((high - low) / (2.0 * 1.96))
-    };
-    let found: Vec<(String, f64)> = model
-        .parameters
-        .iter()
-        .filter_map(|p| {
-            let factor = p.unit.as_ref().map_or(1.0, |u| u.factor);
-            Some((p.name.clone(), deviation(&p.name).map(|d| d * factor).filter(|d| *d > 0.0)?))
-        })
-        .collect();
-    if found.is_empty() {
-        return Err(Failure::file(path, "no interval of this report belongs to a parameter of the model")
-            .mend("give the report.json that was written with the model"));
-    }
-    Ok(found)
-}
-
-/// The input that commands.
-fn input(arguments: &Arguments, model: &Model) -> Result<String, Failure> {
-    match (&arguments.input, model.inputs.as_slice()) {
-        (Some(name), _) => Ok(name.clone()),
-        (None, [only]) => Ok(only.name.clone()),
-        (None, []) => Err(Failure::file(&arguments.model, "the model has no input to command with")
-            .mend("state one under [inputs] and let it act in an equation")),
-        (None, several) => {
-            let names: Vec<&str> = several.iter().map(|i| i.name.as_str()).collect();
-            Err(Failure::file(&arguments.model, format!("the model has the inputs {}", names.join(", ")))
-                .mend("name the one that commands with `--input`; the others are held at zero"))
+impl From<Way> for commands::Way {
+    fn from(way: Way) -> commands::Way {
+        match way {
+            Way::Lqr => commands::Way::Lqr,
+            Way::Hjb => commands::Way::Hjb,
+            Way::Smc => commands::Way::Smc,
         }
     }
 }
 
-fn options(arguments: &Arguments) -> Result<PlantOptions, Failure> {
+pub(crate) fn run(arguments: &Arguments) -> Result<Answer, Failure> {
+    let loaded = loading::model(&arguments.model)?;
+    let out = OutputFolder::prepare(&arguments.out)?;
+    out.spares(&FILES.map(|(name, _)| name), [&arguments.model])?;
+    let request = request(arguments)?;
+    let report = arguments.report.as_deref().map(read_report).transpose()?;
+    let report = arguments.report.as_deref().zip(report.as_deref());
+    let progress = Progress::open();
+    let results = commands::control(&loaded, &request, report, &|what| progress.stage(what))?;
+    drop(progress);
+    out.write(&results.files())?;
+    let place = arguments.out.display();
+    let files: Vec<String> = FILES.iter().map(|(f, _)| format!("{place}/{f}")).collect();
+    let text = format!("{}Written: {}\n", results.story, files.join(", "));
+    Ok(Answer::new(text, results.json))
+}
+
+fn read_report(path: &Path) -> Result<String, Failure> {
+    std::fs::read_to_string(path)
+        .map_err(|e| Failure::file(path, format!("the report cannot be read: {e}")).mend("check the path"))
+}
+
+fn request(arguments: &Arguments) -> Result<Request, Failure> {
     let size = |text: &String| -> Result<(String, f64), Failure> {
         let parsed =
             text.rsplit_once('=').and_then(|(name, v)| Some((name.trim(), v.trim().parse::<f64>().ok()?)));
@@ -271,205 +156,23 @@ fn options(arguments: &Arguments) -> Result<PlantOptions, Failure> {
                 .mend("write it as NAME=VALUE with a positive number, such as `--size theta=0.5`")),
         }
     };
-    Ok(PlantOptions {
+    Ok(Request {
+        method: arguments.method.into(),
+        input: arguments.input.clone(),
+        track: arguments.track.clone(),
+        to: arguments.to,
         sizes: arguments.size.iter().map(size).collect::<Result<_, _>>()?,
         input_size: arguments.input_size,
+        limit: arguments.limit,
+        dt: arguments.dt,
+        hold: arguments.hold,
+        degree: arguments.degree,
+        lambda: arguments.lambda,
+        rate: arguments.rate,
+        eta: arguments.eta,
         ignore_time_terms: arguments.ignore_time_terms,
-        ..PlantOptions::default()
+        compensate_friction: arguments.compensate_friction,
+        members: arguments.members,
+        seed: arguments.seed,
     })
-}
-
-fn method(arguments: &Arguments) -> Method {
-    match arguments.method {
-        Way::Lqr => Method::Lqr,
-        Way::Hjb => Method::Hjb { degree: arguments.degree, domain: Vec::new() },
-        Way::Smc => {
-            let eta = arguments.eta.unwrap_or(10.0 * arguments.input_size);
-            Method::Smc { lambda: arguments.lambda, eta, phi: eta / arguments.rate }
-        }
-    }
-}
-
-/// The law as a function of the state and the set point.
-fn function(model: &Model, controller: &Controller, file: &str) -> Function {
-    let plant = controller.plant();
-    // Rates have no unit text of their own.
-    let member = |(name, primes): &(String, u8)| {
-        let unit = model.state(name).map_or("", |i| model.states[i].unit.text.as_str());
-        let unit = match (unit, primes) {
-            ("", _) => String::new(),
-            (unit, 0) => format!("SI of {unit}"),
-            (unit, 1) => format!("SI of {unit} per s"),
-            (unit, n) => format!("SI of {unit} per s^{n}"),
-        };
-        Member::new(name, *primes, &unit)
-    };
-    let parameter = |(name, value): &(String, f64)| {
-        let unit = model.parameter(name).and_then(|i| model.parameters[i].unit.as_ref());
-        Constant::new(name, *value, unit.map_or("", |u| u.text.as_str()))
-    };
-    let law = controller.law().first().cloned().unwrap_or(greybox_model::Expr::Num(0.0));
-    let (low, high) = controller.limits();
-    Function {
-        name: "control_law".into(),
-        summary: vec![
-            format!("{} law of {} for {}", controller.method().name(), plant.input_name(), model.name),
-            format!("Made by greybox {} from {file}.", env!("CARGO_PKG_VERSION")),
-            format!("Call it every {} s and hold the command; range {low} to {high}.", controller.dt()),
-        ],
-        arguments: vec![
-            Group { name: "state".into(), members: plant.symbols().iter().map(member).collect() },
-            Group {
-                name: "set_point".into(),
-                members: vec![member(&(controller.reference().to_owned(), 0))],
-            },
-        ],
-        constants: plant.parameters().iter().map(parameter).collect(),
-        outputs: vec![(format!("{}, SI", plant.input_name()), law)],
-    }
-}
-
-/// States around the set points, with the command that the code must give.
-fn vectors(
-    function: &Function,
-    controller: &Controller,
-    to: f64,
-) -> Result<String, greybox_export::ExportError> {
-    let plant = controller.plant();
-    let mut points = Vec::new();
-    for check in controller.checks() {
-        for k in 0..VECTORS {
-            // Evenly spread whatever the number of states: a Kronecker sequence of square roots of primes.
-            let roots = [2f64, 3.0, 5.0, 7.0, 11.0, 13.0, 17.0, 19.0, 23.0, 29.0, 31.0, 37.0];
-            let spread = |i: usize| 2.0 * (k as f64 * roots[i % roots.len()].sqrt()).fract() - 1.0;
-            let state = check.equilibrium.state.iter().zip(plant.sizes()).enumerate();
-            let mut point: Vec<f64> = state.map(|(i, (x, size))| x + size * spread(i)).collect();
-            point.push(if k % 2 == 0 { check.set_point } else { 0.5 * to });
-            points.push(point);
-        }
-    }
-    let mut text = plant.state_names().join(",");
-    let _ = writeln!(text, ",{},{}", controller.reference(), plant.input_name());
-    for vector in function.vectors(&points)? {
-        let numbers: Vec<String> =
-            vector.arguments.iter().chain(&vector.outputs).map(|v| format!("{v:?}")).collect();
-        let _ = writeln!(text, "{}", numbers.join(","));
-    }
-    Ok(text)
-}
-
-/// The closed loop as a table.
-fn series(run: &Run) -> Result<Vec<u8>, Failure> {
-    let mut columns: Vec<(&str, &[f64])> = vec![("set_point", &run.r), ("command", &run.u)];
-    columns.extend(run.states.iter().zip(&run.x).map(|(name, x)| (name.as_str(), x.as_slice())));
-    let mut csv = Vec::new();
-    write_csv(&mut csv, &run.t, &columns)?;
-    Ok(csv)
-}
-
-fn report(page: &ControlPage, controller: &Controller, run: &Run, family: Option<&Family>) -> Value {
-    let plant = controller.plant();
-    let (low, high) = controller.limits();
-    let limit = |v: f64| if v.is_finite() { json!(v) } else { Value::Null };
-    let checks: Vec<Value> = controller
-        .checks()
-        .iter()
-        .map(|c| {
-            let poles = |poles: &[Pole]| poles.iter().map(|p| [p.re, p.im]).collect::<Vec<_>>();
-            json!({
-                "set_point": c.set_point, "state": c.equilibrium.state, "command": c.equilibrium.input,
-                "poles": poles(&c.poles), "held_poles": poles(&c.held_poles), "spectral_radius": c.spectral_radius,
-            })
-        })
-        .collect();
-    let spread = |s: &greybox_control::Spread| json!({ "median": limit(s.median), "worst": limit(s.worst) });
-    json!({
-        "greybox": page.producer,
-        "model": page.model.file,
-        "verdict": page.verdict.name(),
-        "summary": sentence::control::summary(page),
-        "method": controller.method().name(),
-        "input": plant.input_name(),
-        "states": plant.state_names(),
-        "tracked": plant.state_names().get(controller.tracked()),
-        "dt": controller.dt(),
-        "limits": [limit(low), limit(high)],
-        "gains": controller.gains(),
-        "law": controller.law().iter().map(ToString::to_string).collect::<Vec<_>>(),
-        "checks": checks,
-        "left_out": plant.dropped().iter().map(|d| json!({
-            "equation": d.equation, "term": d.term.to_string(),
-        })).collect::<Vec<_>>(),
-        "closed_loop": {
-            "diverged": run.diverged.is_some(),
-            "set_points": run.metrics.iter().map(metrics).collect::<Vec<_>>(),
-        },
-        "family": family.map(|f| json!({
-            "members": f.members, "diverged": f.diverged, "settled": f.settled,
-            "settling": spread(&f.settling), "overshoot": spread(&f.overshoot),
-            "final_error": spread(&f.final_error), "largest_command": spread(&f.largest_command),
-        })),
-    })
-}
-
-fn metrics(m: &Metrics) -> Value {
-    json!({
-        "set_point": m.set_point, "settling": m.settling, "overshoot": m.overshoot,
-        "final_error": m.final_error, "rms_error": m.rms_error, "largest_command": m.largest_command,
-        "saturated": m.saturated, "effort": m.effort,
-    })
-}
-
-fn in_words(arguments: &Arguments, controller: &Controller, run: &Run, family: Option<&Family>) -> String {
-    let plant = controller.plant();
-    let tracked = plant.state_names().get(controller.tracked()).cloned().unwrap_or_default();
-    let mut text = format!(
-        "{} of {} for {tracked}, commanded by {} every {} s\n",
-        match arguments.method {
-            Way::Lqr => "Linear-quadratic regulator",
-            Way::Hjb => "Optimal law",
-            Way::Smc => "Sliding-mode law",
-        },
-        file_name(&arguments.model),
-        plant.input_name(),
-        format::number(controller.dt()),
-    );
-    for (name, gain) in plant.state_names().iter().zip(controller.gains()) {
-        let _ = writeln!(text, "  gain of {name}: {}", format::number(*gain));
-    }
-    for dropped in plant.dropped() {
-        let _ = writeln!(text, "  left out of {}: {}", dropped.equation, dropped.term);
-    }
-    for m in run.metrics.iter().skip(1) {
-        let settling =
-            m.settling.map_or("does not settle".into(), |s| format!("settles in {} s", format::number(s)));
-        let _ = writeln!(
-            text,
-            "  to {}: {settling}, overshoot {}, ends {} off, command up to {}",
-            format::number(m.set_point),
-            format::percent(m.overshoot),
-            format::number(m.final_error.abs()),
-            format::number(m.largest_command),
-        );
-    }
-    if let Some(at) = run.diverged {
-        let t = run.t.get(at).copied().unwrap_or_default();
-        let _ =
-            writeln!(text, "  warning: the simulated loop leaves every bound after {} s", format::number(t));
-    }
-    if let Some(f) = family {
-        let _ = writeln!(
-            text,
-            "  on {} perturbed plants: {} settle, {} diverge",
-            f.members, f.settled, f.diverged
-        );
-    }
-    let out = arguments.out.display();
-    let files: Vec<String> = FILES.iter().map(|(f, _)| format!("{out}/{f}")).collect();
-    let _ = writeln!(text, "Written: {}", files.join(", "));
-    text
-}
-
-fn file_name(path: &Path) -> String {
-    path.file_name().map_or_else(|| path.display().to_string(), |n| n.to_string_lossy().into_owned())
 }

@@ -1,16 +1,15 @@
 //! `greybox demo`: the whole story on an embedded recording.
 
-use std::path::PathBuf;
+use std::path::{Path, PathBuf};
 
 use clap::Args;
 use greybox_diagnose::Options;
-use greybox_model::Model;
 use greybox_recording::parse_csv;
 
 use crate::answer::Answer;
 use crate::commands::diagnose::{diagnose, written};
 use crate::failure::Failure;
-use crate::loading::LoadedModel;
+use crate::loading;
 use crate::output::OutputFolder;
 
 const MODEL: &str = include_str!("../../demo/rotary_link.toml");
@@ -43,8 +42,7 @@ pub(crate) fn run(arguments: &Arguments) -> Result<Answer, Failure> {
     if let Some(folder) = &out {
         folder.spares_other(&embedded)?;
     }
-    let model = Model::from_toml(MODEL, "rotary_link.toml").map_err(|e| Failure::internal(e.to_string()))?;
-    let loaded = LoadedModel { model, text: MODEL.to_owned(), file: "rotary_link.toml".to_owned() };
+    let loaded = loading::model_of(MODEL.to_owned(), Path::new("rotary_link.toml"))?;
     let train = [parse_csv(TRAIN, "rotary_link_train.csv")?];
     let holdout = [parse_csv(HOLDOUT, "rotary_link_test.csv")?];
     let results = diagnose(&loaded, &train, &holdout, &Options::default())?;
@@ -55,7 +53,7 @@ pub(crate) fn run(arguments: &Arguments) -> Result<Answer, Failure> {
     );
     match (&out, &arguments.out) {
         (Some(folder), Some(path)) => {
-            results.write_with(folder, &embedded)?;
+            folder.write(&[&results.files(), &embedded[..]].concat())?;
             text.push('\n');
             text.push_str(&written(path));
         }

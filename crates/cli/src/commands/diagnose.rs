@@ -5,18 +5,15 @@ mod folder;
 use std::path::{Path, PathBuf};
 
 use clap::Args;
-use greybox_diagnose::{Diagnosis, Options};
+use greybox_commands::diagnose::{FILES, Results};
+use greybox_diagnose::Options;
 use greybox_recording::Recording;
-use greybox_report::ReportError;
-use greybox_report::convert::{self, Sources};
 
 use crate::answer::Answer;
 use crate::arguments::ModelStudy;
 use crate::failure::Failure;
 use crate::loading::{self, LoadedModel, Mechanisms};
-use crate::output::OutputFolder;
 use crate::progress::Progress;
-use crate::story;
 
 /// Find what physics a model leaves out: what, where, how sure, and a model that fits
 #[derive(Debug, Args)]
@@ -51,9 +48,6 @@ pub(crate) struct Arguments {
 
 const BILLION: u64 = 1_000_000_000;
 
-/// The files of a diagnosis.
-const RESULTS: [&str; 3] = ["report.json", "report.html", "improved.toml"];
-
 impl Arguments {
     fn options(&self, own: Option<&Mechanisms>) -> Options {
         Options {
@@ -79,11 +73,11 @@ pub(crate) fn run(arguments: &Arguments) -> Result<Answer, Failure> {
         (_, None) => {}
     }
     let (loaded, recordings) = arguments.inputs.read()?;
-    let out = arguments.inputs.folder(&RESULTS)?;
-    out.spares(&RESULTS, own.iter().flat_map(|own| &own.files))?;
+    let out = arguments.inputs.folder(&FILES)?;
+    out.spares(&FILES, own.iter().flat_map(|own| &own.files))?;
     let options = arguments.options(own.as_ref());
     let results = diagnose(&loaded, &recordings.train, &recordings.holdout, &options)?;
-    results.write(&out)?;
+    out.write(&results.files())?;
     let tried = own.as_ref().map(tried).unwrap_or_default();
     let text = format!("{}{tried}\n{}", results.story, written(&arguments.inputs.study.out));
     Ok(Answer::new(text, results.json))
@@ -108,63 +102,6 @@ pub(crate) fn written(out: &Path) -> String {
     format!("Written: {0}/report.html, {0}/report.json, {0}/improved.toml\n", out.display())
 }
 
-/// A diagnosis as the files and words that users see.
-#[derive(Debug)]
-pub(crate) struct Results {
-    report_json: String,
-    report_html: String,
-    improved_toml: String,
-    /// The diagnosis in plain language.
-    pub(crate) story: String,
-    /// The content of `report.json`.
-    pub(crate) json: serde_json::Value,
-}
-
-impl Results {
-    /// Writes all files, or none.
-    ///
-    /// # Errors
-    /// As [`OutputFolder::write`].
-    pub(crate) fn write(&self, out: &OutputFolder) -> Result<(), Failure> {
-        self.write_with(out, &[])
-    }
-
-    /// Writes all files and `others`, or none.
-    ///
-    /// # Errors
-    /// As [`OutputFolder::write`].
-    pub(crate) fn write_with(&self, out: &OutputFolder, others: &[(&str, &[u8])]) -> Result<(), Failure> {
-        out.write(&[&self.files(), others].concat())
-    }
-
-    /// The files, by name.
-    fn files(&self) -> [(&'static str, &[u8]); 3] {
-        let [json, html, toml] = RESULTS;
-        [
-            (json, self.report_json.as_bytes()),
-            (html, self.report_html.as_bytes()),
-            (toml, self.improved_toml.as_bytes()),
-        ]
-    }
-
-    /// What is told of a finished diagnosis of these recordings.
-    fn of(
-        diagnosis: &Diagnosis,
-        loaded: &LoadedModel,
-        train: &[Recording],
-        holdout: &[Recording],
-    ) -> Result<Results, Failure> {
-        let sources = Sources { model_file: &loaded.file, model_text: &loaded.text, train, holdout };
-        let report = convert::report(diagnosis, &sources);
-        let report_json = report.to_json().map_err(unwritten)?;
-        let json = serde_json::from_str(&report_json).map_err(|e| unwritten(e.into()))?;
-        let story = story::diagnosis(&report);
-        let report_html = convert::page(diagnosis, report, &sources).to_html().map_err(unwritten)?;
-        let improved_toml = convert::improved_toml(diagnosis, &loaded.text);
-        Ok(Results { report_json, report_html, improved_toml, story, json })
-    }
-}
-
 /// Diagnoses a model, with a progress bar for those who wait.
 ///
 /// # Errors
@@ -179,8 +116,4 @@ pub(crate) fn diagnose(
     let diagnosis = greybox_diagnose::diagnose(&loaded.model, train, holdout, options, &progress)?;
     progress.stage("writing the report");
     Results::of(&diagnosis, loaded, train, holdout)
-}
-
-fn unwritten(error: ReportError) -> Failure {
-    Failure::internal(error.to_string())
 }

@@ -1,17 +1,16 @@
 //! `greybox identify`: the governing equations, from recordings alone.
 
 use clap::{Args, ValueEnum};
-use greybox_identify::{DelayedState, Identification, Library, Monomials, Options, Streamed};
+use greybox_commands::identify::{FILES, Results};
+use greybox_identify::{DelayedState, Library, Monomials, Options, Streamed};
 use greybox_model::Hold;
-use greybox_report::ReportError;
-use greybox_report::convert::identification::{self as convert, MODEL_FILE, Sources};
+use greybox_report::convert::identification::{MODEL_FILE, Sources};
 
 use crate::answer::Answer;
 use crate::arguments::{Recordings, Study};
 use crate::failure::Failure;
 use crate::loading;
 use crate::progress::Progress;
-use crate::story;
 
 /// Find the governing equations from recordings alone: which terms, their values, and how sure each is
 #[derive(Debug, Args)]
@@ -167,33 +166,13 @@ pub(crate) fn run(arguments: &Arguments) -> Result<Answer, Failure> {
     };
     progress.stage("writing the report");
     let sources = Sources { train: &recordings.train, holdout: &recordings.holdout, hold: options.hold };
-    let (files, answer) = results(&found, &sources, &arguments.study)?;
+    let results = Results::of(&found, &sources)?;
     drop(progress);
-    let files: Vec<(&str, &[u8])> = files.iter().map(|(name, text)| (*name, text.as_bytes())).collect();
-    out.write(&files)?;
-    Ok(answer)
-}
-
-/// What it writes.
-const FILES: [&str; 3] = ["report.json", "report.html", MODEL_FILE];
-
-/// Name and content of what a command writes.
-type Files = [(&'static str, String); 3];
-
-/// The files of an identification (name, content), and what the command says.
-fn results(found: &Identification, sources: &Sources<'_>, study: &Study) -> Result<(Files, Answer), Failure> {
-    let unwritten = |e: ReportError| Failure::internal(e.to_string());
-    let report = convert::report(found, sources);
-    let json_text = report.to_json().map_err(unwritten)?;
-    let json = serde_json::from_str(&json_text).map_err(|e| unwritten(e.into()))?;
-    let text = format!(
-        "{}\nWritten: {out}/report.html, {out}/report.json, {out}/{MODEL_FILE}\n",
-        story::identification(&report),
-        out = study.out.display()
-    );
-    let html = convert::page(found, report).to_html().map_err(unwritten)?;
-    let files = [("report.json", json_text), ("report.html", html), (MODEL_FILE, convert::model_toml(found))];
-    Ok((files, Answer::new(text, json)))
+    out.write(&results.files())?;
+    let told = arguments.study.out.display();
+    let text =
+        format!("{}\nWritten: {told}/report.html, {told}/report.json, {told}/{MODEL_FILE}\n", results.story);
+    Ok(Answer::new(text, results.json))
 }
 
 /// The request in the words of the library.

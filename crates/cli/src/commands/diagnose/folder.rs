@@ -7,19 +7,20 @@ use std::sync::atomic::{AtomicUsize, Ordering};
 use std::thread;
 
 use greybox_calibrate::Data;
+use greybox_commands::diagnose::{FILES, Results};
 use greybox_diagnose::{Options, Quiet};
 use greybox_recording::Rename;
 use greybox_report::contract::{ModelId, Producer};
 use greybox_report::summary::Statistics;
-use greybox_report::{Report, merge};
+use greybox_report::{Report, ReportError, merge};
 use serde_json::json;
 
-use super::{Arguments, RESULTS, Results, tried, unwritten};
+use super::{Arguments, tried};
 use crate::answer::Answer;
 use crate::done::{self, Done, Fingerprint, Inputs};
 use crate::failure::Failure;
-use crate::loading::{self, LoadedModel, Mechanisms};
-use crate::output::{OutputFolder, same_file};
+use crate::loading::{self, LoadedModel, Mechanisms, same_file};
+use crate::output::OutputFolder;
 use crate::progress::Progress;
 use crate::story;
 
@@ -64,7 +65,7 @@ pub(super) fn run(arguments: &Arguments, folder: &Path, own: Option<&Mechanisms>
     out.spares(&SUMMARY, inputs())?;
     let tasks = tasks(&recordings, place)?;
     for task in &tasks {
-        task.out.spares(&[&RESULTS as &[&str], &[done::FILE]].concat(), inputs())?;
+        task.out.spares(&[&FILES as &[&str], &[done::FILE]].concat(), inputs())?;
     }
     let batch = Batch {
         loaded,
@@ -193,7 +194,7 @@ impl Batch<'_> {
     /// As a diagnosis of this recording alone.
     fn diagnosed(&self, task: &Task) -> Result<Diagnosed, Failure> {
         let inputs = self.inputs(&task.recording)?;
-        let [json_name, html_name, _] = RESULTS;
+        let [json_name, html_name, _] = FILES;
         let told = |json: &str| {
             let page = format!("{}/{html_name}", task.name);
             let name = loading::file_name(&task.recording);
@@ -211,7 +212,7 @@ impl Batch<'_> {
         let results = Results::of(&diagnosis, &self.loaded, &train, &holdout)?;
         let done = serde_json::to_string_pretty(&Done::new(inputs, &results.files()))
             .map_err(|e| unwritten(e.into()))?;
-        results.write_with(&task.out, &[(done::FILE, done.as_bytes())])?;
+        task.out.write(&[&results.files()[..], &[(done::FILE, done.as_bytes())]].concat())?;
         Ok(Diagnosed { statistics: told(&results.report_json).map_err(unwritten)?, before: false })
     }
 
@@ -239,4 +240,8 @@ impl Batch<'_> {
             mechanisms: self.mechanisms.clone(),
         })
     }
+}
+
+fn unwritten(error: ReportError) -> Failure {
+    Failure::internal(error.to_string())
 }

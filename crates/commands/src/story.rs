@@ -10,7 +10,7 @@ use greybox_report::summary::{Spread, Summary};
 use greybox_report::{expression, format, sentence};
 
 /// The story of a diagnosis: the conclusion, the mechanisms with their rivals, the fit, and what to know.
-pub(crate) fn diagnosis(report: &Report) -> String {
+pub fn diagnosis(report: &Report) -> String {
     let mut text = String::new();
     let written = sentence::summary(report);
     for line in if report.summary.is_empty() { &written } else { &report.summary } {
@@ -27,7 +27,7 @@ pub(crate) fn diagnosis(report: &Report) -> String {
 }
 
 /// The story of an identification: the equations, how well they predict, the doubts, and every term.
-pub(crate) fn identification(report: &IdentifyReport) -> String {
+pub fn identification(report: &IdentifyReport) -> String {
     let mut text = String::new();
     for line in &report.summary {
         let _ = writeln!(text, "{line}");
@@ -53,7 +53,7 @@ pub(crate) fn identification(report: &IdentifyReport) -> String {
 }
 
 /// The story of many recordings: the conclusion, the verdict on each, the errors over all, and what failed.
-pub(crate) fn summary(summary: &Summary) -> String {
+pub fn summary(summary: &Summary) -> String {
     let mut text = String::new();
     for line in &summary.summary {
         let _ = writeln!(text, "{line}");
@@ -148,7 +148,7 @@ fn mechanism_in_words(number: usize, mechanism: &Mechanism) -> String {
 }
 
 /// Free-run errors of the models there are, one row per role and channel.
-pub(crate) fn fit_table(fit: &Fit, noise_floor: &Ordered<f64>) -> String {
+pub fn fit_table(fit: &Fit, noise_floor: &Ordered<f64>) -> String {
     let improved = !(fit.train.improved.is_empty() && fit.holdout.improved.is_empty());
     let mut rows = vec![vec!["".to_owned(), "nominal".to_owned(), "calibrated".to_owned()]];
     rows[0].extend(improved.then(|| "improved".to_owned()));
@@ -175,7 +175,7 @@ fn percent(score: Option<&Score>) -> String {
 }
 
 /// The parameters before and after.
-pub(crate) fn parameter_table(parameters: &Ordered<Parameter>) -> String {
+pub fn parameter_table(parameters: &Ordered<Parameter>) -> String {
     let mut rows = vec![["", "nominal", "calibrated", ""].map(str::to_owned).to_vec()];
     for (name, p) in parameters {
         let value = match p.fixed {
@@ -189,7 +189,7 @@ pub(crate) fn parameter_table(parameters: &Ordered<Parameter>) -> String {
 }
 
 /// What a reader must know of the data, one line each; mere facts stay in the report.
-pub(crate) fn notes(findings: &[Finding]) -> String {
+pub fn notes(findings: &[Finding]) -> String {
     let mut text = String::new();
     for finding in findings.iter().filter(|f| f.severity > Severity::Info) {
         let place = [finding.recording.as_deref(), finding.channel.as_deref()];

@@ -9,26 +9,36 @@ use greybox_model::{Model, Problem};
 use greybox_recording::{CsvBlocks, EXTENSIONS, Recording, RecordingError, Rename};
 
 use crate::failure::Failure;
-use crate::output::same_file;
 
 /// A model and the text it was read from.
 #[derive(Debug)]
-pub(crate) struct LoadedModel {
-    pub(crate) model: Model,
-    pub(crate) text: String,
+pub struct LoadedModel {
+    /// The model.
+    pub model: Model,
+    /// Its text.
+    pub text: String,
+    /// Where it was read, as errors name it.
+    pub path: PathBuf,
     /// File name without its folder.
-    pub(crate) file: String,
+    pub file: String,
 }
 
 /// Reads the model at `path`.
 ///
 /// # Errors
 /// Bad input: no such file, a folder, a recording in its place, or a fault in the model.
-pub(crate) fn model(path: &Path) -> Result<LoadedModel, Failure> {
-    let text = read_text(path)?;
+pub fn model(path: &Path) -> Result<LoadedModel, Failure> {
+    model_of(read_text(path)?, path)
+}
+
+/// The model in `text`, which errors say stands at `path`.
+///
+/// # Errors
+/// Bad input: a recording in its place, or a fault in the model.
+pub fn model_of(text: String, path: &Path) -> Result<LoadedModel, Failure> {
     let label = path.display().to_string();
     match Model::from_toml(&text, &label) {
-        Ok(model) => Ok(LoadedModel { model, file: file_name(path), text }),
+        Ok(model) => Ok(LoadedModel { model, file: file_name(path), path: path.to_owned(), text }),
         Err(error)
             if matches!(error.problem(), Problem::Toml { .. }) && looks_like_recording(path, &text) =>
         {
@@ -57,19 +67,20 @@ fn read_text(path: &Path) -> Result<String, Failure> {
 
 /// The built-in mechanisms and those of a folder.
 #[derive(Debug)]
-pub(crate) struct Mechanisms {
-    pub(crate) library: Library,
+pub struct Mechanisms {
+    /// All of them.
+    pub library: Library,
     /// The files of the folder.
-    pub(crate) files: Vec<PathBuf>,
+    pub files: Vec<PathBuf>,
     /// Name and text of each.
-    pub(crate) texts: Vec<(String, String)>,
+    pub texts: Vec<(String, String)>,
 }
 
 /// Adds every `*.toml` of the folder, in the order of their names, to the built-in library.
 ///
 /// # Errors
 /// Bad input: no such folder, no mechanism in it, or a fault in one.
-pub(crate) fn mechanisms(folder: &Path) -> Result<Mechanisms, Failure> {
+pub fn mechanisms(folder: &Path) -> Result<Mechanisms, Failure> {
     if folder.is_file() {
         return Err(Failure::file(folder, "this is a file, but `--mechanisms` takes a folder")
             .mend("name the folder that holds the mechanism files"));
@@ -91,7 +102,7 @@ pub(crate) fn mechanisms(folder: &Path) -> Result<Mechanisms, Failure> {
 ///
 /// # Errors
 /// Bad input: as [`files_of`], or no recording in it.
-pub(crate) fn recordings_of(folder: &Path) -> Result<Vec<PathBuf>, Failure> {
+pub fn recordings_of(folder: &Path) -> Result<Vec<PathBuf>, Failure> {
     let recordings = files_of(folder, &EXTENSIONS)?;
     if recordings.is_empty() {
         let endings = EXTENSIONS.map(|e| format!("`*.{e}`")).join(", ");
@@ -105,7 +116,7 @@ pub(crate) fn recordings_of(folder: &Path) -> Result<Vec<PathBuf>, Failure> {
 ///
 /// # Errors
 /// Bad input: no such folder, or one that cannot be read.
-pub(crate) fn files_of(folder: &Path, extensions: &[&str]) -> Result<Vec<PathBuf>, Failure> {
+pub fn files_of(folder: &Path, extensions: &[&str]) -> Result<Vec<PathBuf>, Failure> {
     let entries = fs::read_dir(folder).map_err(|e| match e.kind() {
         ErrorKind::NotFound => {
             Failure::file(folder, "no such folder").mend("check the path and the spelling")
@@ -135,7 +146,7 @@ fn has_extension(path: &Path, wanted: &str) -> bool {
 }
 
 /// Name of a file without its folder.
-pub(crate) fn file_name(path: &Path) -> String {
+pub fn file_name(path: &Path) -> String {
     path.file_name().map_or_else(|| path.display().to_string(), |n| n.to_string_lossy().into_owned())
 }
 
@@ -145,7 +156,7 @@ pub(crate) fn file_name(path: &Path) -> String {
 /// # Errors
 /// Bad input: a file that is missing, a model or a folder in its place, one named twice, any fault in it, or a channel
 /// to rename that it does not have.
-pub(crate) fn recordings(paths: &[PathBuf], map: &[Rename]) -> Result<Vec<Recording>, Failure> {
+pub fn recordings(paths: &[PathBuf], map: &[Rename]) -> Result<Vec<Recording>, Failure> {
     no_twins(paths)?;
     let mut read = Vec::with_capacity(paths.len());
     for path in paths {
@@ -161,7 +172,7 @@ pub(crate) fn recordings(paths: &[PathBuf], map: &[Rename]) -> Result<Vec<Record
 ///
 /// # Errors
 /// Bad input: the second of the two.
-pub(crate) fn no_twins<'a>(paths: impl IntoIterator<Item = &'a PathBuf>) -> Result<(), Failure> {
+pub fn no_twins<'a>(paths: impl IntoIterator<Item = &'a PathBuf>) -> Result<(), Failure> {
     let mut seen: Vec<&PathBuf> = Vec::new();
     for path in paths {
         if let Some(twin) = seen.iter().find(|twin| **twin == path || same_file(twin, path)) {
@@ -188,7 +199,7 @@ fn unreadable(path: &Path, error: RecordingError) -> Failure {
 ///
 /// # Errors
 /// As [`recordings`], and for a recording that is no CSV; what is wrong with a block comes in its place.
-pub(crate) fn blocks(
+pub fn blocks(
     paths: &[PathBuf],
     rows: usize,
     map: &[Rename],
@@ -209,7 +220,7 @@ pub(crate) fn blocks(
 }
 
 /// How the recording at `path` is called among those at `paths`: by its file name, unless another has it too.
-pub(crate) fn called(path: &Path, paths: &[PathBuf]) -> String {
+pub fn called(path: &Path, paths: &[PathBuf]) -> String {
     let name = file_name(path);
     match paths.iter().any(|other| other != path && file_name(other) == name) {
         true => path.display().to_string(),
@@ -221,7 +232,7 @@ pub(crate) fn called(path: &Path, paths: &[PathBuf]) -> String {
 ///
 /// # Errors
 /// As [`recordings`].
-pub(crate) fn train_and_holdout(
+pub fn train_and_holdout(
     train: &[PathBuf],
     holdout: &[PathBuf],
     map: &[Rename],
@@ -230,4 +241,12 @@ pub(crate) fn train_and_holdout(
     let mut train_recordings = recordings(&paths, map)?;
     let held = train_recordings.split_off(train.len());
     Ok((train_recordings, held))
+}
+
+/// Whether both paths lead to one existing file.
+pub fn same_file(a: &Path, b: &Path) -> bool {
+    match (fs::canonicalize(a), fs::canonicalize(b)) {
+        (Ok(a), Ok(b)) => a == b,
+        _ => false,
+    }
 }

@@ -1,0 +1,183 @@
+//! A calibration as files and words.
+
+use greybox_calibrate::{Data, Score};
+use greybox_diagnose::Calibration;
+use greybox_diagnose::diagnosis::ParameterChange;
+use greybox_model::{Model, WriteOptions};
+use greybox_recording::{Recording, Severity};
+use greybox_report::contract::{self, FitSet, Interval, ModelId, Ordered, Parameter, Producer};
+use greybox_report::convert::calibrated_recordings;
+use greybox_report::page;
+use serde::Serialize;
+
+use crate::check::check_for_model;
+use crate::failure::Failure;
+use crate::loading::LoadedModel;
+use crate::story;
+
+/// The files of a calibration.
+pub const FILES: [&str; 2] = ["model.toml", "report.json"];
+
+/// A calibration as the files and words that users see.
+#[derive(Debug)]
+pub struct Results {
+    /// `report.json`.
+    pub report_json: String,
+    /// `model.toml`.
+    pub model_toml: String,
+    /// The calibration in plain language.
+    pub story: String,
+    /// The content of `report.json`.
+    pub json: serde_json::Value,
+    /// The recordings beside the free runs of the nominal and the calibrated model.
+    pub recordings: Vec<page::Recording>,
+}
+
+impl Results {
+    /// What is told of a finished calibration on these recordings.
+    ///
+    /// # Errors
+    /// An internal failure where the report cannot be written.
+    pub fn of(
+        calibration: &Calibration,
+        loaded: &LoadedModel,
+        train: &[Recording],
+        holdout: &[Recording],
+    ) -> Result<Results, Failure> {
+        let findings = findings(&loaded.model, train.iter().chain(holdout));
+        let report = report(loaded, calibration, findings);
+        let options = WriteOptions { original: Some(&loaded.text), ..Default::default() };
+        let model_toml = calibration.model.to_toml(&options);
+        let json =
+            serde_json::to_value(&report).map_err(|e| Failure::internal(format!("report.json: {e}")))?;
+        let recordings = calibrated_recordings(calibration);
+        Ok(Results {
+            report_json: format!("{json:#}\n"),
+            model_toml,
+            story: in_words(&report),
+            json,
+            recordings,
+        })
+    }
+
+    /// The files, by name.
+    pub fn files(&self) -> [(&'static str, &[u8]); 2] {
+        let [model, json] = FILES;
+        [(model, self.model_toml.as_bytes()), (json, self.report_json.as_bytes())]
+    }
+}
+
+/// Sees that a parameter may move.
+///
+/// # Errors
+/// Bad input where every parameter is fixed.
+pub fn has_free_parameter(loaded: &LoadedModel) -> Result<(), Failure> {
+    if loaded.model.parameters.iter().all(|p| p.fixed) {
+        return Err(Failure::file(
+            &loaded.path,
+            "every parameter is fixed, so there is nothing to calibrate",
+        )
+        .mend("take `fixed = true` from the parameters that may move"));
+    }
+    Ok(())
+}
+
+/// `report.json` of a calibration: the keys are those of a diagnosis, without its verdict.
+#[derive(Debug, Serialize)]
+struct Report {
+    greybox: Producer,
+    model: ModelId,
+    parameters: Ordered<Parameter>,
+    fit: contract::Fit,
+    noise_floor: Ordered<f64>,
+    findings: Vec<contract::Finding>,
+}
+
+fn report(loaded: &LoadedModel, calibration: &Calibration, findings: Vec<contract::Finding>) -> Report {
+    let data = &calibration.data;
+    let fit_set = |(nominal, calibrated): &(Vec<Score>, Vec<Score>)| FitSet {
+        nominal: scores(data, nominal),
+        calibrated: scores(data, calibrated),
+        improved: Ordered::new(),
+    };
+    let floor = data.sigma.iter().zip(&data.spread).map(|(sigma, spread)| sigma / spread);
+    Report {
+        greybox: Producer { version: env!("CARGO_PKG_VERSION").to_owned(), seed: 0 },
+        model: ModelId { name: loaded.model.name.clone(), file: loaded.file.clone() },
+        parameters: parameters(&loaded.model, &calibration.parameters),
+        fit: contract::Fit {
+            train: fit_set(&calibration.train),
+            holdout: fit_set(&calibration.holdout),
+            window_s: Some(calibration.window),
+            holdout_source: calibration.holdout_source.clone(),
+            recordings: Ordered::new(),
+        },
+        noise_floor: data.channels.iter().map(|c| c.name.clone()).zip(floor).collect(),
+        findings,
+    }
+}
+
+/// Health findings of at least a warning.
+fn findings<'a>(model: &Model, recordings: impl Iterator<Item = &'a Recording>) -> Vec<contract::Finding> {
+    recordings
+        .flat_map(|recording| {
+            check_for_model(recording, model).into_iter().filter_map(|f| {
+                let severity = match f.severity {
+                    Severity::Info => return None,
+                    Severity::Warning => contract::Severity::Warning,
+                    Severity::Problem => contract::Severity::Error,
+                };
+                Some(contract::Finding {
+                    severity,
+                    code: f.code.to_owned(),
+                    recording: Some(recording.name.clone()),
+                    channel: f.channel,
+                    message: f.message,
+                    mend: f.mend,
+                })
+            })
+        })
+        .collect()
+}
+
+/// Scores by channel, in the units of the model.
+fn scores(data: &Data, scores: &[Score]) -> Ordered<contract::Score> {
+    let finite = |v: f64| Some(v).filter(|v| v.is_finite());
+    let score = |s: &Score, factor: f64| contract::Score {
+        nrmse: s.nrmse,
+        rmse: finite(s.rmse / factor),
+        nrmse_windowed: finite(s.nrmse_windowed),
+        rmse_windowed: finite(s.rmse_windowed / factor),
+    };
+    data.channels.iter().zip(scores).map(|(c, s)| (c.name.clone(), score(s, c.factor))).collect()
+}
+
+/// The parameters before and after, in the units of the model file.
+fn parameters(model: &Model, changes: &[ParameterChange]) -> Ordered<Parameter> {
+    changes
+        .iter()
+        .filter_map(|change| {
+            let p = model.parameters.get(change.index)?;
+            let factor = p.unit.as_ref().map_or(1.0, |u| u.factor);
+            let parameter = Parameter {
+                nominal: change.nominal / factor,
+                value: change.calibrated.value / factor,
+                ci95: change.calibrated.ci95.map(|(low, high)| Interval::new(low / factor, high / factor)),
+                unit: p.unit.as_ref().map(|u| u.text.clone()),
+                fixed: p.fixed,
+                calibrated: None,
+                calibrated_ci95: None,
+            };
+            Some((p.name.clone(), parameter))
+        })
+        .collect()
+}
+
+fn in_words(report: &Report) -> String {
+    format!(
+        "{}{}{}",
+        story::parameter_table(&report.parameters),
+        story::fit_table(&report.fit, &report.noise_floor),
+        story::notes(&report.findings),
+    )
+}

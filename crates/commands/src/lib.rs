@@ -1,0 +1,17 @@
+//! What the commands do with what was read, for the command line and for Python.
+//!
+//! A module a command: from a finished piece of work of the libraries to files, words and JSON. [`loading`] reads models
+//! and recordings, [`Failure`] is the one error, [`story`] tells reports in plain language. Nothing here prints, knows a
+//! command line or writes a file, so that the command and the Python package give the same answer.
+
+pub mod calibrate;
+pub mod check;
+pub mod control;
+pub mod diagnose;
+mod failure;
+pub mod identify;
+pub mod loading;
+pub mod simulate;
+pub mod story;
+
+pub use failure::Failure;
