@@ -141,7 +141,11 @@ pub(crate) fn run(root: &Path, arguments: &Arguments) -> Result<Ending> {
         bail!("--write-docs needs --peers or --scale");
     }
     let python = if arguments.peers {
-        Some(peer::environment(root, &target.join("bench").join("python"), &[])?)
+        Some(peer::environment(
+            &root.join("bench").join("requirements.txt"),
+            &target.join("bench").join("python"),
+            &[],
+        )?)
     } else {
         None
     };

@@ -6,6 +6,7 @@
 mod bench;
 mod demo;
 mod docs;
+mod package;
 mod process;
 mod prove;
 mod readme;
@@ -42,6 +43,8 @@ enum Task {
     },
     /// Make a Python with NumPy and SciPy, as bench/requirements.txt pins them, and print its path for $GREYBOX_PYTHON
     Python,
+    /// Build the wheel of the Python package, install it in an environment of its own, and run its tests and notebooks
+    PythonPackage,
     /// Run what the continuous integration runs (.ci/run)
     Ci,
     /// Print the commands of the README's block behind `<!-- MARKER -->`
@@ -69,6 +72,7 @@ fn main() -> ExitCode {
         Task::Bench(arguments) => bench::run(&root(), &arguments),
         Task::Docs { check } => docs::run(&root(), check),
         Task::Python => python(&root()),
+        Task::PythonPackage => package::run(&root()),
         Task::Ci => ci(&root()),
         Task::ReadmeCommand { marker } => print_command(&root(), &marker),
     };
@@ -91,7 +95,8 @@ fn root() -> PathBuf {
 
 fn python(root: &Path) -> Result<Ending> {
     let folder = process::target(root).join("python");
-    println!("{}", bench::peer::environment(root, &folder, &["numpy", "scipy"])?.display());
+    let list = root.join("bench").join("requirements.txt");
+    println!("{}", bench::peer::environment(&list, &folder, &["numpy", "scipy"])?.display());
     Ok(Ending::Done)
 }
 

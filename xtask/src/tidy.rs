@@ -246,3 +246,32 @@ fn models_and_mechanisms_in_the_book_load() {
     }
     assert!(loaded >= 5, "only {loaded} examples were found");
 }
+
+/// Name and version of every package of a lock file.
+fn locked(path: &Path) -> BTreeSet<(String, String)> {
+    let text = |package: &Value, key: &str| package[key].as_str().unwrap_or_default().to_owned();
+    let lock = manifest(path);
+    lock["package"].as_array().unwrap().iter().map(|p| (text(p, "name"), text(p, "version"))).collect()
+}
+
+#[test]
+fn the_python_package_has_the_dependencies_of_the_command() {
+    let ours = locked(&root().join("Cargo.lock"));
+    let names: BTreeSet<&String> = ours.iter().map(|(name, _)| name).collect();
+    let package = locked(&root().join("python").join("Cargo.lock"));
+    let strays: Vec<_> = package.iter().filter(|p| names.contains(&p.0) && !ours.contains(p)).collect();
+    assert!(strays.is_empty(), "python/Cargo.lock: other versions than Cargo.lock: {strays:?}");
+}
+
+#[test]
+fn the_python_package_is_the_version_of_the_workspace() {
+    let workspace = manifest(&root().join("Cargo.toml"));
+    let package = manifest(&root().join("python").join("Cargo.toml"));
+    for key in ["version", "edition", "rust-version", "license"] {
+        assert_eq!(
+            package["package"][key], workspace["workspace"]["package"][key],
+            "python/Cargo.toml: {key}"
+        );
+    }
+    assert_eq!(package["profile"]["release"]["lto"], workspace["profile"]["release"]["lto"]);
+}

@@ -10,11 +10,10 @@ use serde::Deserialize;
 
 use super::case::{Answer, Case};
 
-/// The interpreter of the environment in `folder` with the packages of `requirements.txt`, those in `only` where it names
-/// some. It is made (again) when they are not what it was made from.
-pub(crate) fn environment(root: &Path, folder: &Path, only: &[&str]) -> Result<PathBuf> {
-    let list = root.join("bench").join("requirements.txt");
-    let pinned = fs::read_to_string(&list).with_context(|| format!("{} cannot be read", list.display()))?;
+/// The interpreter of the environment in `folder` with the packages of a `requirements.txt`, those in `only` where it
+/// names some. It is made (again) when they are not what it was made from.
+pub(crate) fn environment(list: &Path, folder: &Path, only: &[&str]) -> Result<PathBuf> {
+    let pinned = fs::read_to_string(list).with_context(|| format!("{} cannot be read", list.display()))?;
     let named =
         |line: &&str| only.is_empty() || line.split("==").next().is_some_and(|name| only.contains(&name));
     let packages: Vec<&str> = pinned.lines().filter(named).collect();

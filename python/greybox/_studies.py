@@ -1,0 +1,297 @@
+"""The commands as functions."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from typing import Union
+
+from . import _native
+from ._inputs import ModelLike, RecordingLike, model as native, recordings, renames
+from ._results import Calibration, Control, Diagnosis, Health, Identification, Simulation
+
+Recordings = Union[RecordingLike, Iterable[RecordingLike]]
+#: Hears what is being done. An exception that it raises ends the work.
+Progress = Callable[[str], object]
+
+
+def diagnose(
+    model: ModelLike,
+    train: Recordings,
+    holdout: Recordings | None = None,
+    *,
+    units: Mapping[str, str] | None = None,
+    map: Mapping[str, str] | None = None,
+    seed: int = 0,
+    work: int | None = None,
+    mechanisms: str | os.PathLike[str] | None = None,
+    progress: Progress | None = None,
+) -> Diagnosis:
+    """Finds what physics a model leaves out: what, where, how sure, and a model that fits.
+
+    Args:
+        model: the nominal model.
+        train: the recordings to choose and fit with.
+        holdout: recordings that only judge the result; without any, the last fifth of each recording is held out.
+        units: unit of each channel that states none, such as ``{"theta": "deg"}``.
+        map: channel for a name of the model, such as ``{"theta": "sensor_3 [deg]"}``.
+        seed: echoed into the report; the same seed and inputs give the same result.
+        work: most work of the search, in billions of operations.
+        mechanisms: folder of mechanisms of your own (``*.toml``), tried beside the built-in ones.
+        progress: hears what is being done.
+
+    Raises:
+        InputError: the model, a recording or an argument is wrong.
+
+    A mass that slides on a table whose friction the model leaves out:
+
+    >>> import numpy as np, greybox
+    >>> t = np.arange(1500) / 100
+    >>> f = 2 * np.sin(1.3 * t) + 1.5 * np.sin(3.1 * t)
+    >>> x, v, xs = 0.0, 0.0, []
+    >>> for force in f:
+    ...     xs.append(x)
+    ...     for _ in range(20):                           # truth: 2 x'' + 3 x' + 8 x + 0.6 sign(x') = f
+    ...         v += 0.0005 * (force - 3 * v - 8 * x - 0.6 * np.tanh(v / 1e-3)) / 2
+    ...         x += 0.0005 * v
+    >>> nominal = '''
+    ... [inputs]
+    ... f = { unit = "N", hold = "zero" }
+    ... [states]
+    ... x = { unit = "m" }
+    ... [parameters]
+    ... m = { value = 2, unit = "kg", fixed = true }
+    ... b = { value = 2, unit = "N s/m" }
+    ... k = { value = 8, unit = "N/m" }
+    ... [equations]
+    ... cart = "m*x'' + b*x' + k*x = f"
+    ... '''
+    >>> noise = 1e-4 * np.random.default_rng(1).standard_normal(len(t))
+    >>> found = greybox.diagnose(nominal, {"t": t, "x [m]": xs + noise, "f [N]": f})
+    >>> found.verdict
+    'missing_physics'
+    >>> found.mechanisms[0].family
+    'friction'
+    """
+    return Diagnosis(
+        _native.diagnose(
+            native(model),
+            recordings(train, "train", units),
+            recordings(holdout, "holdout", units),
+            renames(map),
+            seed,
+            work,
+            mechanisms,
+            progress,
+        )
+    )
+
+
+def identify(
+    train: Recordings,
+    states: str | Sequence[str],
+    inputs: str | Sequence[str] = (),
+    holdout: Recordings | None = None,
+    *,
+    units: Mapping[str, str] | None = None,
+    map: Mapping[str, str] | None = None,
+    order: int | None = None,
+    library: Sequence[str] = (),
+    terms: Sequence[str] = (),
+    derivatives: int = 2,
+    hold: str | None = None,
+    delay: str | None = None,
+    gain: float | None = None,
+    longest: float = 1.0,
+    replicates: int = 100,
+    seed: int = 0,
+    progress: Progress | None = None,
+) -> Identification:
+    """Finds the governing equations from recordings alone: which terms, their values, and how sure each is.
+
+    Args:
+        train, holdout, units, map, progress: as of :func:`diagnose`.
+        states: channels that are the coordinates, one equation each.
+        inputs: channels that drive the machine; the first sets the scale of the equations.
+        order: highest order of the library; 6 for one state, 4 for several.
+        library: one of ``tensor``, ``total``, ``separate``, and any of ``constant``, ``friction``, ``trigonometric``.
+        terms: candidate terms of your own, such as ``"x'*abs(x')"``.
+        derivatives: order of the leading derivative: 2 for mechanics, 1 for first-order systems.
+        hold: what the inputs do between samples; found from the recordings where none is given.
+        delay: state that is also fed back with an unknown delay, ``gain`` where its gain is known, ``longest`` (s) how
+            far to look.
+        replicates: resampled data sets behind the inclusion probabilities.
+        seed: of every random choice.
+    """
+    wanted = {
+        "states": [states] if isinstance(states, str) else list(states),
+        "inputs": [inputs] if isinstance(inputs, str) else list(inputs),
+        "order": order,
+        "library": [library] if isinstance(library, str) else list(library),
+        "terms": [terms] if isinstance(terms, str) else list(terms),
+        "derivatives": derivatives,
+        "hold": hold,
+        "delay": delay,
+        "gain": gain,
+        "longest": longest,
+        "replicates": replicates,
+        "seed": seed,
+    }
+    return Identification(
+        _native.identify(
+            recordings(train, "train", units),
+            recordings(holdout, "holdout", units),
+            renames(map),
+            wanted,
+            progress,
+        )
+    )
+
+
+def calibrate(
+    model: ModelLike,
+    train: Recordings,
+    holdout: Recordings | None = None,
+    *,
+    units: Mapping[str, str] | None = None,
+    map: Mapping[str, str] | None = None,
+    progress: Progress | None = None,
+) -> Calibration:
+    """Refits the parameters of a model, its equations unchanged, with uncertainties.
+
+    The arguments are those of :func:`diagnose`.
+    """
+    return Calibration(
+        _native.calibrate(
+            native(model),
+            recordings(train, "train", units),
+            recordings(holdout, "holdout", units),
+            renames(map),
+            progress,
+        )
+    )
+
+
+def simulate(
+    model: ModelLike,
+    recording: RecordingLike,
+    *,
+    units: Mapping[str, str] | None = None,
+    map: Mapping[str, str] | None = None,
+    progress: Progress | None = None,
+) -> Simulation:
+    """Simulates a model on the inputs of a recording, from the initial state estimated on its first quarter."""
+    (one,) = recordings([recording], "recording", units)
+    return Simulation(_native.simulate(native(model), one, renames(map), progress))
+
+
+def check(
+    data: Recordings,
+    model: ModelLike | None = None,
+    *,
+    inputs: str | Sequence[str] = (),
+    units: Mapping[str, str] | None = None,
+    map: Mapping[str, str] | None = None,
+) -> Health:
+    """Checks the health of recordings: sampling, gaps, clipping, quantisation, outliers, excitation, delay, clocks.
+
+    Without a model, ``inputs`` names the channels that drive the system.
+
+    >>> import numpy as np, greybox
+    >>> t = np.arange(200) / 100
+    >>> health = greybox.check({"t": t, "y [m]": np.sin(9 * t)})
+    >>> health.recordings[0].rows
+    200
+    """
+    named = [inputs] if isinstance(inputs, str) else list(inputs)
+    given = None if model is None else native(model)
+    return Health(*_native.check(recordings(data, "recording", units), given, named, renames(map)))
+
+
+def control(
+    model: ModelLike | Diagnosis,
+    *,
+    method: str = "lqr",
+    input: str | None = None,
+    track: str | None = None,
+    to: float = 1.0,
+    size: Mapping[str, float] | None = None,
+    input_size: float = 1.0,
+    limit: float | None = None,
+    dt: float = 1e-3,
+    hold: float = 2.0,
+    degree: int = 4,
+    lambda_: float = 10.0,
+    rate: float = 50.0,
+    eta: float | None = None,
+    ignore_time_terms: bool = False,
+    compensate_friction: bool = False,
+    report: str | os.PathLike[str] | Diagnosis | Calibration | None = None,
+    members: int = 50,
+    seed: int = 0,
+    progress: Progress | None = None,
+) -> Control:
+    """Designs a controller, simulates its closed loop, and writes its law as code. All numbers are in SI.
+
+    Args:
+        model: the model; of a diagnosis its completed one, and then ``report`` is that diagnosis unless stated.
+        method: ``lqr``, ``hjb`` (value function of ``degree``) or ``smc`` (sliding mode; ``lambda_``, ``rate``,
+            ``eta``).
+        input: input that commands; the model's only one where it has one.
+        track, to: state to bring to the set points ± ``to``.
+        size, input_size: typical sizes of states and command, from which the weights follow.
+        limit: the actuator gives ± this at most.
+        dt: sample time of the law, s.
+        hold: time for each set point of the simulated square wave, s.
+        ignore_time_terms: drop disturbances that depend on the time from the design.
+        compensate_friction: take friction, smoothed, out of the motion (smc).
+        report: how sure the model's parameters are, for the perturbed plants (``members``, ``seed``).
+        progress: hears what is being done.
+
+    >>> import greybox
+    >>> arm = '''
+    ... [inputs]
+    ... u = { unit = "N m" }
+    ... [states]
+    ... q = { unit = "rad" }
+    ... [parameters]
+    ... J = { value = 0.1, unit = "kg m^2" }
+    ... b = { value = 0.2, unit = "N m s/rad" }
+    ... [equations]
+    ... arm = "J*q'' + b*q' = u"
+    ... '''
+    >>> law = greybox.control(arm, track="q", to=0.5)
+    >>> len(law.gains)
+    2
+    >>> "control_law" in law.law_c
+    True
+    """
+    if isinstance(model, Diagnosis):
+        report = model if report is None else report
+        model = model.model
+    told = None
+    if isinstance(report, (Diagnosis, Calibration)):
+        told = ("report.json", report.to_json())
+    elif report is not None:
+        with open(report, encoding="utf-8") as file:
+            told = (os.fspath(report), file.read())
+    wanted = {
+        "method": method,
+        "input": input,
+        "track": track,
+        "to": to,
+        "size": [(name, float(value)) for name, value in (size or {}).items()],
+        "input_size": input_size,
+        "limit": limit,
+        "dt": dt,
+        "hold": hold,
+        "degree": degree,
+        "lambda_": lambda_,
+        "rate": rate,
+        "eta": eta,
+        "ignore_time_terms": ignore_time_terms,
+        "compensate_friction": compensate_friction,
+        "members": members,
+        "seed": seed,
+    }
+    return Control(_native.control(native(model), wanted, told, progress))

@@ -1,0 +1,110 @@
+//! Controllers.
+
+use std::path::PathBuf;
+
+use greybox_commands::Failure;
+use greybox_commands::control::{self as design, Request, Way};
+use numpy::PyArray1;
+use pyo3::prelude::*;
+use pyo3::types::PyBytes;
+
+use crate::error::raised;
+use crate::input::Model;
+use crate::watch::watched;
+
+/// As the arguments of `greybox control`.
+#[derive(FromPyObject)]
+#[pyo3(from_item_all)]
+pub(crate) struct Wanted {
+    method: String,
+    input: Option<String>,
+    track: Option<String>,
+    to: f64,
+    size: Vec<(String, f64)>,
+    input_size: f64,
+    limit: Option<f64>,
+    dt: f64,
+    hold: f64,
+    degree: u8,
+    #[pyo3(item("lambda_"))]
+    lambda: f64,
+    rate: f64,
+    eta: Option<f64>,
+    ignore_time_terms: bool,
+    compensate_friction: bool,
+    members: usize,
+    seed: u64,
+}
+
+impl Wanted {
+    fn request(self) -> Result<Request, Failure> {
+        let method = match self.method.as_str() {
+            "lqr" => Way::Lqr,
+            "hjb" => Way::Hjb,
+            "smc" => Way::Smc,
+            other => {
+                return Err(
+                    Failure::input(format!("`{other}` is no method")).mend("choose `lqr`, `hjb` or `smc`")
+                );
+            }
+        };
+        if let Some((name, value)) = self.size.iter().find(|(_, v)| !(*v > 0.0 && v.is_finite())) {
+            return Err(Failure::input(format!("{value} is no size of `{name}`"))
+                .mend("give a positive number, such as `size={\"theta\": 0.5}`"));
+        }
+        Ok(Request {
+            method,
+            input: self.input,
+            track: self.track,
+            to: self.to,
+            sizes: self.size,
+            input_size: self.input_size,
+            limit: self.limit,
+            dt: self.dt,
+            hold: self.hold,
+            degree: self.degree,
+            lambda: self.lambda,
+            rate: self.rate,
+            eta: self.eta,
+            ignore_time_terms: self.ignore_time_terms,
+            compensate_friction: self.compensate_friction,
+            members: self.members,
+            seed: self.seed,
+        })
+    }
+}
+
+/// An array of Python.
+type Array<'py> = Bound<'py, PyArray1<f64>>;
+
+/// JSON, story, files, and the loop: time, set point, command, states.
+type Controlled<'py> = (
+    String,
+    String,
+    Vec<(&'static str, Bound<'py, PyBytes>)>,
+    (Array<'py>, Array<'py>, Array<'py>, Vec<(String, Array<'py>)>),
+);
+
+/// `report` is the report that the model is from: what errors call it, and its text.
+#[pyfunction]
+#[pyo3(signature = (model, wanted, report, progress))]
+pub(crate) fn control<'py>(
+    py: Python<'py>,
+    model: &Model,
+    wanted: Wanted,
+    report: Option<(PathBuf, String)>,
+    progress: Option<&Bound<'py, PyAny>>,
+) -> PyResult<Controlled<'py>> {
+    let loaded = model.loaded();
+    let request = raised(py, wanted.request())?;
+    let results = watched(py, progress, move |watch| {
+        let report = report.as_ref().map(|(path, text)| (path.as_path(), text.as_str()));
+        design::control(&loaded, &request, report, &|what| watch.stage(what))
+    })?;
+    let files = results.files().into_iter().map(|(name, bytes)| (name, PyBytes::new(py, bytes))).collect();
+    let run = results.run;
+    let array = |values: Vec<f64>| PyArray1::from_vec(py, values);
+    let states = run.states.into_iter().zip(run.x).map(|(name, x)| (name, array(x))).collect();
+    let told = (array(run.t), array(run.r), array(run.u), states);
+    Ok((format!("{:#}\n", results.json), results.story, files, told))
+}

@@ -1,0 +1,284 @@
+//! Recordings and models from Python.
+
+use std::path::{Path, PathBuf};
+
+use greybox_commands::Failure;
+use greybox_commands::loading::{self, LoadedModel};
+use greybox_model::{Hold, Unit, WriteOptions, nearest};
+use greybox_recording::{Channel, Rename, RenameError};
+use numpy::{PyArray1, PyReadonlyArray1};
+use pyo3::prelude::*;
+use pyo3::types::PyDict;
+
+use crate::error::raised;
+
+/// A recording in memory.
+#[pyclass(frozen, module = "greybox._native")]
+pub(crate) struct Recording(greybox_recording::Recording);
+
+/// Header name, unit and values of a channel.
+type Column<'py> = (String, Option<String>, PyReadonlyArray1<'py, f64>);
+
+#[pymethods]
+impl Recording {
+    /// From columns: name, times in s, channels.
+    #[new]
+    fn new(
+        py: Python<'_>,
+        name: &str,
+        time: PyReadonlyArray1<'_, f64>,
+        channels: Vec<Column<'_>>,
+    ) -> PyResult<Recording> {
+        let values = |array: &PyReadonlyArray1<'_, f64>| array.as_array().to_vec();
+        let channels = channels
+            .iter()
+            .map(|(name, unit, array)| Channel {
+                name: name.clone(),
+                unit: unit.clone(),
+                values: values(array),
+            })
+            .collect();
+        let made = greybox_recording::Recording::from_columns(name, values(&time), channels);
+        raised(py, made.map(Recording).map_err(Failure::from))
+    }
+
+    /// What is in a file.
+    #[staticmethod]
+    fn read(py: Python<'_>, path: PathBuf) -> PyResult<Recording> {
+        let read = py.detach(|| loading::recordings(&[path], &[]));
+        raised(py, read.and_then(only)).map(Recording)
+    }
+
+    #[getter]
+    fn name(&self) -> &str {
+        &self.0.name
+    }
+
+    /// Times, s.
+    #[getter]
+    fn t<'py>(&self, py: Python<'py>) -> Bound<'py, PyArray1<f64>> {
+        PyArray1::from_slice(py, &self.0.time)
+    }
+
+    /// Name, unit and values of each channel.
+    #[getter]
+    fn channels<'py>(&self, py: Python<'py>) -> Vec<(&str, Option<&str>, Bound<'py, PyArray1<f64>>)> {
+        self.0
+            .channels
+            .iter()
+            .map(|c| (c.name.as_str(), c.unit.as_deref(), PyArray1::from_slice(py, &c.values)))
+            .collect()
+    }
+}
+
+fn only(read: Vec<greybox_recording::Recording>) -> Result<greybox_recording::Recording, Failure> {
+    read.into_iter().next().ok_or_else(|| Failure::internal("a recording was named, but not read"))
+}
+
+/// A recording as Python hands it on.
+#[derive(FromPyObject)]
+pub(crate) enum Source {
+    Memory(Py<Recording>),
+    File(PathBuf),
+}
+
+/// The recordings to learn from and those held out, not read yet.
+pub(crate) struct Sources {
+    train: Vec<Place>,
+    holdout: Vec<Place>,
+    map: Vec<Rename>,
+}
+
+enum Place {
+    Memory(greybox_recording::Recording),
+    File(PathBuf),
+}
+
+impl Sources {
+    /// # Errors
+    /// Bad input: a renaming that is none.
+    pub(crate) fn new(
+        train: Vec<Source>,
+        holdout: Vec<Source>,
+        map: Vec<String>,
+    ) -> Result<Sources, Failure> {
+        let place = |source| match source {
+            Source::Memory(recording) => Place::Memory(recording.get().0.clone()),
+            Source::File(path) => Place::File(path),
+        };
+        Ok(Sources {
+            train: train.into_iter().map(place).collect(),
+            holdout: holdout.into_iter().map(place).collect(),
+            map: map.iter().map(|text| rename(text)).collect::<Result<_, _>>()?,
+        })
+    }
+
+    /// Reads the files; recordings to learn from, then those held out.
+    ///
+    /// # Errors
+    /// As [`loading::recordings`], and two recordings of one name.
+    pub(crate) fn read(self) -> Result<Recordings, Failure> {
+        let count = self.train.len();
+        let all: Vec<Place> = self.train.into_iter().chain(self.holdout).collect();
+        let paths: Vec<PathBuf> = all
+            .iter()
+            .filter_map(|place| match place {
+                Place::File(path) => Some(path.clone()),
+                Place::Memory(_) => None,
+            })
+            .collect();
+        let mut read = loading::recordings(&paths, &self.map)?.into_iter();
+        let mut train = Vec::with_capacity(all.len());
+        for place in all {
+            train.push(match place {
+                Place::Memory(mut recording) => {
+                    recording.rename(&self.map)?;
+                    recording
+                }
+                Place::File(_) => only(read.by_ref().take(1).collect())?,
+            });
+        }
+        for (k, recording) in train.iter().enumerate() {
+            if train[..k].iter().any(|other| other.name == recording.name) {
+                return Err(Failure::input(format!("two recordings are called {}", recording.name))
+                    .mend("give each a name of its own: `greybox.Recording(data, name=…)`"));
+            }
+        }
+        let holdout = train.split_off(count);
+        Ok(Recordings { train, holdout })
+    }
+}
+
+/// What [`Sources`] hold.
+pub(crate) struct Recordings {
+    pub(crate) train: Vec<greybox_recording::Recording>,
+    pub(crate) holdout: Vec<greybox_recording::Recording>,
+}
+
+/// As `--map` of the command.
+fn rename(text: &str) -> Result<Rename, Failure> {
+    let rename: Rename = text.parse().map_err(|e: RenameError| Failure::input(e.to_string()))?;
+    match rename.unit.as_deref().map(Unit::parse) {
+        Some(Err(error)) => Err(Failure::input(error.to_string())),
+        _ => Ok(rename),
+    }
+}
+
+/// A model in the model language.
+#[pyclass(frozen, module = "greybox._native")]
+pub(crate) struct Model(LoadedModel);
+
+impl Model {
+    pub(crate) fn loaded(&self) -> LoadedModel {
+        LoadedModel {
+            model: self.0.model.clone(),
+            text: self.0.text.clone(),
+            path: self.0.path.clone(),
+            file: self.0.file.clone(),
+        }
+    }
+}
+
+#[pymethods]
+impl Model {
+    /// From its text; `file` is what errors and reports call it.
+    #[new]
+    fn new(py: Python<'_>, text: String, file: &str) -> PyResult<Model> {
+        raised(py, loading::model_of(text, Path::new(file)).map(Model))
+    }
+
+    /// From a file.
+    #[staticmethod]
+    fn read(py: Python<'_>, path: PathBuf) -> PyResult<Model> {
+        raised(py, loading::model(&path).map(Model))
+    }
+
+    #[getter]
+    fn name(&self) -> &str {
+        &self.0.model.name
+    }
+
+    #[getter]
+    fn file(&self) -> &str {
+        &self.0.file
+    }
+
+    #[getter]
+    fn text(&self) -> &str {
+        &self.0.text
+    }
+
+    #[getter]
+    fn inputs(&self) -> Vec<&str> {
+        self.0.model.inputs.iter().map(|i| i.name.as_str()).collect()
+    }
+
+    #[getter]
+    fn states(&self) -> Vec<&str> {
+        self.0.model.states.iter().map(|s| s.name.as_str()).collect()
+    }
+
+    #[getter]
+    fn equations<'py>(&self, py: Python<'py>) -> PyResult<Bound<'py, PyDict>> {
+        let told = PyDict::new(py);
+        for equation in &self.0.model.equations {
+            told.set_item(&equation.name, equation.to_string())?;
+        }
+        Ok(told)
+    }
+
+    /// Value, unit, standard deviation and `fixed` of each parameter, in the units of the file.
+    #[getter]
+    fn parameters<'py>(&self, py: Python<'py>) -> PyResult<Bound<'py, PyDict>> {
+        let all = PyDict::new(py);
+        for p in &self.0.model.parameters {
+            let factor = p.unit.as_ref().map_or(1.0, |u| u.factor);
+            let told = PyDict::new(py);
+            told.set_item("value", p.value / factor)?;
+            told.set_item("unit", p.unit.as_ref().map(|u| u.text.as_str()))?;
+            told.set_item("std", p.std.map(|s| s / factor))?;
+            told.set_item("fixed", p.fixed)?;
+            all.set_item(&p.name, told)?;
+        }
+        Ok(all)
+    }
+
+    /// The model with other values of parameters, in the units of the file.
+    fn with_parameters(&self, py: Python<'_>, values: Vec<(String, f64)>) -> PyResult<Model> {
+        raised(py, self.changed(&values))
+    }
+}
+
+impl Model {
+    fn changed(&self, values: &[(String, f64)]) -> Result<Model, Failure> {
+        let mut model = self.0.model.clone();
+        for (name, value) in values {
+            let Some(index) = model.parameter(name) else {
+                let known = model.parameters.iter().map(|p| p.name.as_str());
+                let failure = Failure::file(&self.0.path, format!("there is no parameter `{name}`"));
+                return Err(match nearest(name, known) {
+                    Some(near) => failure.mend(format!("did you mean `{near}`?")),
+                    None => failure.mend("name one of the model's [parameters]"),
+                });
+            };
+            if !value.is_finite() {
+                return Err(Failure::file(&self.0.path, format!("`{name}` cannot be {value}"))
+                    .mend("give a finite number"));
+            }
+            let parameter = &mut model.parameters[index];
+            parameter.value = value * parameter.unit.as_ref().map_or(1.0, |u| u.factor);
+        }
+        let text = model.to_toml(&WriteOptions { original: Some(&self.0.text), ..Default::default() });
+        loading::model_of(text, &self.0.path).map(Model)
+    }
+}
+
+/// A hold by its name.
+///
+/// # Errors
+/// Bad input: no such hold.
+pub(crate) fn hold(name: &str) -> Result<Hold, Failure> {
+    [Hold::Zero, Hold::Linear, Hold::BandLimited].into_iter().find(|hold| hold.name() == name).ok_or_else(
+        || Failure::input(format!("`{name}` is no hold")).mend("choose `zero`, `linear` or `band_limited`"),
+    )
+}

@@ -1,0 +1,93 @@
+"""The same input gives what the command gives."""
+
+import json
+
+import greybox
+import numpy as np
+import pytest
+from conftest import write_csv
+
+
+def test_a_diagnosis_of_files_is_the_command_s_to_the_byte(cart, command, tmp_path):
+    first, second = cart["files"]
+    done = command("diagnose", cart["model"], first, "--holdout", second, "--out", tmp_path, "--seed", "3")
+    found = greybox.diagnose(cart["model"], first, second, seed=3)
+    assert found.to_json() == (tmp_path / "report.json").read_text()
+    assert found.improved == (tmp_path / "improved.toml").read_text()
+    assert found.report_html() == (tmp_path / "report.html").read_text()
+    assert found.summary == done.stdout.split("\nWritten:")[0].rstrip("\n") + "\n"
+
+
+def test_a_diagnosis_of_arrays_is_the_command_s(cart, command, tmp_path):
+    first, second = cart["files"]
+    command("diagnose", cart["model"], first, "--holdout", second, "--out", tmp_path)
+    named = [greybox.Recording(c, f.name) for c, f in zip(cart["columns"], cart["files"])]
+    found = greybox.diagnose(cart["model"], named[0], named[1])
+    assert found.report == json.loads((tmp_path / "report.json").read_text())
+
+
+def test_a_calibration_is_the_command_s(cart, command, tmp_path):
+    command("calibrate", cart["model"], *cart["files"], "--out", tmp_path)
+    found = greybox.calibrate(cart["model"], cart["files"])
+    assert found.to_json() == (tmp_path / "report.json").read_text()
+    assert found.model_text == (tmp_path / "model.toml").read_text()
+    assert "# the spring" in found.model_text
+
+
+def test_an_identification_is_the_command_s(cart, command, tmp_path):
+    flags = ["--states", "x", "--inputs", "f", "--order", "2", "--library", "separate,friction", "--replicates", "5"]
+    command("identify", cart["files"][0], *flags, "--out", tmp_path)
+    wanted = {"order": 2, "library": ["separate", "friction"], "replicates": 5}
+    found = greybox.identify(cart["files"][0], "x", "f", **wanted)
+    assert found.to_json() == (tmp_path / "report.json").read_text()
+    assert found.model_text == (tmp_path / "model.toml").read_text()
+
+
+def test_a_simulation_is_the_command_s(cart, command, tmp_path):
+    out = tmp_path / "out.csv"
+    done = command("simulate", cart["model"], cart["files"][0], "--out", out, "--json")
+    simulated = greybox.simulate(cart["model"], cart["columns"][0])
+    table = np.genfromtxt(out, delimiter=",", skip_header=1)
+    assert np.array_equal(table[:, 0], simulated.t)
+    assert np.array_equal(table[:, 1], simulated["x"])
+    told = json.loads(done.stdout)
+    assert simulated.fit.x.nrmse == told["fit"]["x"]["nrmse"]
+
+
+def test_a_controller_is_the_command_s(cart, command, tmp_path):
+    flags = ["--track", "x", "--to", "0.2", "--size", "x=0.2", "--limit", "8", "--hold", "3"]
+    command("control", cart["model"], *flags, "--out", tmp_path)
+    law = greybox.control(cart["model"], track="x", to=0.2, size={"x": 0.2}, limit=8, hold=3)
+    assert law.to_json() == (tmp_path / "report.json").read_text()
+    for name, content in law.files.items():
+        assert content == (tmp_path / name).read_bytes(), name
+
+
+def test_a_check_is_the_command_s(cart, command):
+    done = command("check", cart["files"][0], "--model", cart["model"], "--json")
+    assert greybox.check(cart["files"][0], cart["model"]).report == json.loads(done.stdout)
+
+
+@pytest.mark.parametrize(
+    "model, change",
+    [("no_such.toml", None), ("bad.toml", ("b*x'", "bb*x'")), ("unit.toml", ('"N s/m"', '"N/m"'))],
+)
+def test_errors_are_in_the_command_s_words(cart, command, tmp_path, model, change):
+    path = tmp_path / model
+    if change:
+        path.write_text(cart["model"].read_text().replace(*change))
+    told = command("calibrate", path, cart["files"][0], "--out", tmp_path / "out", status=2).stderr
+    with pytest.raises(greybox.InputError) as error:
+        greybox.calibrate(path, cart["files"][0])
+    assert told == f"error: {error.value}\n"
+    assert isinstance(error.value, ValueError)
+
+
+def test_a_missing_channel_is_told_as_by_the_command(cart, command, tmp_path):
+    columns = {("y [m]" if key == "x [m]" else key): v for key, v in cart["columns"][0].items()}
+    path = write_csv(tmp_path / "run.csv", columns)
+    told = command("diagnose", cart["model"], path, "--out", tmp_path / "out", status=2).stderr
+    with pytest.raises(greybox.GreyboxError) as error:
+        greybox.diagnose(cart["model"], greybox.Recording(columns, "run.csv"))
+    assert told == f"error: {error.value}\n"
+    assert error.value.channel == "x"
