@@ -19,6 +19,9 @@ pub(crate) struct Recording(greybox_recording::Recording);
 /// Header name, unit and values of a channel.
 type Column<'py> = (String, Option<String>, PyReadonlyArray1<'py, f64>);
 
+/// The same on its way out.
+type Told<'a, 'py> = (&'a str, Option<&'a str>, Bound<'py, PyArray1<f64>>);
+
 #[pymethods]
 impl Recording {
     /// From columns: name, times in s, channels.
@@ -62,7 +65,7 @@ impl Recording {
 
     /// Name, unit and values of each channel.
     #[getter]
-    fn channels<'py>(&self, py: Python<'py>) -> Vec<(&str, Option<&str>, Bound<'py, PyArray1<f64>>)> {
+    fn channels<'py>(&self, py: Python<'py>) -> Vec<Told<'_, 'py>> {
         self.0
             .channels
             .iter()
