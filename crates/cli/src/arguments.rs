@@ -53,9 +53,14 @@ pub(crate) struct Cli {
 /// What the model calls the channels of the recordings.
 #[derive(Debug, Args)]
 pub(crate) struct Channels {
-    /// Name of the model for a channel of the recordings, with its unit where they state none, such as
-    /// "theta=sensor_3 [deg]"; may be repeated
-    #[arg(long, value_name = "NAME=CHANNEL", value_parser = rename)]
+    // (Not a doc comment: rustdoc takes a unit in brackets for a link.)
+    #[arg(
+        long,
+        value_name = "NAME=CHANNEL",
+        value_parser = rename,
+        help = "Name of the model for a channel of the recordings, with its unit where they state none, such as \
+                \"theta=sensor_3 [deg]\"; may be repeated"
+    )]
     pub(crate) map: Vec<Rename>,
 }
 
