@@ -14,18 +14,20 @@ its text, or a :class:`Model`. Every result has ``summary`` (plain language), ``
 """
 
 from ._errors import GreyboxError, InputError, InternalError
-from ._inputs import Model, Recording
+from ._inputs import Model, ModelLike, Recording, RecordingLike
 from ._native import __version__
 from ._records import (
     Alternative,
     Channel,
     Curve,
+    Equation,
     Estimate,
     Finding,
     Fit,
     FitSet,
     Location,
     Mechanism,
+    Named,
     Parameter,
     Record,
     Remainder,
@@ -42,6 +44,7 @@ __all__ = [
     "Control",
     "Curve",
     "Diagnosis",
+    "Equation",
     "Estimate",
     "Finding",
     "Fit",
@@ -54,9 +57,12 @@ __all__ = [
     "Location",
     "Mechanism",
     "Model",
+    "ModelLike",
+    "Named",
     "Parameter",
     "Record",
     "Recording",
+    "RecordingLike",
     "Remainder",
     "Score",
     "Simulation",

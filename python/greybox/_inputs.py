@@ -8,6 +8,7 @@ from collections.abc import Iterable, Mapping
 from typing import TYPE_CHECKING, Any, Union
 
 import numpy as np
+from numpy.typing import NDArray
 
 from . import _native
 from ._errors import InputError
@@ -31,9 +32,9 @@ def _header(cell: object) -> tuple[str, str | None]:
     return (found[1], found[2].strip()) if found else (str(cell).strip(), None)
 
 
-def _values(values: object, what: str, called: str) -> np.ndarray:
+def _values(values: object, what: str, called: str) -> NDArray[np.float64]:
     if isinstance(values, np.ma.MaskedArray):
-        values = values.astype(float).filled(np.nan)
+        values = np.ma.filled(values.astype(float), np.nan)
     try:
         array = np.asarray(values, dtype=np.float64)
     except (TypeError, ValueError) as error:
@@ -68,17 +69,20 @@ class Recording:
     Recording('recording', 100 rows of theta [deg], v [V])
     """
 
+    _inner: _native.Recording
+
     def __init__(
         self, data: RecordingLike, name: str | None = None, *, units: Mapping[str, str] | None = None
     ) -> None:
         units = dict(units or {})
+        read: _native.Recording | None = None
         if isinstance(data, Recording):
-            data = data._native
+            read = data._inner
         elif isinstance(data, (str, os.PathLike)):
-            data = _native.Recording.read(data)
-        if isinstance(data, _native.Recording):
-            called = data.name if name is None else name
-            time, columns = data.t, data.channels
+            read = _native.Recording.read(data)
+        if read is not None:
+            called = read.name if name is None else name
+            time, columns = read.t, read.channels
         else:
             called = "recording" if name is None else name
             time, columns = self._columns(data, called)
@@ -88,10 +92,10 @@ class Recording:
         if units:
             there = ", ".join(channel for channel, _, _ in stated)
             raise InputError(f"{called}: `units` names {', '.join(units)}, but the channels are {there}")
-        self._native = _native.Recording(called, time, stated)
+        self._inner = _native.Recording(called, time, stated)
 
     @staticmethod
-    def _columns(data: Any, called: str) -> tuple[np.ndarray, list[tuple[str, str | None, np.ndarray]]]:
+    def _columns(data: Any, called: str) -> tuple[NDArray[np.float64], list[tuple[str, str | None, NDArray[np.float64]]]]:
         if not hasattr(data, "items"):
             raise TypeError(f"a recording is a file, a dict of arrays or a pandas frame, not {type(data).__name__}")
         columns = [(*_header(key), values) for key, values in data.items()]
@@ -122,26 +126,26 @@ class Recording:
     @property
     def name(self) -> str:
         """What reports call it."""
-        return self._native.name
+        return self._inner.name
 
     @property
-    def t(self) -> np.ndarray:
+    def t(self) -> NDArray[np.float64]:
         """Times, s."""
-        return self._native.t
+        return self._inner.t
 
     @property
     def units(self) -> dict[str, str | None]:
         """Unit of each channel; none where none was stated."""
-        return {name: unit for name, unit, _ in self._native.channels}
+        return {name: unit for name, unit, _ in self._inner.channels}
 
-    def __getitem__(self, channel: str) -> np.ndarray:
-        for name, _, values in self._native.channels:
+    def __getitem__(self, channel: str) -> NDArray[np.float64]:
+        for name, _, values in self._inner.channels:
             if name == channel:
                 return values
         raise KeyError(channel)
 
     def __repr__(self) -> str:
-        cells = (name if unit is None else f"{name} [{unit}]" for name, unit, _ in self._native.channels)
+        cells = (name if unit is None else f"{name} [{unit}]" for name, unit, _ in self._inner.channels)
         return f"Recording({self.name!r}, {len(self.t)} rows of {', '.join(cells)})"
 
 
@@ -165,56 +169,58 @@ class Model:
     3.0
     """
 
+    _inner: _native.Model
+
     def __init__(self, source: ModelLike | _native.Model, file: str = "model.toml") -> None:
         if isinstance(source, Model):
-            source = source._native
-        if isinstance(source, _native.Model):
-            self._native = source
+            self._inner = source._inner
+        elif isinstance(source, _native.Model):
+            self._inner = source
         elif isinstance(source, str) and "\n" in source:
-            self._native = _native.Model(source, file)
+            self._inner = _native.Model(source, file)
         elif isinstance(source, (str, os.PathLike)):
-            self._native = _native.Model.read(source)
+            self._inner = _native.Model.read(source)
         else:
             raise TypeError(f"a model is a file, its text or a Model, not {type(source).__name__}")
 
     @property
     def name(self) -> str:
         """Its title."""
-        return self._native.name
+        return self._inner.name
 
     @property
     def file(self) -> str:
         """The file that errors and reports name."""
-        return self._native.file
+        return self._inner.file
 
     @property
     def text(self) -> str:
         """The text of its file."""
-        return self._native.text
+        return self._inner.text
 
     @property
     def inputs(self) -> list[str]:
         """Names of its inputs."""
-        return self._native.inputs
+        return self._inner.inputs
 
     @property
     def states(self) -> list[str]:
         """Names of its states."""
-        return self._native.states
+        return self._inner.states
 
     @property
     def equations(self) -> dict[str, str]:
         """Its equations, by name."""
-        return self._native.equations
+        return self._inner.equations
 
     @property
     def parameters(self) -> dict[str, dict[str, Any]]:
         """Value, unit, standard deviation and ``fixed`` of each parameter, in the units of the file."""
-        return self._native.parameters
+        return self._inner.parameters
 
     def with_parameters(self, **values: float) -> Model:
         """The model with other values, in the units of the file; comments are kept."""
-        return Model(self._native.with_parameters([(name, float(v)) for name, v in values.items()]))
+        return Model(self._inner.with_parameters([(name, float(v)) for name, v in values.items()]))
 
     def save(self, path: str | os.PathLike[str]) -> None:
         """Writes it to a file."""
@@ -227,7 +233,7 @@ class Model:
 
 def model(source: ModelLike) -> _native.Model:
     """A model as the native half takes it."""
-    return Model(source)._native
+    return Model(source)._inner
 
 
 def recordings(
@@ -243,10 +249,10 @@ def recordings(
         if isinstance(one, (str, os.PathLike)) and not units:
             made.append(one)
         elif isinstance(one, Recording):
-            made.append((Recording(one, units=units) if units else one)._native)
+            made.append((Recording(one, units=units) if units else one)._inner)
         else:
             called = None if isinstance(one, (str, os.PathLike)) else f"{role} {k + 1}" if len(several) > 1 else role
-            made.append(Recording(one, called, units=units)._native)  # type: ignore[arg-type]
+            made.append(Recording(one, called, units=units)._inner)  # type: ignore[arg-type]
     return made
 
 

@@ -2,19 +2,24 @@
 
 from __future__ import annotations
 
+import math
 import typing
-from typing import Any, Dict, List, Optional, Union
+from typing import Any, Dict, List, Optional, TypeVar, Union
 
 import numpy as np
+from numpy.typing import NDArray
 
 
-class Record(Dict[str, Any]):
+T = TypeVar("T")
+
+
+class Named(Dict[str, T]):
     """A dict whose keys are attributes, too: ``report.fit.train`` is ``report["fit"]["train"]``.
 
     Where a key is no name (``theta'``) or a method of dicts, it is an item only.
     """
 
-    def __getattr__(self, name: str) -> Any:
+    def __getattr__(self, name: str) -> T:
         try:
             return self[name]
         except KeyError:
@@ -22,6 +27,10 @@ class Record(Dict[str, Any]):
 
     def __dir__(self) -> list[str]:
         return [*super().__dir__(), *(key for key in self if key.isidentifier())]
+
+
+class Record(Named[Any]):
+    """Part of a report: each key means something of its own."""
 
 
 class Estimate(Record):
@@ -42,8 +51,8 @@ class Alternative(Record):
 class Location(Record):
     """Where something acts: times (s) by recording, a region of the state, a band (Hz)."""
 
-    windows_s: Dict[str, List[List[float]]]
-    region: Dict[str, List[Optional[float]]]
+    windows_s: Named[List[List[float]]]
+    region: Named[List[Optional[float]]]
 
 
 class Mechanism(Record):
@@ -53,7 +62,7 @@ class Mechanism(Record):
     family: str
     equation: Union[str, List[str]]
     expression: str
-    parameters: Dict[str, Estimate]
+    parameters: Named[Estimate]
     share_explained: float
     confidence: float
     alternatives: List[Alternative]
@@ -85,9 +94,9 @@ class Score(Record):
 class FitSet(Record):
     """Scores by channel of the model as given, refitted, and with what was found."""
 
-    nominal: Dict[str, Score]
-    calibrated: Dict[str, Score]
-    improved: Dict[str, Score]
+    nominal: Named[Score]
+    calibrated: Named[Score]
+    improved: Named[Score]
 
 
 class Fit(Record):
@@ -113,11 +122,19 @@ class Term(Record):
     ci95: Optional[List[float]]
 
 
+class Equation(Record):
+    """An identified equation; ``input`` is what its terms add up to, none where nothing drives it."""
+
+    input: Optional[str]
+    expression: str
+    terms: List[Term]
+
+
 class Channel(Record):
     """A measured channel beside the free runs: an array for each model that there is."""
 
     unit: str
-    measured: np.ndarray
+    measured: NDArray[np.float64]
 
 
 class Curve(Record):
@@ -125,21 +142,26 @@ class Curve(Record):
 
     name: str
     role: str
-    t: np.ndarray
-    channels: Dict[str, Channel]
-    inputs: Dict[str, Record]
+    t: NDArray[np.float64]
+    channels: Named[Channel]
+    inputs: Named[Record]
 
 
 def shaped(value: Any, kind: Any = Record) -> Any:
-    """The value with records in place of dicts, of the class that the annotations of its place name."""
+    """The value with records in place of dicts, of the class that the annotations of its place name.
+
+    A number that is not finite, which JSON cannot say, is NaN.
+    """
+    if value is None and kind is float:
+        return math.nan
     origin, arguments = typing.get_origin(kind), typing.get_args(kind)
     if isinstance(value, list):
         inner = arguments[0] if origin is list else Record
         return [shaped(v, inner) for v in value]
     if not isinstance(value, dict):
         return value
-    if origin is dict:
-        return Record({k: shaped(v, arguments[1]) for k, v in value.items()})
+    if origin in (dict, Named):
+        return Named({k: shaped(v, arguments[-1]) for k, v in value.items()})
     made = kind if isinstance(kind, type) and issubclass(kind, Record) else Record
     hints = typing.get_type_hints(made)
     return made({k: shaped(v, hints.get(k, Record)) for k, v in value.items()})

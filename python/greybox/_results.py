@@ -5,12 +5,26 @@ from __future__ import annotations
 import html
 import json
 import os
+import typing
 from typing import TYPE_CHECKING, Any, Dict, List, Sequence
 
 import numpy as np
+from numpy.typing import NDArray
 
 from ._inputs import Model
-from ._records import Curve, Finding, Fit, Mechanism, Parameter, Record, Remainder, shaped
+from ._records import (
+    Curve,
+    Equation,
+    Finding,
+    Fit,
+    Mechanism,
+    Named,
+    Parameter,
+    Record,
+    Remainder,
+    Score,
+    shaped,
+)
 
 if TYPE_CHECKING:
     import pandas
@@ -21,7 +35,7 @@ def _write(path: str | os.PathLike[str], content: bytes) -> None:
         file.write(content)
 
 
-def _frame(columns: dict[str, np.ndarray], index: np.ndarray) -> pandas.DataFrame:
+def _frame(columns: dict[str, NDArray[np.float64]], index: NDArray[np.float64]) -> pandas.DataFrame:
     try:
         import pandas
     except ImportError:
@@ -30,16 +44,15 @@ def _frame(columns: dict[str, np.ndarray], index: np.ndarray) -> pandas.DataFram
 
 
 class _Result:
-    """What all results have. Keys of ``report`` are attributes of the result."""
-
-    _shape: type[Record] = Record
+    """What all results have. Keys of ``report`` are attributes of the result, of the types that its class states."""
 
     def __init__(self, text: str, summary: str) -> None:
         self._text = text
         #: The result in plain language, as the command tells it.
         self.summary: str = summary
+        hints = typing.get_type_hints(type(self))
         #: What report.json holds.
-        self.report: Any = shaped(json.loads(text), self._shape)
+        self.report = Record({key: shaped(v, hints.get(key, Record)) for key, v in json.loads(text).items()})
 
     def __getattr__(self, name: str) -> Any:
         if name.startswith("_") or "report" not in self.__dict__:
@@ -93,16 +106,6 @@ class _Paged(_Study):
         return text
 
 
-class _DiagnosisReport(Record):
-    verdict: str
-    mechanisms: List[Mechanism]
-    remainder: Remainder
-    parameters: Dict[str, Parameter]
-    fit: Fit
-    noise_floor: Dict[str, float]
-    findings: List[Finding]
-
-
 class Diagnosis(_Paged):
     """What a model leaves out.
 
@@ -110,13 +113,12 @@ class Diagnosis(_Paged):
     the residual that they explain.
     """
 
-    _shape = _DiagnosisReport
     verdict: str
     mechanisms: List[Mechanism]
     remainder: Remainder
-    parameters: Dict[str, Parameter]
+    parameters: Named[Parameter]
     fit: Fit
-    noise_floor: Dict[str, float]
+    noise_floor: Named[float]
     findings: List[Finding]
 
     @property
@@ -134,24 +136,14 @@ class Diagnosis(_Paged):
         return f"Diagnosis({self.verdict}{': ' + kinds if kinds else ''})"
 
 
-class _IdentificationReport(Record):
-    equations: Dict[str, Record]
-    order: Record
-    delay: Dict[str, Record]
-    fit: Fit
-    noise_floor: Dict[str, float]
-    findings: List[Finding]
-
-
 class Identification(_Paged):
     """Governing equations found from recordings alone: ``equations`` by state, each with its ``terms``."""
 
-    _shape = _IdentificationReport
-    equations: Dict[str, Record]
+    equations: Named[Equation]
     order: Record
-    delay: Dict[str, Record]
+    delay: Named[Record]
     fit: Fit
-    noise_floor: Dict[str, float]
+    noise_floor: Named[float]
     findings: List[Finding]
 
     @property
@@ -168,20 +160,12 @@ class Identification(_Paged):
         return f"Identification({'; '.join(e.expression for e in self.equations.values())})"
 
 
-class _CalibrationReport(Record):
-    parameters: Dict[str, Parameter]
-    fit: Fit
-    noise_floor: Dict[str, float]
-    findings: List[Finding]
-
-
 class Calibration(_Study):
     """The same equations with refitted parameters."""
 
-    _shape = _CalibrationReport
-    parameters: Dict[str, Parameter]
+    parameters: Named[Parameter]
     fit: Fit
-    noise_floor: Dict[str, float]
+    noise_floor: Named[float]
     findings: List[Finding]
 
     @property
@@ -202,17 +186,20 @@ class Calibration(_Study):
 class Simulation(_Result):
     """A free run: an array for each measured channel, at the recording's times and in its units; NaN = not reached."""
 
+    fit: Named[Score]
+    diverged: bool
+
     def __init__(
-        self, told: tuple[str, str, np.ndarray, Sequence[tuple[str, np.ndarray]]]
+        self, told: tuple[str, str, NDArray[np.float64], Sequence[tuple[str, NDArray[np.float64]]]]
     ) -> None:
         text, summary, t, columns = told
         super().__init__(text, summary)
         #: Times, s.
-        self.t: np.ndarray = t
+        self.t: NDArray[np.float64] = t
         #: Values by header: ``name`` or ``name [unit]``.
-        self.columns: Dict[str, np.ndarray] = dict(columns)
+        self.columns: Dict[str, NDArray[np.float64]] = dict(columns)
 
-    def __getitem__(self, channel: str) -> np.ndarray:
+    def __getitem__(self, channel: str) -> NDArray[np.float64]:
         for header, values in self.columns.items():
             if channel in (header, header.split(" [")[0]):
                 return values
@@ -235,13 +222,13 @@ class Control(_Result):
         #: Content of every file that the command writes, by name.
         self.files: Dict[str, bytes] = dict(files)
         #: Times of the closed loop, s.
-        self.t: np.ndarray = t
+        self.t: NDArray[np.float64] = t
         #: Its set point, SI.
-        self.set_point: np.ndarray = set_point
+        self.set_point: NDArray[np.float64] = set_point
         #: Its command, SI.
-        self.command: np.ndarray = command
+        self.command: NDArray[np.float64] = command
         #: Its states, SI.
-        self.trajectories: Dict[str, np.ndarray] = dict(states)
+        self.trajectories: Dict[str, NDArray[np.float64]] = dict(states)
 
     @property
     def law_c(self) -> str:

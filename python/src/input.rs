@@ -116,6 +116,26 @@ impl Sources {
         })
     }
 
+    /// The same with the recordings of every folder in its place.
+    ///
+    /// # Errors
+    /// As [`loading::recordings_of`].
+    pub(crate) fn without_folders(self) -> Result<Sources, Failure> {
+        let spread = |places: Vec<Place>| -> Result<Vec<Place>, Failure> {
+            let mut files = Vec::with_capacity(places.len());
+            for place in places {
+                match place {
+                    Place::File(path) => {
+                        files.extend(loading::without_folders(&[path])?.into_iter().map(Place::File));
+                    }
+                    memory @ Place::Memory(_) => files.push(memory),
+                }
+            }
+            Ok(files)
+        };
+        Ok(Sources { train: spread(self.train)?, holdout: spread(self.holdout)?, map: self.map })
+    }
+
     /// Reads the files; recordings to learn from, then those held out.
     ///
     /// # Errors

@@ -232,7 +232,7 @@ pub(crate) fn check(
     let loaded = model.map(Model::loaded);
     let sources = raised(py, Sources::new(recordings, Vec::new(), map))?;
     watched(py, None, move |_| {
-        let Recordings { train, .. } = sources.read()?;
+        let Recordings { train, .. } = sources.without_folders()?.read()?;
         let model = loaded.as_ref().map(|l| &l.model);
         let checked = checks::check(&train, model, &inputs)?;
         Ok((checks::to_json(model, &checked).to_string(), checks::story(&checked)))

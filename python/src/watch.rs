@@ -3,10 +3,11 @@
 use std::panic::{AssertUnwindSafe, catch_unwind, resume_unwind};
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::sync::mpsc::{Receiver, RecvTimeoutError, Sender, channel};
-use std::sync::{Arc, Mutex, PoisonError};
+use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
 use std::thread;
 use std::time::Duration;
 
+use greybox_calibrate::Work;
 use greybox_commands::{Failure, diagnose, identify};
 use greybox_diagnose::Stage;
 use greybox_diagnose::evidence::Evidence;
@@ -29,10 +30,36 @@ enum Word<T> {
 /// Nobody waits for the answer any more: the payload with which the work unwinds.
 struct Abandoned;
 
+/// Whether the work is abandoned, and what then ends the fits that it is at.
+#[derive(Default)]
+struct Fate {
+    abandoned: AtomicBool,
+    work: Mutex<Option<Arc<Work>>>,
+}
+
+impl Fate {
+    fn work(&self) -> MutexGuard<'_, Option<Arc<Work>>> {
+        self.work.lock().unwrap_or_else(PoisonError::into_inner)
+    }
+
+    fn abandon(&self) {
+        let work = self.work();
+        self.abandoned.store(true, Ordering::Relaxed);
+        if let Some(work) = &*work {
+            work.give_up();
+        }
+    }
+
+    /// The work has begun: from now on it is what [`Fate::abandon`] gives up.
+    fn begins(&self, work: &Arc<Work>) {
+        *self.work() = Some(work.clone());
+    }
+}
+
 /// Tells of stages; ends the work where nobody waits for it any more.
 pub(crate) struct Watch {
     tell: Box<dyn Fn(String) + Send + Sync>,
-    abandoned: Arc<AtomicBool>,
+    fate: Arc<Fate>,
 }
 
 impl Watch {
@@ -42,16 +69,25 @@ impl Watch {
         (self.tell)(what.into());
     }
 
-    /// A step of the work is done. The libraries know no way to give up, so it unwinds (past the hook that would
-    /// report a panic) to where [`watched`] catches it.
+    /// A step of the work is done. Abandoned work unwinds (past the hook that would report a panic) to where
+    /// [`watched`] catches it.
     fn step(&self) {
-        if self.abandoned.load(Ordering::Relaxed) {
+        if self.fate.abandoned.load(Ordering::Relaxed) {
             resume_unwind(Box::new(Abandoned));
         }
+    }
+
+    fn begins(&self, work: &Arc<Work>) {
+        self.fate.begins(work);
+        self.step();
     }
 }
 
 impl greybox_diagnose::Observer for Watch {
+    fn begins(&self, work: &Arc<Work>) {
+        Watch::begins(self, work);
+    }
+
     fn stage(&self, stage: Stage) {
         Watch::stage(self, diagnose::told(stage));
     }
@@ -74,13 +110,18 @@ impl greybox_diagnose::Observer for Watch {
 }
 
 impl greybox_identify::Observer for Watch {
+    fn begins(&self, work: &Arc<Work>) {
+        Watch::begins(self, work);
+    }
+
     fn stage(&self, name: &str) {
         Watch::stage(self, identify::told(name));
     }
 }
 
 /// Does `work` without the interpreter's lock. Stages are told to `progress` on the caller's thread. An exception of
-/// `progress`, or Ctrl-C, is raised at once; the work then ends at its next step, unheard.
+/// `progress`, or Ctrl-C, is raised at once; the work then ends soon, unheard: a fit with the step that it is at, all
+/// the rest where the libraries next speak to their observer.
 ///
 /// # Errors
 /// What `work` says, an exception of `progress`, or `KeyboardInterrupt`. A panic is told as a failure of greybox.
@@ -89,28 +130,28 @@ pub(crate) fn watched<T: Send + 'static>(
     progress: Option<&Bound<'_, PyAny>>,
     work: impl FnOnce(&Watch) -> Result<T, Failure> + Send + 'static,
 ) -> PyResult<T> {
-    let abandoned = Arc::new(AtomicBool::new(false));
+    let fate = Arc::new(Fate::default());
     let (say, heard) = channel();
-    let spoken = start(say, abandoned.clone(), work);
+    let spoken = start(say, fate.clone(), work);
     raised(py, spoken)?;
     // `Receiver` alone may not be shared with the closure that runs without the lock.
     let heard = Mutex::new(heard);
     let listened = listen(py, progress, &heard);
     if listened.is_err() {
-        abandoned.store(true, Ordering::Relaxed);
+        fate.abandon();
     }
     raised(py, listened?)
 }
 
 fn start<T: Send + 'static>(
     say: Sender<Word<T>>,
-    abandoned: Arc<AtomicBool>,
+    fate: Arc<Fate>,
     work: impl FnOnce(&Watch) -> Result<T, Failure> + Send + 'static,
 ) -> Result<(), Failure> {
     let tell = say.clone();
     // With nobody left to hear, there is nothing to say.
     let tell = move |what| drop(tell.send(Word::Stage(what)));
-    let watch = Watch { tell: Box::new(tell), abandoned };
+    let watch = Watch { tell: Box::new(tell), fate };
     let run = move || {
         let outcome = catch_unwind(AssertUnwindSafe(|| work(&watch)));
         drop(say.send(Word::Done(outcome)));

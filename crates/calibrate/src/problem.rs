@@ -29,7 +29,7 @@
 
 use std::ops::Range;
 use std::sync::Arc;
-use std::sync::atomic::{AtomicU64, Ordering};
+use std::sync::atomic::{AtomicBool, AtomicU64, Ordering};
 
 use greybox_model::System;
 use greybox_simulate::{
@@ -101,17 +101,31 @@ pub struct Problem<'a> {
 /// Work done: evaluations of the right-hand side, each counted once for the state and once for every tangent, times
 /// the operations of one. Unlike time it is the same in every run, whatever the machine and the number of threads.
 #[derive(Debug, Default)]
-pub struct Work(AtomicU64);
+pub struct Work {
+    done: AtomicU64,
+    given_up: AtomicBool,
+}
 
 impl Work {
     /// So far.
     pub fn done(&self) -> u64 {
-        self.0.load(Ordering::Relaxed)
+        self.done.load(Ordering::Relaxed)
+    }
+
+    /// Nobody waits for the answer any more: every fit that adds up here ends with the step that it is at, and what
+    /// comes of it is no answer.
+    pub fn give_up(&self) {
+        self.given_up.store(true, Ordering::Relaxed);
+    }
+
+    /// Whether it was given up.
+    pub fn is_given_up(&self) -> bool {
+        self.given_up.load(Ordering::Relaxed)
     }
 
     fn add(&self, trajectory: &Trajectory, lanes: usize, system: &System) {
         let work = trajectory.evaluations * (1 + lanes) * system.rhs.registers();
-        self.0.fetch_add(work as u64, Ordering::Relaxed);
+        self.done.fetch_add(work as u64, Ordering::Relaxed);
     }
 }
 
@@ -151,7 +165,7 @@ pub enum Ending {
     Converged,
     /// No step decreases the cost any more.
     Stalled,
-    /// The iteration limit was reached.
+    /// The iteration limit was reached, or the work was given up.
     Limit,
 }
 
@@ -457,7 +471,7 @@ impl Problem<'_> {
         let mut rows = self.rows(&point, true, None);
         let mut cost = self.cost_of(&rows, &point);
         let mut small = 0;
-        while iterations < limits.iterations {
+        while iterations < limits.iterations && !self.work.is_given_up() {
             iterations += 1;
             let reduced: Vec<Reduced> = rows
                 .par_iter()

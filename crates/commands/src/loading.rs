@@ -112,6 +112,21 @@ pub fn recordings_of(folder: &Path) -> Result<Vec<PathBuf>, Failure> {
     Ok(recordings)
 }
 
+/// These paths, with the recordings of a folder in its place.
+///
+/// # Errors
+/// As [`recordings_of`].
+pub fn without_folders(paths: &[PathBuf]) -> Result<Vec<PathBuf>, Failure> {
+    let mut files = Vec::with_capacity(paths.len());
+    for path in paths {
+        match path.is_dir() {
+            true => files.extend(recordings_of(path)?),
+            false => files.push(path.clone()),
+        }
+    }
+    Ok(files)
+}
+
 /// The files of a folder with one of these extensions, in the order of their names.
 ///
 /// # Errors

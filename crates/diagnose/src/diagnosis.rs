@@ -269,6 +269,7 @@ pub fn diagnose(
     };
     let Layout { train, holdout, source } = layout(model, train, holdout)?;
     let nominal = Setup::new(model, train.clone(), free_parameters(model))?;
+    observer.begins(&nominal.work);
     let mut search = Search::new(nominal.clone(), &library, observer);
     search.most_work = options.work;
     let found = search.run();
@@ -1241,6 +1242,7 @@ pub fn calibrate(
 ) -> Result<Calibration, DiagnoseError> {
     let Layout { train, holdout, source } = layout(model, train, holdout)?;
     let nominal = Setup::new(model, train.clone(), free_parameters(model))?;
+    observer.begins(&nominal.work);
     let mut search = Search::new(nominal.clone(), &[], observer);
     search.keep_holds = true; // it changes parameters and nothing else
     let found = search.run();

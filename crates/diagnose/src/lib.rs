@@ -15,6 +15,10 @@ pub mod surface;
 pub use diagnosis::{Calibration, DiagnoseError, Diagnosis, Estimate, Options, Verdict, calibrate, diagnose};
 pub use library::{Mechanism, MechanismError, built_in};
 
+use std::sync::Arc;
+
+use greybox_calibrate::Work;
+
 /// Where the diagnosis is, for progress bars and logs.
 #[derive(Debug, Clone, PartialEq)]
 pub enum Stage {
@@ -43,8 +47,10 @@ pub enum Stage {
     Simulating,
 }
 
-/// Watches a diagnosis; never steers it.
+/// Watches a diagnosis. It never steers it, but may end it: by giving the work up, and by unwinding.
 pub trait Observer: Sync {
+    /// The work begins; it may be [given up](Work::give_up), after which it ends soon.
+    fn begins(&self, _work: &Arc<Work>) {}
     /// A stage begins.
     fn stage(&self, _stage: Stage) {}
     /// A candidate of a round was fitted.

@@ -861,9 +861,10 @@ impl<'a> Search<'a> {
         self.would_overspend(0)
     }
 
-    /// Whether so much more is too much.
+    /// Whether so much more is too much. Of work that was given up, any is.
     fn would_overspend(&self, more: u64) -> bool {
-        let over = self.nominal.work.done().saturating_add(more) > self.most_work;
+        let work = &self.nominal.work;
+        let over = work.done().saturating_add(more) > self.most_work || work.is_given_up();
         if over {
             self.limited.store(true, Ordering::Relaxed);
         }

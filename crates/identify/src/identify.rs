@@ -2,7 +2,7 @@
 
 use std::sync::Arc;
 
-use greybox_calibrate::{Data, FreeRun, Hats, Score, Setup, window_length};
+use greybox_calibrate::{Data, FreeRun, Hats, Score, Setup, Work, window_length};
 use greybox_model::{Hold, Model};
 use greybox_recording::Recording;
 use greybox_sparse::{folds, select};
@@ -216,8 +216,10 @@ pub struct Identification {
     pub seed: u64,
 }
 
-/// Watches an identification; never steers it.
+/// Watches an identification. It never steers it, but may end it: by giving the work up, and by unwinding.
 pub trait Observer: Sync {
+    /// The work begins; it may be [given up](Work::give_up), after which it ends soon.
+    fn begins(&self, _work: &Arc<Work>) {}
     /// A stage begins.
     fn stage(&self, _name: &str) {}
 }
@@ -279,7 +281,9 @@ pub(crate) fn search(
     let first = first_estimates(&structure, &whole, &data, &hats, options)?;
 
     observer.stage("output error");
-    let refined = best_refined(&structure, &data, &first).ok_or(IdentifyError::NoFit)?;
+    let work = Arc::new(Work::default());
+    observer.begins(&work);
+    let refined = best_refined(&structure, &data, &first, &work).ok_or(IdentifyError::NoFit)?;
     let (structure, refined) = match options.hold {
         Some(_) => (structure, refined),
         None => better_hold(structure, refined),
@@ -584,9 +588,9 @@ fn estimate(
     Some((badness, state))
 }
 
-fn best_refined(structure: &Structure, data: &Arc<Data>, first: &First) -> Option<Refined> {
+fn best_refined(structure: &Structure, data: &Arc<Data>, first: &First, work: &Arc<Work>) -> Option<Refined> {
     let begun: Vec<Refined> =
-        first.starts.iter().filter_map(|s| output_error::begin(structure, data, s.clone())).collect();
+        first.starts.iter().filter_map(|s| output_error::begin(structure, data, s.clone(), work)).collect();
     let best = begun.into_iter().min_by(|a, b| a.score().total_cmp(&b.score()))?;
     Some(output_error::refine(structure, best, &first.allowed))
 }

@@ -9,7 +9,7 @@
 
 use std::sync::Arc;
 
-use greybox_calibrate::{Data, Fit, Free, Level, Limits, Point, Segment, SegmentRows, Setup, qr};
+use greybox_calibrate::{Data, Fit, Free, Level, Limits, Point, Segment, SegmentRows, Setup, Work, qr};
 use rayon::prelude::*;
 
 use crate::choose::{Reduced, Roles};
@@ -401,8 +401,13 @@ fn levels(structure: &Structure) -> &'static [usize] {
 }
 
 /// A first fit of `start` on short segments.
-pub(crate) fn begin(structure: &Structure, data: &Arc<Data>, start: State) -> Option<Refined> {
-    let setup = setup(structure, data, &start, None)?;
+pub(crate) fn begin(
+    structure: &Structure,
+    data: &Arc<Data>,
+    start: State,
+    work: &Arc<Work>,
+) -> Option<Refined> {
+    let setup = Setup { work: work.clone(), ..setup(structure, data, &start, None)? };
     let level = setup.level(levels(structure)[0]);
     let scale: Vec<f64> = data.sigma.iter().zip(&data.spread).map(|(s, d)| s.max(1e-6 * d)).collect();
     let point = Point { parameters: setup.values(), starts: setup.starts(&level, &setup.values()) };

@@ -39,13 +39,7 @@ pub(crate) struct Arguments {
 
 pub(crate) fn run(arguments: &Arguments) -> Result<Answer, Failure> {
     let loaded = arguments.model.as_deref().map(loading::model).transpose()?;
-    let mut paths = Vec::new();
-    for path in &arguments.recordings {
-        match path.is_dir() {
-            true => paths.extend(loading::recordings_of(path)?),
-            false => paths.push(path.clone()),
-        }
-    }
+    let paths = loading::without_folders(&arguments.recordings)?;
     let recordings = loading::recordings(&paths, &arguments.channels.map)?;
     let model = loaded.as_ref().map(|l| &l.model);
     let checked = check::check(&recordings, model, &arguments.inputs)?;
