@@ -95,7 +95,9 @@ class Recording:
         self._inner = _native.Recording(called, time, stated)
 
     @staticmethod
-    def _columns(data: Any, called: str) -> tuple[NDArray[np.float64], list[tuple[str, str | None, NDArray[np.float64]]]]:
+    def _columns(
+        data: Any, called: str
+    ) -> tuple[NDArray[np.float64], list[tuple[str, str | None, NDArray[np.float64]]]]:
         if not hasattr(data, "items"):
             raise TypeError(f"a recording is a file, a dict of arrays or a pandas frame, not {type(data).__name__}")
         columns = [(*_header(key), values) for key, values in data.items()]

@@ -1,6 +1,8 @@
 """The same input gives what the command gives."""
 
 import json
+import shutil
+from pathlib import Path
 
 import greybox
 import numpy as np
@@ -66,6 +68,37 @@ def test_a_controller_is_the_command_s(cart, command, tmp_path):
 def test_a_check_is_the_command_s(cart, command):
     done = command("check", cart["files"][0], "--model", cart["model"], "--json")
     assert greybox.check(cart["files"][0], cart["model"]).report == json.loads(done.stdout)
+
+
+MAT_FILES = Path(__file__).parents[2] / "crates" / "recording" / "tests" / "mat"
+
+
+def test_mat_files_are_read_as_by_the_command(command):
+    path = MAT_FILES / "structure.mat"
+    done = command("check", path, "--json")
+    assert greybox.check(path).report == json.loads(done.stdout)
+    read = greybox.Recording(path)
+    assert read.units and np.isfinite(read.t).all()
+
+
+def test_a_folder_is_checked_as_by_the_command(cart, command, tmp_path):
+    for file in cart["files"]:
+        shutil.copy(file, tmp_path)
+    done = command("check", tmp_path, "--json")
+    assert greybox.check(tmp_path).report == json.loads(done.stdout)
+    told = command("calibrate", cart["model"], tmp_path, "--out", tmp_path / "out", status=2).stderr
+    with pytest.raises(greybox.InputError) as error:
+        greybox.calibrate(cart["model"], tmp_path)
+    assert told == f"error: {error.value}\n"
+
+
+def test_what_a_build_leaves_out_is_told_as_by_the_command(cart, command, tmp_path):
+    path = tmp_path / "run.parquet"
+    path.write_bytes(b"PAR1")
+    told = command("check", path, status=2).stderr
+    with pytest.raises(greybox.InputError) as error:
+        greybox.check(path)
+    assert told == f"error: {error.value}\n"
 
 
 @pytest.mark.parametrize(
