@@ -1,31 +1,45 @@
 from collections.abc import Callable, Sequence
 from os import PathLike
-from typing import Any
+from typing import Any, final
 
 import numpy as np
 from numpy.typing import NDArray
 
-Floats = NDArray[np.float64]
-Source = Recording | str | PathLike[str]
-Progress = Callable[[str], object] | None
+_Floats = NDArray[np.float64]
+_Source = Recording | str | PathLike[str]
+_Progress = Callable[[str], object] | None
+
+__all__ = [
+    "Model",
+    "Recording",
+    "__version__",
+    "calibrate",
+    "check",
+    "control",
+    "diagnose",
+    "identify",
+    "simulate",
+]
 
 __version__: str
 
+@final
 class Recording:
-    def __init__(
-        self, name: str, time: Floats, channels: Sequence[tuple[str, str | None, Floats]]
-    ) -> None: ...
+    def __new__(
+        cls, name: str, time: _Floats, channels: Sequence[tuple[str, str | None, _Floats]]
+    ) -> Recording: ...
     @staticmethod
     def read(path: str | PathLike[str]) -> Recording: ...
     @property
     def name(self) -> str: ...
     @property
-    def t(self) -> Floats: ...
+    def t(self) -> _Floats: ...
     @property
-    def channels(self) -> list[tuple[str, str | None, Floats]]: ...
+    def channels(self) -> list[tuple[str, str | None, _Floats]]: ...
 
+@final
 class Model:
-    def __init__(self, text: str, file: str) -> None: ...
+    def __new__(cls, text: str, file: str) -> Model: ...
     @staticmethod
     def read(path: str | PathLike[str]) -> Model: ...
     @property
@@ -44,40 +58,40 @@ class Model:
     def parameters(self) -> dict[str, dict[str, Any]]: ...
     def with_parameters(self, values: Sequence[tuple[str, float]]) -> Model: ...
 
-Studied = tuple[str, str, str | None, str, list[dict[str, Any]]]
+_Studied = tuple[str, str, str | None, str, list[dict[str, Any]]]
 
 def diagnose(
     model: Model,
-    train: Sequence[Source],
-    holdout: Sequence[Source],
+    train: Sequence[_Source],
+    holdout: Sequence[_Source],
     map: Sequence[str],
     seed: int,
     work: int | None,
     mechanisms: str | PathLike[str] | None,
-    progress: Progress,
-) -> Studied: ...
+    progress: _Progress,
+) -> _Studied: ...
 def identify(
-    train: Sequence[Source],
-    holdout: Sequence[Source],
+    train: Sequence[_Source],
+    holdout: Sequence[_Source],
     map: Sequence[str],
     wanted: dict[str, Any],
-    progress: Progress,
-) -> Studied: ...
+    progress: _Progress,
+) -> _Studied: ...
 def calibrate(
     model: Model,
-    train: Sequence[Source],
-    holdout: Sequence[Source],
+    train: Sequence[_Source],
+    holdout: Sequence[_Source],
     map: Sequence[str],
-    progress: Progress,
-) -> Studied: ...
+    progress: _Progress,
+) -> _Studied: ...
 def simulate(
-    model: Model, recording: Source, map: Sequence[str], progress: Progress
-) -> tuple[str, str, Floats, list[tuple[str, Floats]]]: ...
+    model: Model, recording: _Source, map: Sequence[str], progress: _Progress
+) -> tuple[str, str, _Floats, list[tuple[str, _Floats]]]: ...
 def check(
-    recordings: Sequence[Source], model: Model | None, inputs: Sequence[str], map: Sequence[str]
+    recordings: Sequence[_Source], model: Model | None, inputs: Sequence[str], map: Sequence[str]
 ) -> tuple[str, str]: ...
 def control(
-    model: Model, wanted: dict[str, Any], report: tuple[str, str] | None, progress: Progress
+    model: Model, wanted: dict[str, Any], report: tuple[str, str] | None, progress: _Progress
 ) -> tuple[
-    str, str, list[tuple[str, bytes]], tuple[Floats, Floats, Floats, list[tuple[str, Floats]]]
+    str, str, list[tuple[str, bytes]], tuple[_Floats, _Floats, _Floats, list[tuple[str, _Floats]]]
 ]: ...

@@ -141,10 +141,15 @@ class Identification(_Paged):
 
     equations: Named[Equation]
     order: Record
-    delay: Named[Record]
     fit: Fit
     noise_floor: Named[float]
     findings: List[Finding]
+
+    @property
+    def delay(self) -> Named[Record]:
+        """The delayed feedback by the name of its state; empty where none was looked for."""
+        there: Named[Record] = self.report.get("delay", Named())
+        return there
 
     @property
     def model_text(self) -> str:

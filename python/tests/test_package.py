@@ -13,7 +13,7 @@ import time
 import greybox
 import numpy as np
 import pytest
-from conftest import FRICTION, NOMINAL
+from conftest import FRICTION, NOMINAL, run
 
 
 @pytest.fixture(scope="session")
@@ -192,6 +192,27 @@ def test_ctrl_c_is_heard_while_it_works(cart):
     assert "writing the report" not in stages
     # What was given up leaves the interpreter alone, and the next call works.
     assert greybox.check(cart["columns"][0]).recordings[0].rows == 1500
+
+
+def test_what_was_given_up_ends():
+    columns = run(1, rows=40_000)
+    begun = time.process_time()
+    greybox.calibrate(NOMINAL, columns)
+    whole = time.process_time() - begun
+
+    def stop(stage):
+        raise RuntimeError(stage)
+
+    with pytest.raises(RuntimeError):
+        greybox.calibrate(NOMINAL, columns, progress=stop)
+    given_up = before = time.process_time()
+    while True:
+        time.sleep(0.3)
+        now = time.process_time()
+        if now - before < 0.02:
+            break
+        before = now
+    assert now - given_up < 0.5 * whole, (now - given_up, whole)
 
 
 @pytest.mark.parametrize("module", ["_inputs", "_studies"])
