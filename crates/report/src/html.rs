@@ -588,9 +588,9 @@ fn italic(shown: &str) -> String {
 }
 
 /// Functions of the model language, set upright.
-const FUNCTIONS: [&str; 15] = [
-    "sin", "cos", "tan", "exp", "ln", "sqrt", "abs", "sign", "tanh", "min", "max", "delay", "deadzone",
-    "saturate", "step",
+const FUNCTIONS: [&str; 16] = [
+    "sin", "cos", "tan", "exp", "ln", "sqrt", "abs", "sign", "tanh", "atan", "min", "max", "delay",
+    "deadzone", "saturate", "step",
 ];
 
 // -- where the residual comes from ------------------------------------------------------------------------
