@@ -6,6 +6,7 @@
 //! by askama), through [`crate::expression::escape`], and as JSON in the data island, where `<`, `>` and `&`
 //! are written as `\u00XX` so that nothing in it can close the element.
 
+mod compare;
 mod control;
 mod identified;
 mod summary;

@@ -1,0 +1,146 @@
+//! Two diagnoses side by side: what counts as a change, the schema, and the page.
+#![allow(clippy::unwrap_used, reason = "helpers of tests panic like the tests themselves")]
+
+use std::sync::OnceLock;
+
+use greybox_report::Comparison;
+use greybox_report::compare::schema;
+use greybox_report::contract::{Estimate, Finding, Interval, Report, Severity, Verdict};
+
+#[path = "common/schema.rs"]
+mod documents;
+#[path = "../examples/sample/mod.rs"]
+mod sample;
+
+/// The sample's report, whose signals take a while to make.
+fn sampled() -> &'static Report {
+    static REPORT: OnceLock<Report> = OnceLock::new();
+    REPORT.get_or_init(|| sample::page().report)
+}
+
+/// The sample's report with this much friction.
+fn report(fc: f64, half: f64) -> Report {
+    let mut report = sampled().clone();
+    let estimate =
+        Estimate { value: fc, ci95: Some(Interval::new(fc - half, fc + half)), unit: "N m".into() };
+    report.mechanisms[0].parameters.insert("fc".into(), estimate);
+    report
+}
+
+fn compared(before: &Report, after: &Report) -> Comparison {
+    Comparison::of(("march", before), ("april <2>", after))
+}
+
+#[test]
+fn the_checked_in_schema_is_current() {
+    documents::assert_current("comparison.schema.json", &schema());
+}
+
+#[test]
+fn a_comparison_satisfies_the_schema_and_comes_back_unchanged() {
+    let mut after = report(0.09, 0.004);
+    after.fit.holdout.improved["theta"].nrmse = f64::INFINITY;
+    let text = compared(&report(0.06, 0.004), &after).to_json().unwrap();
+    let json = documents::assert_valid(&text, &schema());
+    let back: Comparison = serde_json::from_str(&text).unwrap();
+    assert_eq!(back.to_json().unwrap(), text);
+    assert_eq!(json["mechanisms"][0]["kind"], "coulomb_friction");
+    assert_eq!(json["mechanisms"][0]["parameters"]["fc"]["changed"], true);
+    assert_eq!(json["mechanisms"][0]["parameters"]["fc"]["before"]["value"], 0.06);
+    assert!(json["holdout"]["theta"]["after"]["improved"].is_null());
+}
+
+#[test]
+fn a_report_beside_itself_has_not_changed() {
+    let c = compared(sampled(), sampled());
+    assert!(c.cautions.is_empty(), "{:?}", c.cautions);
+    assert!(c.findings_new.is_empty() && c.findings_gone.is_empty());
+    let changes = c.mechanisms.iter().flat_map(|m| m.parameters.values()).chain(c.parameters.values());
+    assert!(changes.clone().count() > 3 && changes.clone().all(|c| c.changed != Some(true)));
+    assert!(c.mechanisms.iter().all(|m| m.before == m.after && m.before.is_some()));
+    assert!(c.to_html().unwrap().contains("<span class=\"badge\">Unchanged</span>"));
+}
+
+/// √(3² + 4²) = 5: a difference of 4.9 half-widths is none, one of 5.1 is.
+#[test]
+fn a_change_is_more_than_the_half_width_of_the_difference() {
+    for (after, changed) in [(0.149, false), (0.151, true), (0.049, true), (0.051, false)] {
+        let c = compared(&report(0.1, 0.03), &report(after, 0.04));
+        assert_eq!(c.mechanisms[0].parameters["fc"].changed, Some(changed), "{after}");
+        assert_eq!(c.summary[1].contains("but changed: f"), changed, "{:?}", c.summary);
+    }
+    // Without an interval, or in another unit, nothing can be said.
+    let mut other = report(0.2, 0.01);
+    other.mechanisms[0].parameters["fc"].unit = "mN m".into();
+    assert_eq!(compared(&report(0.1, 0.01), &other).mechanisms[0].parameters["fc"].changed, None);
+    other.mechanisms[0].parameters["fc"].ci95 = None;
+    assert_eq!(compared(&report(0.1, 0.01), &other).mechanisms[0].parameters["fc"].changed, None);
+}
+
+#[test]
+fn what_is_new_what_is_gone_and_what_moved_are_told_apart() {
+    let old = report(0.06, 0.004);
+    let mut new = report(0.06, 0.004);
+    new.mechanisms[0].kind = "viscous_friction".into();
+    let c = compared(&old, &new);
+    assert_eq!(c.mechanisms.len(), old.mechanisms.len() + 1);
+    assert_eq!(c.summary.iter().filter(|s| s.ends_with(" is new.")).count(), 1, "{:?}", c.summary);
+    assert_eq!(c.summary.iter().filter(|s| s.ends_with(" is gone.")).count(), 1, "{:?}", c.summary);
+
+    // The same kind in another equation is another mechanism.
+    let mut moved = report(0.06, 0.004);
+    moved.mechanisms[0].location.equation = Some("link".into());
+    assert_eq!(compared(&old, &moved).mechanisms.len(), old.mechanisms.len() + 1);
+
+    let mut agreed = old.clone();
+    agreed.mechanisms.clear();
+    agreed.verdict = Verdict::Consistent;
+    let c = compared(&old, &agreed);
+    assert_eq!(
+        c.summary[0],
+        "Before: physics is missing. After: the model agrees with the recordings."
+    );
+}
+
+#[test]
+fn what_makes_figures_incomparable_is_said() {
+    let mut after = sampled().clone();
+    after.model.file = "other.toml".into();
+    after.samples.train += 1;
+    after.greybox.version = "9.9.9".into();
+    after.parameters[0].nominal += 1.0;
+    let c = compared(sampled(), &after);
+    for part in ["other.toml", "different recordings", "9.9.9", "different values"] {
+        assert!(c.cautions.iter().any(|s| s.contains(part)), "{part}: {:?}", c.cautions);
+    }
+}
+
+#[test]
+fn the_page_shows_both_runs_and_escapes_what_comes_from_files() {
+    let mut after = report(0.09, 0.004);
+    after.findings.push(Finding {
+        severity: Severity::Warning,
+        code: "clipping".into(),
+        recording: Some("<script>.csv".into()),
+        channel: None,
+        message: "it clips".into(),
+        mend: None,
+    });
+    let html = compared(&report(0.06, 0.004), &after).to_html().unwrap();
+    for text in [
+        "<span class=\"badge\">Changed</span>",
+        "<dd>march</dd>",
+        "<dd>april &#60;2&#62;</dd>",
+        "Coulomb friction <small>in the hub equation: <b>in both, changed</b></small>",
+        "0.060 ± 0.004",
+        "0.090 ± 0.004",
+        "&#60;script&#62;.csv: it clips",
+    ] {
+        assert!(html.contains(text), "the page lacks {text:?}");
+    }
+    for link in html.split("href=\"#").skip(1) {
+        let target = link.split('"').next().unwrap();
+        assert!(html.contains(&format!("id=\"{target}\"")), "{target}");
+    }
+    assert!(!html.contains("<script") && !html.contains("src="));
+}
