@@ -43,6 +43,21 @@ pub(crate) fn number(v: f64) -> String {
     if v.fract() == 0.0 && v.abs() < 1e15 { format!("{v}") } else { format!("{v:?}") }
 }
 
+/// A string literal in double quotes: quotes and backslashes get a backslash, `other` writes the rest.
+pub(crate) fn quoted(text: &str, other: impl Fn(&mut String, char)) -> String {
+    let mut out = String::from("\"");
+    for c in text.chars() {
+        if matches!(c, '"' | '\\') {
+            out.push('\\');
+            out.push(c);
+        } else {
+            other(&mut out, c);
+        }
+    }
+    out.push('"');
+    out
+}
+
 /// The expression, with parentheses unless it holds together.
 pub(crate) fn atom<D: Dialect>(e: &Expr, dialect: &mut D) -> String {
     write(e, Tightness::Atom, dialect)

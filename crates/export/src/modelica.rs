@@ -6,7 +6,7 @@ use greybox_model::expr::Func;
 use greybox_model::{Dimension, Expr, Model, System, Unit};
 
 use crate::error::ExportError;
-use crate::infix::{Dialect, atom, number, text};
+use crate::infix::{Dialect, atom, number, quoted, text};
 use crate::names::{Names, ascii};
 
 /// Keywords of Modelica (Language Specification 3.6, 2.3.3), its functions and predefined types, and names
@@ -301,19 +301,7 @@ fn said(own: &str, name: &str) -> String {
 
 /// A string; Modelica's escapes are those of C.
 fn string(text: &str) -> String {
-    let mut out = String::from("\"");
-    for c in text.chars() {
-        match c {
-            '"' | '\\' => {
-                out.push('\\');
-                out.push(c);
-            }
-            c if c.is_control() => out.push(' '),
-            c => out.push(c),
-        }
-    }
-    out.push('"');
-    out
+    quoted(text, |out, c| out.push(if c.is_control() { ' ' } else { c }))
 }
 
 /// The letters and digits of a name, each word with a capital.

@@ -7,7 +7,7 @@ use greybox_model::system::CompileError;
 use greybox_model::{Expr, Hold, Model, System, Unit};
 
 use crate::error::ExportError;
-use crate::infix::{Dialect, number, text};
+use crate::infix::{Dialect, number, quoted, text};
 use crate::names::Names;
 
 /// The part that is the same for every model: inputs between samples, events, delays, steps.
@@ -489,21 +489,13 @@ fn comment(text: &str) -> String {
     format!("  # {line}")
 }
 
-/// A string literal.
-pub(crate) fn literal(text: &str) -> String {
-    let mut out = String::from("\"");
-    for c in text.chars() {
-        match c {
-            '"' | '\\' => {
-                out.push('\\');
-                out.push(c);
-            }
-            c if c.is_alphanumeric() || c.is_ascii_graphic() || c == ' ' => out.push(c),
-            c => {
-                let _ = write!(out, "\\U{:08x}", c as u32);
-            }
+/// A string literal; what does not show is written by its code point.
+fn literal(text: &str) -> String {
+    quoted(text, |out, c| {
+        if c.is_alphanumeric() || c.is_ascii_graphic() || c == ' ' {
+            out.push(c);
+        } else {
+            let _ = write!(out, "\\U{:08x}", c as u32);
         }
-    }
-    out.push('"');
-    out
+    })
 }

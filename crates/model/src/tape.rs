@@ -161,21 +161,66 @@ impl Switch {
 
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]
 enum Op {
-    Neg(Reg),
+    Of(Smooth, Reg),
     Add(Reg, Reg),
     Sub(Reg, Reg),
     Mul(Reg, Reg),
     Div(Reg, Reg),
     Powi(Reg, i32),
     Pow(Reg, Reg),
-    Sqrt(Reg),
-    Sin(Reg),
-    Cos(Reg),
-    Tan(Reg),
-    Exp(Reg),
-    Ln(Reg),
-    Tanh(Reg),
     Switch(u32),
+}
+
+/// A smooth function of one argument.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]
+enum Smooth {
+    Neg,
+    Sqrt,
+    Sin,
+    Cos,
+    Tan,
+    Exp,
+    Ln,
+    Tanh,
+}
+
+impl Smooth {
+    #[inline(always)]
+    fn value(self, x: f64) -> f64 {
+        match self {
+            Smooth::Neg => -x,
+            Smooth::Sqrt => x.sqrt(),
+            Smooth::Sin => x.sin(),
+            Smooth::Cos => x.cos(),
+            Smooth::Tan => x.tan(),
+            Smooth::Exp => x.exp(),
+            Smooth::Ln => x.ln(),
+            Smooth::Tanh => x.tanh(),
+        }
+    }
+
+    /// The derivative at `x`, where the function is `y`.
+    #[inline(never)]
+    fn slope(self, x: f64, y: f64) -> f64 {
+        match self {
+            Smooth::Neg => -1.0,
+            // At 0 the slope of the root is infinite; a zero derivative keeps lanes finite
+            // where a state rests at the boundary of its domain (an empty tank).
+            Smooth::Sqrt => {
+                if y > 0.0 {
+                    0.5 / y
+                } else {
+                    0.0
+                }
+            }
+            Smooth::Sin => x.cos(),
+            Smooth::Cos => -x.sin(),
+            Smooth::Tan => 1.0 + y * y,
+            Smooth::Exp => y,
+            Smooth::Ln => 1.0 / x,
+            Smooth::Tanh => 1.0 - y * y,
+        }
+    }
 }
 
 /// A delayed value: `leaf` receives `arg` evaluated `tau` ago.
@@ -314,10 +359,10 @@ impl<'a> Compiler<'a> {
         OPERATION + i as Reg
     }
 
-    fn unary(&mut self, op: fn(Reg) -> Op, a: Reg, f: fn(f64) -> f64) -> Reg {
+    fn smooth(&mut self, f: Smooth, a: Reg) -> Reg {
         match self.constant_value(a) {
-            Some(v) => self.constant(f(v)),
-            None => self.push(op(a), &[a]),
+            Some(v) => self.constant(f.value(v)),
+            None => self.push(Op::Of(f, a), &[a]),
         }
     }
 
@@ -353,7 +398,7 @@ impl<'a> Compiler<'a> {
             }
             Expr::Neg(a) => {
                 let a = self.add(a)?;
-                self.unary(Op::Neg, a, |v| -v)
+                self.smooth(Smooth::Neg, a)
             }
             Expr::Bin(op, a, b) => {
                 let (ra, rb) = (self.add(a)?, self.add(b)?);
@@ -395,13 +440,13 @@ impl<'a> Compiler<'a> {
             Expr::Call(f, args) => {
                 let a = self.add(&args[0])?;
                 match f {
-                    Func::Sin => self.unary(Op::Sin, a, f64::sin),
-                    Func::Cos => self.unary(Op::Cos, a, f64::cos),
-                    Func::Tan => self.unary(Op::Tan, a, f64::tan),
-                    Func::Exp => self.unary(Op::Exp, a, f64::exp),
-                    Func::Ln => self.unary(Op::Ln, a, f64::ln),
-                    Func::Sqrt => self.unary(Op::Sqrt, a, f64::sqrt),
-                    Func::Tanh => self.unary(Op::Tanh, a, f64::tanh),
+                    Func::Sin => self.smooth(Smooth::Sin, a),
+                    Func::Cos => self.smooth(Smooth::Cos, a),
+                    Func::Tan => self.smooth(Smooth::Tan, a),
+                    Func::Exp => self.smooth(Smooth::Exp, a),
+                    Func::Ln => self.smooth(Smooth::Ln, a),
+                    Func::Sqrt => self.smooth(Smooth::Sqrt, a),
+                    Func::Tanh => self.smooth(Smooth::Tanh, a),
                     Func::Sign => self.switch(SwitchKind::Sign, a, a),
                     Func::Abs => self.switch(SwitchKind::Abs, a, a),
                     Func::Min | Func::Max | Func::Deadzone | Func::Saturate | Func::Step => {
@@ -445,20 +490,13 @@ impl<'a> Compiler<'a> {
         let ops: Vec<Op> = order
             .iter()
             .map(|&i| match self.ops[i].0 {
-                Op::Neg(a) => Op::Neg(at(a)),
+                Op::Of(f, a) => Op::Of(f, at(a)),
                 Op::Add(a, b) => Op::Add(at(a), at(b)),
                 Op::Sub(a, b) => Op::Sub(at(a), at(b)),
                 Op::Mul(a, b) => Op::Mul(at(a), at(b)),
                 Op::Div(a, b) => Op::Div(at(a), at(b)),
                 Op::Powi(a, n) => Op::Powi(at(a), n),
                 Op::Pow(a, b) => Op::Pow(at(a), at(b)),
-                Op::Sqrt(a) => Op::Sqrt(at(a)),
-                Op::Sin(a) => Op::Sin(at(a)),
-                Op::Cos(a) => Op::Cos(at(a)),
-                Op::Tan(a) => Op::Tan(at(a)),
-                Op::Exp(a) => Op::Exp(at(a)),
-                Op::Ln(a) => Op::Ln(at(a)),
-                Op::Tanh(a) => Op::Tanh(at(a)),
                 Op::Switch(k) => Op::Switch(k),
             })
             .collect();
@@ -608,11 +646,6 @@ impl Tape {
                 let (lower, upper) = regs.split_at_mut(first + i);
                 let o = &mut upper[0];
                 let r = |a: Reg| &lower[a as usize];
-                let map1 = |o: &mut [f64; LANES], a: Reg, f: fn(f64) -> f64| {
-                    for (o, x) in o.iter_mut().zip(r(a)) {
-                        *o = f(*x);
-                    }
-                };
                 macro_rules! map2 {
                     ($a:expr, $b:expr, $f:expr) => {
                         for ((o, x), y) in o.iter_mut().zip(r($a)).zip(r($b)) {
@@ -621,7 +654,11 @@ impl Tape {
                     };
                 }
                 match *op {
-                    Op::Neg(a) => map1(o, a, |x| -x),
+                    Op::Of(f, a) => {
+                        for (o, x) in o.iter_mut().zip(r(a)) {
+                            *o = f.value(*x);
+                        }
+                    }
                     Op::Add(a, b) => map2!(a, b, |x: f64, y: f64| x + y),
                     Op::Sub(a, b) => map2!(a, b, |x: f64, y: f64| x - y),
                     Op::Mul(a, b) => map2!(a, b, |x: f64, y: f64| x * y),
@@ -632,13 +669,6 @@ impl Tape {
                             *o = powi(*x, n);
                         }
                     }
-                    Op::Sqrt(a) => map1(o, a, f64::sqrt),
-                    Op::Sin(a) => map1(o, a, f64::sin),
-                    Op::Cos(a) => map1(o, a, f64::cos),
-                    Op::Tan(a) => map1(o, a, f64::tan),
-                    Op::Exp(a) => map1(o, a, f64::exp),
-                    Op::Ln(a) => map1(o, a, f64::ln),
-                    Op::Tanh(a) => map1(o, a, f64::tanh),
                     Op::Switch(k) => {
                         let s = &self.switches[k as usize];
                         map2!(s.a, s.b, |x: f64, y: f64| s.value(s.natural_mode(x, y), 0.0, x, y));

@@ -8,7 +8,7 @@
 //!
 //! so that λ ∈ [0, 1] has no unit and no term is judged by its scale. Columns of weight 0 are protected: they
 //! are projected out of the others and of the target first (Frisch–Waugh; exact, by the triangular factor), and
-//! take no part in the descent. Thesis Eq 2.13 is this with ½ and the norms taken into λ.
+//! take no part in the descent. Thesis Eq 2.14 is this with ½ and the norms taken into λ.
 //!
 //! With the signs of the coefficients known the minimiser solves a linear system; from one λ to the next the active set
 //! changes by few columns, so that its Cholesky factor is kept and the steps are exact (feature-sign search). Where the

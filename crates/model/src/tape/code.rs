@@ -6,23 +6,7 @@ use super::{Op, Reg, Switch, powi};
 
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub(super) enum Code {
-    Neg(Reg),
-    Add(Reg, Reg),
-    Sub(Reg, Reg),
-    Mul(Reg, Reg),
-    Div(Reg, Reg),
-    Square(Reg),
-    Cube(Reg),
-    Powi(Reg, i32),
-    Pow(Reg, Reg),
-    Sqrt(Reg),
-    Sin(Reg),
-    Cos(Reg),
-    Tan(Reg),
-    Exp(Reg),
-    Ln(Reg),
-    Tanh(Reg),
-    Switch(u32),
+    One(Op),
     /// a b, then a b + c.
     MulAdd(Reg, Reg, Reg),
     /// a b, then a b − c.
@@ -45,7 +29,7 @@ pub(super) fn compile(ops: &[Op], first: usize) -> Vec<Code> {
                 i += 2;
             }
             None => {
-                code.push(single(ops[i]));
+                code.push(Code::One(ops[i]));
                 i += 1;
             }
         }
@@ -74,28 +58,6 @@ fn pair(op: Op, product: Reg, next: Op) -> Option<Code> {
     }
 }
 
-fn single(op: Op) -> Code {
-    match op {
-        Op::Neg(a) => Code::Neg(a),
-        Op::Add(a, b) => Code::Add(a, b),
-        Op::Sub(a, b) => Code::Sub(a, b),
-        Op::Mul(a, b) => Code::Mul(a, b),
-        Op::Div(a, b) => Code::Div(a, b),
-        Op::Powi(a, 2) => Code::Square(a),
-        Op::Powi(a, 3) => Code::Cube(a),
-        Op::Powi(a, n) => Code::Powi(a, n),
-        Op::Pow(a, b) => Code::Pow(a, b),
-        Op::Sqrt(a) => Code::Sqrt(a),
-        Op::Sin(a) => Code::Sin(a),
-        Op::Cos(a) => Code::Cos(a),
-        Op::Tan(a) => Code::Tan(a),
-        Op::Exp(a) => Code::Exp(a),
-        Op::Ln(a) => Code::Ln(a),
-        Op::Tanh(a) => Code::Tanh(a),
-        Op::Switch(k) => Code::Switch(k),
-    }
-}
-
 /// Runs `code`, whose results go to the registers from `first` on. With `NATURAL` every mode is taken from the
 /// arguments' values and left in `modes`; else `lambda[k]` is the value of a sticking sign `k`.
 #[inline(always)]
@@ -111,29 +73,14 @@ pub(super) fn run<const NATURAL: bool>(
     for op in code {
         let g = |r: Reg| regs[r as usize];
         let v = match *op {
-            Code::Neg(a) => -g(a),
-            Code::Add(a, b) => g(a) + g(b),
-            Code::Sub(a, b) => g(a) - g(b),
-            Code::Mul(a, b) => g(a) * g(b),
-            Code::Div(a, b) => g(a) / g(b),
-            Code::Square(a) => {
-                let x = g(a);
-                x * x
-            }
-            Code::Cube(a) => {
-                let x = g(a);
-                x * x * x
-            }
-            Code::Powi(a, n) => powi(g(a), n),
-            Code::Pow(a, b) => g(a).powf(g(b)),
-            Code::Sqrt(a) => g(a).sqrt(),
-            Code::Sin(a) => g(a).sin(),
-            Code::Cos(a) => g(a).cos(),
-            Code::Tan(a) => g(a).tan(),
-            Code::Exp(a) => g(a).exp(),
-            Code::Ln(a) => g(a).ln(),
-            Code::Tanh(a) => g(a).tanh(),
-            Code::Switch(k) => {
+            Code::One(Op::Of(f, a)) => f.value(g(a)),
+            Code::One(Op::Add(a, b)) => g(a) + g(b),
+            Code::One(Op::Sub(a, b)) => g(a) - g(b),
+            Code::One(Op::Mul(a, b)) => g(a) * g(b),
+            Code::One(Op::Div(a, b)) => g(a) / g(b),
+            Code::One(Op::Powi(a, n)) => powi(g(a), n),
+            Code::One(Op::Pow(a, b)) => g(a).powf(g(b)),
+            Code::One(Op::Switch(k)) => {
                 let s = &switches[k as usize];
                 let (a, b) = (g(s.a), g(s.b));
                 if NATURAL {

@@ -1,6 +1,6 @@
 //! Directional derivatives of the registers: which have any, and the rule of each.
 
-use super::{Op, Reg, Switch, SwitchKind, powi};
+use super::{Op, Reg, Smooth, Switch, SwitchKind, powi};
 
 /// Which registers can have a non-zero derivative, and what computes it. Made once by
 /// [`Tape::tangents`](super::Tape::tangents), for the leaves that have one.
@@ -53,8 +53,6 @@ pub(super) struct Row {
 enum Rule {
     /// da.
     Same(Reg),
-    /// −da.
-    Negated(Reg),
     /// da + db.
     Sum(Reg, Reg),
     /// da − db.
@@ -69,6 +67,9 @@ enum Rule {
     Under(Reg, Reg),
     /// d(a / b).
     Quotient(Reg, Reg),
+    /// d f(a).
+    Of(Smooth, Reg),
+    /// d(aⁿ).
     Powi(Reg, i32),
     /// d(a^B).
     Base(Reg, Reg),
@@ -76,13 +77,6 @@ enum Rule {
     Exponent(Reg, Reg),
     /// d(a^b).
     Pow(Reg, Reg),
-    Sqrt(Reg),
-    Sin(Reg),
-    Cos(Reg),
-    Tan(Reg),
-    Exp(Reg),
-    Ln(Reg),
-    Tanh(Reg),
     /// A non-smooth function: by its mode; which of the arguments have a row.
     Switch(u32, bool, bool),
 }
@@ -97,20 +91,13 @@ impl Rule {
             (false, false) => None,
         };
         match op {
-            Op::Neg(a) => one(a, Rule::Negated(a)),
+            Op::Of(f, a) => one(a, Rule::Of(f, a)),
             Op::Add(a, b) => two(a, b, Rule::Same(a), Rule::Same(b), Rule::Sum(a, b)),
-            Op::Sub(a, b) => two(a, b, Rule::Same(a), Rule::Negated(b), Rule::Difference(a, b)),
+            Op::Sub(a, b) => two(a, b, Rule::Same(a), Rule::Of(Smooth::Neg, b), Rule::Difference(a, b)),
             Op::Mul(a, b) => two(a, b, Rule::Scaled(a, b), Rule::Scaled(b, a), Rule::Product(a, b)),
             Op::Div(a, b) => two(a, b, Rule::Over(a, b), Rule::Under(a, b), Rule::Quotient(a, b)),
             Op::Powi(a, n) => one(a, Rule::Powi(a, n)),
             Op::Pow(a, b) => two(a, b, Rule::Base(a, b), Rule::Exponent(a, b), Rule::Pow(a, b)),
-            Op::Sqrt(a) => one(a, Rule::Sqrt(a)),
-            Op::Sin(a) => one(a, Rule::Sin(a)),
-            Op::Cos(a) => one(a, Rule::Cos(a)),
-            Op::Tan(a) => one(a, Rule::Tan(a)),
-            Op::Exp(a) => one(a, Rule::Exp(a)),
-            Op::Ln(a) => one(a, Rule::Ln(a)),
-            Op::Tanh(a) => one(a, Rule::Tanh(a)),
             Op::Switch(k) => {
                 let s = &switches[k as usize];
                 let (a, b) = (active(s.a), active(s.b));
@@ -139,58 +126,24 @@ pub(super) fn run(rows: &[Row], at: Place<'_>, lanes: usize, d: &mut [f64]) {
         let o = &mut upper[..lanes];
         let v = |r: Reg| at.regs[r as usize];
         let row = |r: Reg| &lower[r as usize * lanes..][..lanes];
-        // (Every operation has few forms of arithmetic, so that it stands here few times.)
         match *rule {
             Rule::Same(a) => o.copy_from_slice(row(a)),
             Rule::Sum(a, b) => join(o, row(a), row(b), |x, y| x + y),
             Rule::Difference(a, b) => join(o, row(a), row(b), |x, y| x - y),
             Rule::Scaled(a, b) => scale(o, row(a), v(b)),
             Rule::Product(a, b) => blend(o, row(a), v(b), row(b), v(a)),
-            Rule::Switch(k, a, b) => switch(o, k as usize, (a, b), at, lower),
-            other => match other.factors(at.regs, out) {
-                (Some((a, ka)), Some((b, kb))) => blend(o, row(a), ka, row(b), kb),
-                (Some((a, k)), None) | (None, Some((a, k))) => scale(o, row(a), k),
-                (None, None) => {}
-            },
-        }
-    }
-}
-
-type Factor = Option<(Reg, f64)>;
-
-impl Rule {
-    /// The arguments' rows and what they are multiplied with.
-    #[inline(never)]
-    fn factors(self, regs: &[f64], out: usize) -> (Factor, Factor) {
-        let v = |r: Reg| regs[r as usize];
-        let one = |a: Reg, k: f64| (Some((a, k)), None);
-        match self {
-            Rule::Negated(a) => one(a, -1.0),
-            Rule::Over(a, b) => one(a, 1.0 / v(b)),
-            Rule::Under(a, b) => one(b, -v(a) / (v(b) * v(b))),
-            Rule::Quotient(a, b) => (Some((a, 1.0 / v(b))), Some((b, -v(a) / (v(b) * v(b))))),
-            Rule::Powi(a, n) => one(a, n as f64 * powi(v(a), n - 1)),
-            Rule::Base(a, b) => one(a, v(b) * v(a).powf(v(b) - 1.0)),
-            Rule::Exponent(a, b) => one(b, v(a).powf(v(b)) * v(a).ln()),
+            Rule::Over(a, b) => scale(o, row(a), 1.0 / v(b)),
+            Rule::Under(a, b) => scale(o, row(b), -v(a) / (v(b) * v(b))),
+            Rule::Quotient(a, b) => blend(o, row(a), 1.0 / v(b), row(b), -v(a) / (v(b) * v(b))),
+            Rule::Of(f, a) => scale(o, row(a), f.slope(v(a), at.regs[out])),
+            Rule::Powi(a, n) => scale(o, row(a), n as f64 * powi(v(a), n - 1)),
+            Rule::Base(a, b) => scale(o, row(a), v(b) * v(a).powf(v(b) - 1.0)),
+            Rule::Exponent(a, b) => scale(o, row(b), v(a).powf(v(b)) * v(a).ln()),
             Rule::Pow(a, b) => {
                 let (x, y) = (v(a), v(b));
-                (Some((a, y * x.powf(y - 1.0))), Some((b, x.powf(y) * x.ln())))
+                blend(o, row(a), y * x.powf(y - 1.0), row(b), x.powf(y) * x.ln());
             }
-            // At 0 the slope of the root is infinite; a zero derivative keeps lanes finite
-            // where a state rests at the boundary of its domain (an empty tank).
-            Rule::Sqrt(a) => one(a, if regs[out] > 0.0 { 0.5 / regs[out] } else { 0.0 }),
-            Rule::Sin(a) => one(a, v(a).cos()),
-            Rule::Cos(a) => one(a, -v(a).sin()),
-            Rule::Tan(a) => one(a, 1.0 + regs[out] * regs[out]),
-            Rule::Exp(a) => one(a, regs[out]),
-            Rule::Ln(a) => one(a, 1.0 / v(a)),
-            Rule::Tanh(a) => one(a, 1.0 - regs[out] * regs[out]),
-            Rule::Same(a) => one(a, 1.0),
-            Rule::Sum(a, b) => (Some((a, 1.0)), Some((b, 1.0))),
-            Rule::Difference(a, b) => (Some((a, 1.0)), Some((b, -1.0))),
-            Rule::Scaled(a, b) => one(a, v(b)),
-            Rule::Product(a, b) => (Some((a, v(b))), Some((b, v(a)))),
-            Rule::Switch(..) => (None, None),
+            Rule::Switch(k, a, b) => switch(o, k as usize, (a, b), at, lower),
         }
     }
 }
