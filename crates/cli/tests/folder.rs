@@ -276,7 +276,8 @@ fn two_diagnoses_are_held_against_each_other() {
         assert!(said.stdout.contains(part), "{part}: {}", said.stdout);
     }
     assert_eq!(names(&bench.path("change")), ["comparison.html", "comparison.json"]);
-    let json: Value = serde_json::from_slice(&fs::read(bench.path("change/comparison.json")).unwrap()).unwrap();
+    let json: Value =
+        serde_json::from_slice(&fs::read(bench.path("change/comparison.json")).unwrap()).unwrap();
     assert_eq!(json["mechanisms"][0]["kind"], "viscous_friction");
     let printed = bench.greybox(&[&compare as &[&str], &["--json"]].concat());
     assert_eq!(serde_json::from_str::<Value>(&printed.stdout).unwrap(), json);
@@ -285,7 +286,11 @@ fn two_diagnoses_are_held_against_each_other() {
     for (path, part) in [("no.json", "this is no report of a diagnosis"), ("nowhere", "cannot be read")] {
         let refused = bench.greybox(&["compare", path, "out/friday", "--out", "none"]);
         assert_eq!(refused.code, 2, "{}", refused.stderr);
-        assert!(refused.stderr.contains(part) && refused.stderr.contains("report.json"), "{}", refused.stderr);
+        assert!(
+            refused.stderr.contains(part) && refused.stderr.contains("report.json"),
+            "{}",
+            refused.stderr
+        );
     }
     assert!(!bench.path("none").exists());
 }

@@ -5,8 +5,10 @@ use std::sync::OnceLock;
 
 use greybox_report::Comparison;
 use greybox_report::compare::schema;
-use greybox_report::contract::{Estimate, Finding, Interval, Report, Severity, Verdict};
+use greybox_report::contract::{Estimate, Finding, Interval, Parameter, Report, Severity, Verdict};
 
+#[path = "common/browser.rs"]
+mod browser;
 #[path = "common/schema.rs"]
 mod documents;
 #[path = "../examples/sample/mod.rs"]
@@ -96,10 +98,7 @@ fn what_is_new_what_is_gone_and_what_moved_are_told_apart() {
     agreed.mechanisms.clear();
     agreed.verdict = Verdict::Consistent;
     let c = compared(&old, &agreed);
-    assert_eq!(
-        c.summary[0],
-        "Before: physics is missing. After: the model agrees with the recordings."
-    );
+    assert_eq!(c.summary[0], "Before: physics is missing. After: the model agrees with the recordings.");
 }
 
 #[test]
@@ -115,8 +114,8 @@ fn what_makes_figures_incomparable_is_said() {
     }
 }
 
-#[test]
-fn the_page_shows_both_runs_and_escapes_what_comes_from_files() {
+/// More friction, and a finding that was not there.
+fn changed() -> Comparison {
     let mut after = report(0.09, 0.004);
     after.findings.push(Finding {
         severity: Severity::Warning,
@@ -126,14 +125,21 @@ fn the_page_shows_both_runs_and_escapes_what_comes_from_files() {
         message: "it clips".into(),
         mend: None,
     });
-    let html = compared(&report(0.06, 0.004), &after).to_html().unwrap();
+    compared(&report(0.06, 0.004), &after)
+}
+
+#[test]
+fn the_page_shows_both_runs_and_escapes_what_comes_from_files() {
+    let html = changed().to_html().unwrap();
     for text in [
         "<span class=\"badge\">Changed</span>",
         "<dd>march</dd>",
         "<dd>april &#60;2&#62;</dd>",
         "Coulomb friction <small>in the hub equation: <b>in both, changed</b></small>",
-        "0.060 ± 0.004",
-        "0.090 ± 0.004",
+        "0.060 ±\u{a0}0.004",
+        "0.090 ±\u{a0}0.004",
+        "+0.030 ±\u{a0}0.006, changed",
+        "<svg class=\"change\"",
         "&#60;script&#62;.csv: it clips",
     ] {
         assert!(html.contains(text), "the page lacks {text:?}");
@@ -143,4 +149,60 @@ fn the_page_shows_both_runs_and_escapes_what_comes_from_files() {
         assert!(html.contains(&format!("id=\"{target}\"")), "{target}");
     }
     assert!(!html.contains("<script") && !html.contains("src="));
+}
+
+#[test]
+fn the_page_keeps_nobody_out() {
+    let Some(faults) = browser::faults(&changed().to_html().unwrap()) else { return };
+    assert!(faults.is_empty(), "{faults:#?}");
+}
+
+#[test]
+fn hostile_names_do_nothing_in_the_browser() {
+    let evil = "</title></style><script>document.documentElement.dataset.owned='1'</script>\
+                <img src=x onerror=\"document.documentElement.dataset.owned='2'\">";
+    let hostile = |fc: f64| {
+        let mut report = report(fc, 0.004);
+        report.model.name = evil.into();
+        report.model.file = evil.into();
+        report.greybox.version = format!("{fc} {evil}");
+        report.fit.holdout_source = format!("{fc} {evil}");
+        report.mechanisms[0].kind = evil.into();
+        report.mechanisms[0].expression = evil.into();
+        report.mechanisms[0].location.channel = Some(evil.into());
+        report.mechanisms[0].parameters.insert(
+            evil.into(),
+            Estimate { value: fc, ci95: Some(Interval::new(fc - 0.01, fc + 0.01)), unit: evil.into() },
+        );
+        let first = report.parameters[0].clone();
+        report
+            .parameters
+            .insert(evil.into(), Parameter { unit: Some(evil.into()), value: fc, fixed: false, ..first });
+        for set in [
+            &mut report.fit.holdout.nominal,
+            &mut report.fit.holdout.calibrated,
+            &mut report.fit.holdout.improved,
+        ] {
+            let score = set["theta"];
+            set.insert(evil.into(), score);
+        }
+        report.findings.push(Finding {
+            severity: Severity::Warning,
+            code: evil.into(),
+            recording: Some(evil.into()),
+            channel: Some(evil.into()),
+            message: format!("{fc} {evil}"),
+            mend: Some(evil.into()),
+        });
+        report
+    };
+    let html = Comparison::of((evil, &hostile(0.06)), (evil, &hostile(0.09))).to_html().unwrap();
+    assert!(!html.contains("<script") && !html.contains("<img"), "something of a file became an element");
+    assert!(html.matches("&lt;img").count() + html.matches("&#60;img").count() > 10);
+    let Some(dom) = browser::dom(&html) else { return };
+    assert!(!browser::root(&dom).contains("data-owned"), "{}", browser::root(&dom));
+    let attributes = ["src=\"", "href=\""].map(|name| format!(" {name}"));
+    for value in attributes.iter().flat_map(|name| dom.split(name.as_str()).skip(1)) {
+        assert!(value.starts_with('#'), "{} leaves the page", &value[..20]);
+    }
 }

@@ -218,3 +218,9 @@ fn poles_that_cannot_be_drawn_are_left_out() {
     let edge = svg.split("class=\"edge\" d=\"").nth(1).unwrap().split('"').next().unwrap();
     assert!(edge.starts_with('M') && edge.contains('L'), "{edge}");
 }
+
+#[test]
+fn the_page_keeps_nobody_out() {
+    let Some(faults) = browser::faults(&page().to_html().unwrap()) else { return };
+    assert!(faults.is_empty(), "{faults:#?}");
+}

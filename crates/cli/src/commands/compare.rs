@@ -3,7 +3,7 @@
 use std::path::{Path, PathBuf};
 
 use clap::Args;
-use greybox_report::{Comparison, Report};
+use greybox_report::{Comparison, Report, ReportError};
 
 use crate::answer::Answer;
 use crate::failure::Failure;
@@ -37,11 +37,12 @@ pub(crate) fn run(arguments: &Arguments) -> Result<Answer, Failure> {
     let (before, after) = (read(&arguments.before)?, read(&arguments.after)?);
     let name = |path: &Path| path.display().to_string();
     let comparison = Comparison::of((&name(&arguments.before), &before), (&name(&arguments.after), &after));
-    let json = comparison.to_json()?;
+    let unwritten = |e: ReportError| Failure::internal(e.to_string());
+    let json = comparison.to_json().map_err(unwritten)?;
     if let Some(path) = &arguments.out {
         let out = OutputFolder::prepare(path)?;
         out.spares(&FILES, [&arguments.before, &arguments.after])?;
-        let html = comparison.to_html()?;
+        let html = comparison.to_html().map_err(unwritten)?;
         out.write(&[(FILES[0], json.as_bytes()), (FILES[1], html.as_bytes())])?;
     }
     let mut text: String = comparison.summary.iter().map(|s| format!("{s}\n")).collect();

@@ -4,10 +4,10 @@ use askama::Template;
 
 use super::{Assets, Common};
 use crate::compare::{Change, Comparison, Errors, MechanismChange, Run, Weight};
-use crate::contract::{Estimate, Finding};
+use crate::contract::{Estimate, Finding, Interval};
 use crate::sentence::comparison as words;
 use crate::sentence::recordings::place;
-use crate::{ReportError, expression, format};
+use crate::{ReportError, expression, format, svg};
 
 impl Comparison {
     /// Renders `comparison.html`.
@@ -57,8 +57,11 @@ struct RowView {
     before: String,
     after: String,
     unit: String,
-    change: &'static str,
+    /// After minus before, and whether that is more than the intervals allow.
+    change: String,
     changed: bool,
+    /// Both intervals on one scale.
+    drawing: Option<String>,
 }
 
 struct ErrorView {
@@ -146,8 +149,9 @@ fn mechanism(m: &MechanismChange) -> MechanismView {
         before: weight(m.before, of),
         after: weight(m.after, of),
         unit: String::new(),
-        change: "",
+        change: String::new(),
         changed: false,
+        drawing: None,
     };
     let mut rows: Vec<RowView> = m.parameters.iter().map(|(name, change)| row(name, change)).collect();
     rows.push(share("explains", |w| w.share_explained));
@@ -163,22 +167,33 @@ fn mechanism(m: &MechanismChange) -> MechanismView {
 }
 
 fn row(name: &str, change: &Change) -> RowView {
-    let shown = |e: &Option<Estimate>| {
-        e.as_ref().map_or_else(|| "–".to_owned(), |e| format::with_interval(e.value, e.ci95))
-    };
+    let shown =
+        |e: &Option<Estimate>| e.as_ref().map_or_else(|| "–".to_owned(), |e| format::cell(e.value, e.ci95));
     let unit = change.after.as_ref().or(change.before.as_ref()).map_or("", |e| e.unit.as_str());
     RowView {
         name_html: expression::html(name),
         before: shown(&change.before),
         after: shown(&change.after),
         unit: format::unit(unit),
-        change: match change.changed {
-            Some(true) => "changed",
-            Some(false) => "within the intervals",
-            None => "",
-        },
+        change: difference(change),
         changed: change.changed == Some(true),
+        drawing: match (&change.before, &change.after) {
+            (Some(a), Some(b)) if a.unit == b.unit => svg::change_plot((a.value, a.ci95), (b.value, b.ci95)),
+            _ => None,
+        },
     }
+}
+
+/// `+0.030 ± 0.006, changed`; empty where nothing can be said.
+fn difference(change: &Change) -> String {
+    let (Some(changed), Some(a), Some(b)) = (change.changed, &change.before, &change.after) else {
+        return String::new();
+    };
+    let half = |e: &Estimate| e.ci95.map_or(f64::NAN, |c| c.half_width());
+    let (by, half) = (b.value - a.value, half(a).hypot(half(b)));
+    let sign = if by > 0.0 { "+" } else { "" };
+    let by = format::cell(by, Some(Interval::new(by - half, by + half)));
+    format!("{sign}{by}, {}", if changed { "changed" } else { "within the intervals" })
 }
 
 fn errors(of: Option<Errors>) -> [String; 3] {
