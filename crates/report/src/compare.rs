@@ -207,7 +207,7 @@ fn run((name, report): (&str, &Report)) -> Run {
     }
 }
 
-/// Two mechanisms are one where kind, place and what drifts are the same; each is paired once.
+/// Two mechanisms are one where kind, place, what drifts and the names of the parameters are the same; each is paired once.
 fn mechanisms(before: &Report, after: &Report) -> Vec<MechanismChange> {
     let of = |report: &Report| report.mechanisms.iter().map(merge::mechanism).collect::<Vec<_>>();
     let weight =
@@ -216,10 +216,11 @@ fn mechanisms(before: &Report, after: &Report) -> Vec<MechanismChange> {
     let mut out: Vec<MechanismChange> = of(after)
         .into_iter()
         .map(|new| {
-            let key = |law: &Law| {
-                (law.kind.clone(), law.equation.clone(), law.channel.clone(), law.drifting.clone())
+            let key = |m: &MechanismResult| {
+                let law = (m.law.kind.clone(), m.law.equation.clone(), m.law.channel.clone());
+                (law, m.law.drifting.clone(), m.parameters.keys().cloned().collect::<Vec<_>>())
             };
-            let same = old.iter().position(|o| key(&o.law) == key(&new.law)).map(|at| old.remove(at));
+            let same = old.iter().position(|o| key(o) == key(&new)).map(|at| old.remove(at));
             let empty = Ordered::new();
             let parameters = changes(same.as_ref().map_or(&empty, |o| &o.parameters), &new.parameters);
             let (before, after) = (same.as_ref().map(weight), Some(weight(&new)));

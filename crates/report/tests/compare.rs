@@ -89,6 +89,20 @@ fn what_is_new_what_is_gone_and_what_moved_are_told_apart() {
     assert_eq!(c.summary.iter().filter(|s| s.ends_with(" is new.")).count(), 1, "{:?}", c.summary);
     assert_eq!(c.summary.iter().filter(|s| s.ends_with(" is gone.")).count(), 1, "{:?}", c.summary);
 
+    // So is a law of the same kind and place with other parameters; the two are told apart.
+    let mut other = report(0.06, 0.004);
+    other.mechanisms[0].expression = "fd*sign(theta')".into();
+    let fc = other.mechanisms[0].parameters.shift_remove("fc").unwrap();
+    other.mechanisms[0].parameters.insert("fd".into(), fc);
+    let c = compared(&old, &other);
+    assert_eq!(c.mechanisms.len(), old.mechanisms.len() + 1);
+    assert!(
+        c.summary.contains(&"Coulomb friction in the hub equation, fd·sign(θ′), is new.".to_owned()),
+        "{:?}",
+        c.summary
+    );
+    assert!(c.summary.iter().any(|s| s.ends_with("fc·sign(θ′), is gone.")), "{:?}", c.summary);
+
     // The same kind in another equation is another mechanism.
     let mut moved = report(0.06, 0.004);
     moved.mechanisms[0].location.equation = Some("link".into());

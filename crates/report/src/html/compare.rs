@@ -4,7 +4,7 @@ use askama::Template;
 
 use super::{Assets, Common};
 use crate::compare::{Change, Comparison, Errors, MechanismChange, Run, Weight};
-use crate::contract::{Estimate, Finding, Interval};
+use crate::contract::{Estimate, Finding, Interval, Severity};
 use crate::sentence::comparison as words;
 use crate::sentence::recordings::place;
 use crate::{ReportError, expression, format, svg};
@@ -38,7 +38,7 @@ struct View {
     /// What it is, before, after.
     runs: Vec<[String; 3]>,
     mechanisms: Vec<MechanismView>,
-    parameters: Vec<RowView>,
+    parameters: Rows,
     errors: Vec<ErrorView>,
     findings: Vec<(&'static str, Vec<String>)>,
 }
@@ -49,11 +49,22 @@ struct MechanismView {
     expression_html: String,
     state: &'static str,
     changed: bool,
-    rows: Vec<RowView>,
+    rows: Rows,
+}
+
+struct Rows(Vec<RowView>);
+
+impl Rows {
+    /// Whether any difference can be told; without one its columns are left out.
+    fn differ(&self) -> bool {
+        self.0.iter().any(|row| !row.change.is_empty())
+    }
 }
 
 struct RowView {
     name_html: String,
+    /// A word and no symbol.
+    word: bool,
     before: String,
     after: String,
     unit: String,
@@ -66,8 +77,8 @@ struct RowView {
 
 struct ErrorView {
     channel: String,
-    /// Calibrated, improved and noise before; the same after.
-    cells: [String; 6],
+    /// Which model, and its error before and after.
+    rows: Vec<(&'static str, [String; 2])>,
 }
 
 impl View {
@@ -96,14 +107,17 @@ impl View {
             cautions: c.cautions.clone(),
             runs: runs(&c.before, &c.after),
             mechanisms: c.mechanisms.iter().map(mechanism).collect(),
-            parameters: c.parameters.iter().map(|(name, change)| row(name, change)).collect(),
+            parameters: Rows(c.parameters.iter().map(|(name, change)| row(name, change)).collect()),
             errors: c
                 .holdout
                 .iter()
                 .map(|(channel, e)| {
-                    let [a, b, n] = errors(e.before);
-                    let [x, y, m] = errors(e.after);
-                    ErrorView { channel: expression::text(channel), cells: [a, b, n, x, y, m] }
+                    let names = ["Nominal", "Calibrated", "Improved", "Noise alone"];
+                    let both = errors(e.before).into_iter().zip(errors(e.after)).map(|(b, a)| [b, a]);
+                    ErrorView {
+                        channel: expression::text(channel),
+                        rows: names.into_iter().zip(both).collect(),
+                    }
                 })
                 .collect(),
             findings: [("Only before", &c.findings_gone), ("Only after", &c.findings_new)]
@@ -146,6 +160,7 @@ fn mechanism(m: &MechanismChange) -> MechanismView {
     };
     let share = |name: &str, of: fn(Weight) -> f64| RowView {
         name_html: name.to_owned(),
+        word: true,
         before: weight(m.before, of),
         after: weight(m.after, of),
         unit: String::new(),
@@ -162,7 +177,7 @@ fn mechanism(m: &MechanismChange) -> MechanismView {
         expression_html: expression::html(&m.law.expression),
         state,
         changed,
-        rows,
+        rows: Rows(rows),
     }
 }
 
@@ -172,6 +187,7 @@ fn row(name: &str, change: &Change) -> RowView {
     let unit = change.after.as_ref().or(change.before.as_ref()).map_or("", |e| e.unit.as_str());
     RowView {
         name_html: expression::html(name),
+        word: false,
         before: shown(&change.before),
         after: shown(&change.after),
         unit: format::unit(unit),
@@ -196,14 +212,20 @@ fn difference(change: &Change) -> String {
     format!("{sign}{by}, {}", if changed { "changed" } else { "within the intervals" })
 }
 
-fn errors(of: Option<Errors>) -> [String; 3] {
+fn errors(of: Option<Errors>) -> [String; 4] {
     match of {
-        Some(e) => [e.calibrated, e.improved, e.noise].map(format::percent),
-        None => ["–", "–", "–"].map(str::to_owned),
+        Some(e) => [e.nominal, e.calibrated, e.improved, e.noise].map(format::percent),
+        None => ["–"; 4].map(str::to_owned),
     }
 }
 
 fn finding(f: &Finding) -> String {
     let place: Vec<&str> = [f.recording.as_deref(), f.channel.as_deref()].into_iter().flatten().collect();
-    if place.is_empty() { f.message.clone() } else { format!("{}: {}", place.join(", "), f.message) }
+    let severity = match f.severity {
+        Severity::Info => "note",
+        Severity::Warning => "warning",
+        Severity::Error => "error",
+    };
+    let place = if place.is_empty() { String::new() } else { format!("{}: ", place.join(", ")) };
+    format!("{severity}: {place}{}", f.message)
 }

@@ -14,7 +14,14 @@ pub fn summary(comparison: &Comparison) -> Vec<String> {
         true => format!("Both runs say: {}.", verdict(after.verdict)),
         false => format!("Before: {}. After: {}.", verdict(before.verdict), verdict(after.verdict)),
     }];
-    out.extend(comparison.mechanisms.iter().map(mechanism));
+    let named = |m: &MechanismChange| format!("{} {}", format::kind(&m.law.kind), place(&m.law));
+    out.extend(comparison.mechanisms.iter().map(|m| {
+        let twins = comparison.mechanisms.iter().filter(|other| named(other) == named(m)).count();
+        // Two of one kind in one place are told apart by what they are.
+        let law =
+            if twins > 1 { format!(", {},", expression::text(&m.law.expression)) } else { String::new() };
+        mechanism(&format!("{}{law}", named(m)), m)
+    }));
     let changed: Vec<String> = comparison
         .parameters
         .iter()
@@ -93,8 +100,7 @@ pub fn verdict(verdict: Verdict) -> &'static str {
     }
 }
 
-fn mechanism(m: &MechanismChange) -> String {
-    let what = format!("{} {}", format::kind(&m.law.kind), place(&m.law));
+fn mechanism(what: &str, m: &MechanismChange) -> String {
     match (m.before, m.after) {
         (None, _) => format!("{what} is new."),
         (_, None) => format!("{what} is gone."),
