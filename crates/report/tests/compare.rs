@@ -183,7 +183,7 @@ fn hostile_names_do_nothing_in_the_browser() {
         report.fit.holdout_source = format!("{fc} {evil}");
         report.mechanisms[0].kind = evil.into();
         report.mechanisms[0].expression = evil.into();
-        report.mechanisms[0].location.channel = Some(evil.into());
+        report.mechanisms[0].location.equation = Some(evil.into());
         report.mechanisms[0].parameters.insert(
             evil.into(),
             Estimate { value: fc, ci95: Some(Interval::new(fc - 0.01, fc + 0.01)), unit: evil.into() },
