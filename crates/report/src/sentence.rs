@@ -1,6 +1,7 @@
 //! The conclusion in plain language, worded from the numbers of a [`Report`]; [`identified`] does the same
 //! for an identification, [`recordings`] for many recordings.
 
+pub mod comparison;
 pub mod control;
 pub mod identified;
 pub mod recordings;
