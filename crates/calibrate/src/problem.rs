@@ -129,6 +129,10 @@ impl Work {
     }
 }
 
+/// Residual where the simulation says no number (a logarithm of what is negative, an overflow), in units of the scale:
+/// much more than any that it may have, and not so much that a fit cannot leave such a place.
+const UNDEFINED: f64 = 1e3;
+
 /// A point of the search.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Point {
@@ -360,7 +364,11 @@ impl Problem<'_> {
             let y = &measured[c][segment.range.clone()];
             for k in 0..n {
                 let e = (y[k] - trajectory.y[c * n + k]) * inverse;
-                r[c * n + k] = if e.is_finite() { e } else { 0.0 };
+                r[c * n + k] = match y[k].is_nan() {
+                    true => 0.0,
+                    false if e.is_finite() => e,
+                    false => UNDEFINED,
+                };
             }
         }
         whiten(&mut r);
@@ -380,7 +388,8 @@ impl Problem<'_> {
                     let y = &measured[c][segment.range.clone()];
                     for k in 0..n {
                         let v = d[c * n + k] * inverse;
-                        column[c * n + k] = if y[k].is_nan() || !v.is_finite() { 0.0 } else { v };
+                        let defined = !y[k].is_nan() && trajectory.y[c * n + k].is_finite() && v.is_finite();
+                        column[c * n + k] = if defined { v } else { 0.0 };
                     }
                 }
                 whiten(column);

@@ -8,7 +8,7 @@ use clap::{Args, Parser, Subcommand};
 
 use crate::answer::Answer;
 use crate::commands::{
-    calibrate, check, control, demo, diagnose, export, identify, mechanisms, new, shell, simulate,
+    calibrate, check, compare, control, demo, diagnose, export, identify, mechanisms, new, shell, simulate,
 };
 use crate::failure::{self, Failure};
 use crate::loading::{self, LoadedModel};
@@ -164,6 +164,7 @@ pub(crate) enum Command {
     Calibrate(calibrate::Arguments),
     Simulate(simulate::Arguments),
     Check(check::Arguments),
+    Compare(compare::Arguments),
     Control(control::Arguments),
     Export(export::Arguments),
     New(new::Arguments),
@@ -181,6 +182,7 @@ impl Command {
             Command::Calibrate(arguments) => calibrate::run(arguments),
             Command::Simulate(arguments) => simulate::run(arguments),
             Command::Check(arguments) => check::run(arguments),
+            Command::Compare(arguments) => compare::run(arguments),
             Command::Control(arguments) => control::run(arguments),
             Command::Export(arguments) => export::run(arguments),
             Command::New(arguments) => new::run(arguments),
@@ -202,8 +204,8 @@ impl Cli {
             }
             Err(e) if e.kind() == ErrorKind::DisplayHelpOnMissingArgumentOrSubcommand => {
                 Err(Failure::input("no command is given").mend(
-                    "name one: `greybox diagnose`, `identify`, `calibrate`, `simulate`, `check`, `control`, `export`, \
-                     `new`, `mechanisms` or `demo`; \
+                    "name one: `greybox diagnose`, `identify`, `calibrate`, `simulate`, `check`, `compare`, `control`, \
+                     `export`, `new`, `mechanisms` or `demo`; \
                      `greybox --help` explains them",
                 ))
             }

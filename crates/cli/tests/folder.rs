@@ -258,3 +258,39 @@ fn two_runs_do_not_write_to_one_folder() {
     bench.refuses(&[&DIAGNOSE as &[&str], &["out"]].concat(), &["error: out: another run", "mend"]);
     assert_eq!(names(&bench.path("out")), [""; 0]);
 }
+
+#[test]
+fn two_diagnoses_are_held_against_each_other() {
+    let bench = bench();
+    let out = bench.greybox(&[&DIAGNOSE as &[&str], &["out"]].concat());
+    assert_eq!(out.code, 0, "{}", out.stderr);
+    let compare = ["compare", "out/monday", "out/friday/report.json"];
+    let said = bench.greybox(&[&compare as &[&str], &["--out", "change"]].concat());
+    assert_eq!(said.code, 0, "{}", said.stderr);
+    for part in [
+        "Both runs say: physics is missing.\n",
+        "Viscous friction in the body equation is in both, ",
+        "caution: The runs were judged on different recordings",
+        "change/comparison.html",
+    ] {
+        assert!(said.stdout.contains(part), "{part}: {}", said.stdout);
+    }
+    assert_eq!(names(&bench.path("change")), ["comparison.html", "comparison.json"]);
+    let json: Value =
+        serde_json::from_slice(&fs::read(bench.path("change/comparison.json")).unwrap()).unwrap();
+    assert_eq!(json["mechanisms"][0]["kind"], "viscous_friction");
+    let printed = bench.greybox(&[&compare as &[&str], &["--json"]].concat());
+    assert_eq!(serde_json::from_str::<Value>(&printed.stdout).unwrap(), json);
+
+    bench.write("no.json", "{\"verdict\": 3}");
+    for (path, part) in [("no.json", "this is no report of a diagnosis"), ("nowhere", "cannot be read")] {
+        let refused = bench.greybox(&["compare", path, "out/friday", "--out", "none"]);
+        assert_eq!(refused.code, 2, "{}", refused.stderr);
+        assert!(
+            refused.stderr.contains(part) && refused.stderr.contains("report.json"),
+            "{}",
+            refused.stderr
+        );
+    }
+    assert!(!bench.path("none").exists());
+}

@@ -5,7 +5,7 @@ use std::ops::Deref;
 use std::sync::Arc;
 
 use greybox_calibrate::{
-    Data, DataError, FreeRun, Limits, Point, Score, Setup, free_parameters, qr, window_length,
+    Data, DataError, FreeRun, Limits, Point, Score, Setup, Work, free_parameters, qr, window_length,
 };
 use greybox_model::system::CompileError;
 use greybox_model::{Expr, Func, Hold, Model};
@@ -336,14 +336,20 @@ fn conclude(
     let dt = train.pieces.iter().map(|p| p.dt).fold(0.0, f64::max);
     let window = window_length(&durations, dt);
     observer.stage(Stage::Simulating);
-    let calibrated = polish_baseline(&found.calibrated, &nominal.values(), &found.scale);
+    let mut baseline = Baseline::of(&found, &nominal.values());
     let improved = if found.improved.parts.is_empty() {
-        Fitted { ..calibrated.clone() }
+        baseline.fitted.clone()
     } else {
+        // The search fits the baseline with a scale that its mechanisms made small, and only where it goes on with
+        // it. What is compared with is the best that the equations can do alone.
+        let alone = Baseline::of(&alone(nominal, false, &Untold(observer)), &nominal.values());
+        if alone.misfit.total_cmp(&baseline.misfit).is_lt() {
+            baseline = alone;
+        }
         polish(&found.improved, &found.scale, window)
     };
+    let Baseline { fitted: calibrated, scale: calibrated_scale, .. } = baseline;
     let scale = residual_scale(&improved, &found.scale);
-    let calibrated_scale = residual_scale(&calibrated, &found.scale);
     let calibrated_widths = Uncertainty::of(&calibrated, &calibrated_scale).widths();
     let uncertainty = Uncertainty::of(&improved, &scale);
     let improved_widths = uncertainty.widths();
@@ -495,35 +501,68 @@ fn residual_scale(fitted: &Fitted, scale: &[f64]) -> Vec<f64> {
     rms(&fitted.fit, scale).iter().zip(&fitted.setup.data.sigma).map(|(r, s)| r.max(0.7 * s)).collect()
 }
 
-/// The baseline refitted on whole pieces, from the segments' parameters and from the nominal ones: the
-/// parameters that simulate the training recordings best in free run.
-fn polish_baseline(fitted: &Fitted, nominal: &[f64], scale: &[f64]) -> Fitted {
-    let setup = &fitted.setup;
-    let own = residual_scale(fitted, scale);
-    let level = setup.level(1);
-    let free_run = |p: &[f64]| -> f64 {
-        let run = setup.free_run(p, &own);
-        let scores = setup.scores(&run, p, f64::INFINITY, None);
-        scores.iter().map(|s| s.nrmse.powi(2)).sum()
-    };
-    let mut best = (free_run(&fitted.fit.point.parameters), None);
-    let stitched = setup.stitch(&fitted.level, &fitted.fit.point, &level, &own);
-    for mut start in [stitched, Point { parameters: nominal.to_vec(), starts: setup.starts(&level, nominal) }]
-    {
-        for (s, prior) in start.starts.iter_mut().zip(&level.priors) {
-            for (x, (mean, std)) in s.iter_mut().zip(prior) {
-                if std.is_finite() {
-                    *x = *mean;
+/// Hears of the work, which it may give up, and of nothing else.
+struct Untold<'a>(&'a dyn Observer);
+
+impl Observer for Untold<'_> {
+    fn begins(&self, work: &Arc<Work>) {
+        self.0.begins(work);
+    }
+}
+
+/// A search that changes parameters, and the holds of inputs if it may, and nothing else.
+fn alone(nominal: &Setup, keep_holds: bool, observer: &dyn Observer) -> Found {
+    // With a limit of work of its own.
+    let nominal = Setup { work: Arc::default(), ..nominal.clone() };
+    observer.begins(&nominal.work);
+    let mut search = Search::new(nominal, &[], observer);
+    search.keep_holds = keep_holds;
+    search.run()
+}
+
+/// The equations as they are, with the parameters that simulate the training recordings best in free run.
+struct Baseline {
+    fitted: Fitted,
+    /// Its residual.
+    scale: Vec<f64>,
+    /// Sum over the channels of the squares of its free run's NRMSE.
+    misfit: f64,
+}
+
+impl Baseline {
+    /// What a search found without mechanisms, refitted on whole pieces, from its parameters and from the nominal
+    /// ones.
+    fn of(found: &Found, nominal: &[f64]) -> Baseline {
+        let (fitted, setup) = (&found.calibrated, &found.calibrated.setup);
+        let own = residual_scale(fitted, &found.scale);
+        let misfit = |p: &[f64], scale: &[f64]| -> f64 {
+            let run = setup.free_run(p, scale);
+            let scores = setup.scores(&run, p, f64::INFINITY, None);
+            scores.iter().map(|s| s.nrmse.powi(2)).sum()
+        };
+        let level = setup.level(1);
+        let mut best = (misfit(&fitted.fit.point.parameters, &own), None);
+        let stitched = setup.stitch(&fitted.level, &fitted.fit.point, &level, &own);
+        let measured = Point { parameters: nominal.to_vec(), starts: setup.starts(&level, nominal) };
+        for mut start in [stitched, measured] {
+            for (s, prior) in start.starts.iter_mut().zip(&level.priors) {
+                for (x, (mean, std)) in s.iter_mut().zip(prior) {
+                    if std.is_finite() {
+                        *x = *mean;
+                    }
                 }
             }
+            let whole = setup.fit(&level, &own, &[start], Limits { iterations: 30, tolerance: 1e-6 });
+            let quality = misfit(&whole.point.parameters, &own);
+            if quality < best.0 {
+                best = (quality, Some(whole.point.parameters));
+            }
         }
-        let whole = setup.fit(&level, &own, &[start], Limits { iterations: 30, tolerance: 1e-6 });
-        let quality = free_run(&whole.point.parameters);
-        if quality < best.0 {
-            best = (quality, Some(whole.point.parameters));
-        }
+        let fitted = with_parameters(fitted, best.1, &found.scale);
+        let scale = residual_scale(&fitted, &found.scale);
+        let misfit = misfit(&fitted.fit.point.parameters, &scale);
+        Baseline { fitted, scale, misfit }
     }
-    with_parameters(fitted, best.1, scale)
 }
 
 /// The improved model refitted on whole pieces, kept where its free run gains and its restarted windows
@@ -1242,14 +1281,10 @@ pub fn calibrate(
 ) -> Result<Calibration, DiagnoseError> {
     let Layout { train, holdout, source } = layout(model, train, holdout)?;
     let nominal = Setup::new(model, train.clone(), free_parameters(model))?;
-    observer.begins(&nominal.work);
-    let mut search = Search::new(nominal.clone(), &[], observer);
-    search.keep_holds = true; // it changes parameters and nothing else
-    let found = search.run();
+    let found = alone(&nominal, true, observer);
     let durations: Vec<f64> = train.pieces.iter().map(|p| (p.len.saturating_sub(1)) as f64 * p.dt).collect();
     let window = window_length(&durations, train.pieces.iter().map(|p| p.dt).fold(0.0, f64::max));
-    let fitted = polish_baseline(&found.calibrated, &nominal.values(), &found.scale);
-    let scale = residual_scale(&fitted, &found.scale);
+    let Baseline { fitted, scale, .. } = Baseline::of(&found, &nominal.values());
     let widths = Uncertainty::of(&fitted, &scale).widths();
     let values = &fitted.fit.point.parameters;
     let mut calibrated = model.clone();

@@ -702,15 +702,13 @@ impl<'a> Search<'a> {
         e.score > threshold && visible && enough && steady
     }
 
-    /// Residual sum of squares of `calibrated` at the level of `like`, in units of `scale`.
+    /// Residual sum of squares of `calibrated` at the level of `like`, in units of `scale`, its starts refitted.
     pub fn rss_at(&self, calibrated: &Fitted, like: &Fitted, scale: &[f64]) -> f64 {
         let mut f = calibrated.clone();
-        if f.level.segments != like.level.segments {
-            let fixed = Setup { free: Vec::new(), ..f.setup.clone() };
-            let point = fixed.stitch(&f.level, &f.fit.point, &like.level, scale);
-            f.fit = fixed.fit(&like.level, scale, &[point], limits(8));
-            f.level = like.level.clone();
-        }
+        let fixed = Setup { free: Vec::new(), ..f.setup.clone() };
+        let point = fixed.stitch(&f.level, &f.fit.point, &like.level, scale);
+        f.fit = fixed.fit(&like.level, scale, &[point], limits(8));
+        f.level = like.level.clone();
         calibrated_rss(&f, scale)
     }
 

@@ -3,7 +3,7 @@
 //! clipping the stopping impulse), which shares no code with the crates under test.
 #![allow(missing_docs, clippy::unwrap_used)]
 
-use greybox_diagnose::{Diagnosis, Options, Quiet, Verdict, diagnose};
+use greybox_diagnose::{Diagnosis, Options, Quiet, Verdict, calibrate, diagnose};
 use greybox_model::Model;
 use greybox_recording::{Channel, Recording};
 use rand::SeedableRng;
@@ -26,6 +26,8 @@ mass = "m*x'' + c*x' + k*x = f"
 #[derive(Clone, Copy, Default)]
 struct Left {
     coulomb: f64,
+    /// What the spring is softer than it might be, N/m.
+    soft: f64,
     cubic: f64,
     offset: f64,
     quintic: f64,
@@ -71,7 +73,7 @@ fn record(seed: u64, left: Left, noise: f64) -> Recording {
             let w = i as f64 / fine as f64;
             let f = samples[k] + w * (samples[(k + 1).min(n - 1)] - samples[k]);
             let t = k as f64 * dt + i as f64 * h;
-            let smooth = f - 0.6 * v - 42.0 * x - left.force(x, t);
+            let smooth = f - 0.6 * v - (42.0 - left.soft) * x - left.force(x, t);
             // Dry friction removes at most the momentum there is (semi-implicit, sticks exactly).
             let free = v + h * smooth;
             v = if free.abs() <= h * left.coulomb { 0.0 } else { free - h * left.coulomb * free.signum() };
@@ -131,6 +133,27 @@ fn one_effect_left_out_is_named_and_sized() {
             assert!(after.nrmse < before.nrmse, "{kind} seed {seed}: {:?}", kinds(&d));
         }
         assert!(exact >= 5, "{kind}: {exact} of 6 exact");
+    }
+}
+
+/// What mechanisms are held against is the best that the equations do alone, and that is what `calibrate` finds.
+#[test]
+fn the_baseline_of_a_diagnosis_is_as_good_as_a_calibration() {
+    // An axis: nothing draws it back, and what is left out adds up.
+    let axis =
+        MODEL.replace(" + k*x = f", " = f").replace("k = { value = 38.0, unit = \"N/m\", std = 8.0 }\n", "");
+    let model = Model::from_toml(&axis, "axis.toml").unwrap();
+    for (seed, coulomb) in [(0, 0.5), (1, 1.5), (2, 2.5)] {
+        let left = Left { coulomb, soft: 42.0, ..Left::default() };
+        let train = [record(seed, left, 1e-3)];
+        let held = [record(seed + 1000, left, 1e-3)];
+        let diagnosis = diagnose(&model, &train, &held, &Options::default(), &Quiet).unwrap();
+        let alone = calibrate(&model, &train, &held, &Quiet).unwrap();
+        let (found, alone) = (diagnosis.train.calibrated.scores[0].nrmse, alone.train.1[0].nrmse);
+        assert!(
+            found <= alone * (1.0 + 1e-9),
+            "seed {seed}: {found} in the diagnosis, {alone} by calibration"
+        );
     }
 }
 

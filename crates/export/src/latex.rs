@@ -200,6 +200,7 @@ fn call(f: Func, arguments: &[Expr]) -> String {
         Func::Exp => "\\exp",
         Func::Ln => "\\ln",
         Func::Tanh => "\\tanh",
+        Func::Atan => "\\arctan",
         Func::Min => "\\min",
         Func::Max => "\\max",
         Func::Sign => "\\operatorname{sign}",

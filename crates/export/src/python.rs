@@ -127,6 +127,7 @@ impl Dialect for Text<'_> {
             Func::Ln => "math.log",
             Func::Sqrt => "math.sqrt",
             Func::Tanh => "math.tanh",
+            Func::Atan => "math.atan",
             Func::Abs => "abs",
             Func::Min => "min",
             Func::Max => "max",

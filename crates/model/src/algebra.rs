@@ -160,6 +160,7 @@ fn call(f: Func, a: f64, b: f64) -> f64 {
         Func::Ln => a.ln(),
         Func::Sqrt => a.sqrt(),
         Func::Tanh => a.tanh(),
+        Func::Atan => a.atan(),
         Func::Abs => a.abs(),
         Func::Sign if a == 0.0 => 0.0,
         Func::Sign => a.signum(),
@@ -365,6 +366,7 @@ fn differentiate_call(f: Func, args: &[Expr], d: &dyn Fn(&Expr) -> Option<Expr>)
         Func::Ln => return Some(div(da, x)),
         Func::Sqrt => return Some(div(da, mul(Expr::Num(2.0), same(f)))),
         Func::Tanh => sub(ONE, simplify_binary(BinOp::Pow, same(f), Expr::Num(2.0))),
+        Func::Atan => return Some(div(da, add(ONE, simplify_binary(BinOp::Pow, x, Expr::Num(2.0))))),
         Func::Abs => call1(Func::Sign, x),
         _ => return None,
     };

@@ -237,7 +237,7 @@ impl<'a> Checker<'a> {
     fn call(&mut self, e: &Expr, f: Func, args: &[Expr], place: &Place) -> Result<Dim, Fault> {
         let none = Dim::Is(self.known(Dimension::NONE));
         match (f, args) {
-            (Func::Sin | Func::Cos | Func::Tan | Func::Exp | Func::Ln | Func::Tanh, [a]) => {
+            (Func::Sin | Func::Cos | Func::Tan | Func::Exp | Func::Ln | Func::Tanh | Func::Atan, [a]) => {
                 self.need(e, a, Dimension::NONE, &format!("the argument of `{}`", f.name()), place)?;
                 Ok(none)
             }

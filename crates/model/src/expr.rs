@@ -58,6 +58,8 @@ pub enum Func {
     Sqrt,
     /// `tanh(x)`
     Tanh,
+    /// `atan(x)`
+    Atan,
     /// `abs(x)`
     Abs,
     /// `sign(x)`; `sign(0)` is set-valued, [−1, 1]: friction sticks.
@@ -78,9 +80,9 @@ pub enum Func {
 
 impl Func {
     /// Every function of the language.
-    pub const ALL: [Func; 15] = {
+    pub const ALL: [Func; 16] = {
         use Func::*;
-        [Sin, Cos, Tan, Exp, Ln, Sqrt, Tanh, Abs, Sign, Min, Max, Delay, Deadzone, Saturate, Step]
+        [Sin, Cos, Tan, Exp, Ln, Sqrt, Tanh, Atan, Abs, Sign, Min, Max, Delay, Deadzone, Saturate, Step]
     };
 
     /// The function of this name in the model language.
@@ -94,6 +96,7 @@ impl Func {
             "ln" => Ln,
             "sqrt" => Sqrt,
             "tanh" => Tanh,
+            "atan" => Atan,
             "abs" => Abs,
             "sign" => Sign,
             "min" => Min,
@@ -117,6 +120,7 @@ impl Func {
             Ln => "ln",
             Sqrt => "sqrt",
             Tanh => "tanh",
+            Atan => "atan",
             Abs => "abs",
             Sign => "sign",
             Min => "min",
@@ -132,7 +136,7 @@ impl Func {
     pub fn arity(self) -> usize {
         use Func::*;
         match self {
-            Sin | Cos | Tan | Exp | Ln | Sqrt | Tanh | Abs | Sign => 1,
+            Sin | Cos | Tan | Exp | Ln | Sqrt | Tanh | Atan | Abs | Sign => 1,
             Min | Max | Delay | Deadzone | Saturate | Step => 2,
         }
     }

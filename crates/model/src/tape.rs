@@ -182,6 +182,7 @@ enum Smooth {
     Exp,
     Ln,
     Tanh,
+    Atan,
 }
 
 impl Smooth {
@@ -196,6 +197,7 @@ impl Smooth {
             Smooth::Exp => x.exp(),
             Smooth::Ln => x.ln(),
             Smooth::Tanh => x.tanh(),
+            Smooth::Atan => x.atan(),
         }
     }
 
@@ -219,6 +221,7 @@ impl Smooth {
             Smooth::Exp => y,
             Smooth::Ln => 1.0 / x,
             Smooth::Tanh => 1.0 - y * y,
+            Smooth::Atan => 1.0 / (1.0 + x * x),
         }
     }
 }
@@ -447,6 +450,7 @@ impl<'a> Compiler<'a> {
                     Func::Ln => self.smooth(Smooth::Ln, a),
                     Func::Sqrt => self.smooth(Smooth::Sqrt, a),
                     Func::Tanh => self.smooth(Smooth::Tanh, a),
+                    Func::Atan => self.smooth(Smooth::Atan, a),
                     Func::Sign => self.switch(SwitchKind::Sign, a, a),
                     Func::Abs => self.switch(SwitchKind::Abs, a, a),
                     Func::Min | Func::Max | Func::Deadzone | Func::Saturate | Func::Step => {

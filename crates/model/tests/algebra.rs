@@ -46,7 +46,14 @@ fn smooth_expr() -> impl Strategy<Value = Expr> {
                 (Expr::Num(1.5) + Expr::call(Func::Tanh, vec![a])).pow(Expr::call(Func::Sin, vec![b]))
             }),
             (
-                prop::sample::select(vec![Func::Sin, Func::Cos, Func::Tanh, Func::Abs, Func::Sign]),
+                prop::sample::select(vec![
+                    Func::Sin,
+                    Func::Cos,
+                    Func::Tanh,
+                    Func::Atan,
+                    Func::Abs,
+                    Func::Sign
+                ]),
                 inner.clone()
             )
                 .prop_map(|(f, a)| Expr::call(f, vec![a])),

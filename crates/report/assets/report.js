@@ -9,10 +9,11 @@
   const data = JSON.parse(document.getElementById("report-data").textContent);
   const css = getComputedStyle(root);
   const colour = name => css.getPropertyValue(name).trim();
+  // By the dash as well as by the colour: the page may be printed in grey.
   const look = {
     measured: { stroke: colour("--measured"), width: 3 },
-    nominal: { stroke: colour("--nominal"), width: 1.6 },
-    calibrated: { stroke: colour("--calibrated"), width: 1.5 },
+    nominal: { stroke: colour("--nominal"), width: 1.8, dash: [2, 3] },
+    calibrated: { stroke: colour("--calibrated"), width: 1.6, dash: [9, 3] },
     improved: { stroke: colour("--improved-line"), width: 1.4 },
     input: { stroke: "#5f6b7a", width: 1.3 },
     noise: { stroke: "#a4acb7", width: 1.3, dash: [5, 4] },
@@ -87,7 +88,7 @@
       width: Math.max(220, host.clientWidth), height: plot.height,
       padding: [10, 14, 0, 0],
       cursor: { sync: { key: plot.sync, scales: ["x", null], setSeries: false }, drag: { x: true, y: false }, points: { size: 7 } },
-      legend: { live: true },
+      legend: { live: true, markers: { dash: (u, i) => u.series[i].dash ? (u.series[i].dash[0] < 4 ? "dotted" : "dashed") : "solid" } },
       scales: { x: log ? { time: false, distr: 3 } : { time: false }, y: log ? { distr: 3 } : {} },
       axes: [
         Object.assign({}, axisStyle, { label: plot.x, labelSize: 22, size: 30, values, space: log ? 40 : (narrow() ? 50 : 70) }),
@@ -98,7 +99,13 @@
         ...plot.series.map(s => Object.assign({ label: s.label, points: { show: false }, value: (u, v) => number(v), spanGaps: false }, look[s.role])),
       ],
       bands: (plot.fills || []).map(([upper, lower]) => ({ series: [upper + 1, lower + 1], fill: "rgba(26, 143, 209, .18)" })),
-      hooks: { drawClear: [behind(plot)] },
+      hooks: {
+        drawClear: [behind(plot)],
+        setSeries: [(u, i) => {
+          const th = u.root.querySelectorAll(".u-legend .u-series th")[i];
+          if (i > 0 && th) th.setAttribute("aria-pressed", String(u.series[i].show));
+        }],
+      },
     };
     if (log) {
       // A minimum that is one numerical zero must not squash the rest.
@@ -108,10 +115,13 @@
       if (range[1] > range[0]) options.scales.y.range = () => range;
     }
     const u = new uPlot(options, [data.axes[plot.axis], ...plot.series.map(s => s.data)], host);
-    // The legend by keyboard.
-    u.root.querySelectorAll(".u-legend .u-series th").forEach((th, i) => {
+    // The figure says what is drawn; the legend is a row of switches, by keyboard as well.
+    u.root.querySelector(".u-wrap").setAttribute("aria-hidden", "true");
+    const legend = u.root.querySelector(".u-legend");
+    legend.setAttribute("role", "group"); legend.setAttribute("aria-label", "Curves shown");
+    legend.querySelectorAll(".u-series th").forEach((th, i) => {
       if (i === 0) return;
-      th.tabIndex = 0; th.setAttribute("role", "button");
+      th.tabIndex = 0; th.setAttribute("role", "button"); th.setAttribute("aria-pressed", "true");
       th.addEventListener("keydown", e => { if (e.key === "Enter" || e.key === " ") { e.preventDefault(); th.click(); } });
     });
     return u;

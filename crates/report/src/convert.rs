@@ -628,7 +628,7 @@ fn plots(d: &Diagnosis) -> Vec<MechanismPlot> {
                 mechanism: Some(i),
                 title: format!("{} in equation {equation}", crate::format::kind(&m.kind)),
                 x_label: curve.variable.clone(),
-                y_label: format!("force in equation {equation} (SI)"),
+                y_label: format!("force in the {equation} equation, SI"),
                 points: curve.points.iter().map(|(a, b)| [*a, *b]).collect(),
                 curve: curve.law.iter().map(|(a, b)| [*a, *b]).collect(),
             })

@@ -97,6 +97,11 @@ pub fn with_interval(value: f64, ci95: Option<Interval>) -> String {
     }
 }
 
+/// [`with_interval`] for a narrow column: a line may break before the `±`, not after it.
+pub fn cell(value: f64, ci95: Option<Interval>) -> String {
+    with_interval(value, ci95).replace("± ", "±\u{a0}")
+}
+
 /// An interval `0.101 … 0.160`; `–` where there is none. The ends have three significant digits, and more where
 /// the width would not show.
 ///

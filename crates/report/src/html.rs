@@ -6,6 +6,7 @@
 //! by askama), through [`crate::expression::escape`], and as JSON in the data island, where `<`, `>` and `&`
 //! are written as `\u00XX` so that nothing in it can close the element.
 
+mod compare;
 mod control;
 mod identified;
 mod summary;
@@ -588,9 +589,9 @@ fn italic(shown: &str) -> String {
 }
 
 /// Functions of the model language, set upright.
-const FUNCTIONS: [&str; 15] = [
-    "sin", "cos", "tan", "exp", "ln", "sqrt", "abs", "sign", "tanh", "min", "max", "delay", "deadzone",
-    "saturate", "step",
+const FUNCTIONS: [&str; 16] = [
+    "sin", "cos", "tan", "exp", "ln", "sqrt", "abs", "sign", "tanh", "atan", "min", "max", "delay",
+    "deadzone", "saturate", "step",
 ];
 
 // -- where the residual comes from ------------------------------------------------------------------------
@@ -999,7 +1000,7 @@ fn mechanism_view(page: &Page, index: usize, mechanism: &Mechanism) -> Mechanism
     let parameters = mechanism.parameters.iter().map(|(name, estimate)| {
         [
             expression::html(name),
-            format::with_interval(estimate.value, estimate.ci95),
+            format::cell(estimate.value, estimate.ci95),
             format::interval(estimate.ci95),
             format::unit(&estimate.unit),
         ]
@@ -1123,8 +1124,12 @@ fn parameters(page: &Page) -> Vec<ParameterView> {
         } else if !change.is_finite() {
             format::UNKNOWN.to_owned()
         } else {
-            let percent = format!("{:+.1} %", 100.0 * change).replace('-', "−");
-            if matches!(percent.as_str(), "+0.0 %" | "−0.0 %") { "0.0 %".to_owned() } else { percent }
+            let percent = format!("{:+.1}\u{a0}%", 100.0 * change).replace('-', "−");
+            if matches!(percent.as_str(), "+0.0\u{a0}%" | "−0.0\u{a0}%") {
+                "0.0\u{a0}%".to_owned()
+            } else {
+                percent
+            }
         };
         ParameterView {
             name_html: expression::html(name),
@@ -1132,10 +1137,10 @@ fn parameters(page: &Page) -> Vec<ParameterView> {
             unit: parameter.unit.as_deref().map(format::unit).unwrap_or_default(),
             nominal: format::number(parameter.nominal),
             calibrated: match parameter.calibrated {
-                Some(value) => format::with_interval(value, parameter.calibrated_ci95),
+                Some(value) => format::cell(value, parameter.calibrated_ci95),
                 None => format::UNKNOWN.to_owned(),
             },
-            value: format::with_interval(parameter.value, parameter.ci95),
+            value: format::cell(parameter.value, parameter.ci95),
             change,
             fixed: parameter.fixed,
         }

@@ -32,6 +32,7 @@
 //!
 //! [`convert`] fills these types from a finished diagnosis; nothing here decides, reads a file or prints.
 
+pub mod compare;
 pub mod contract;
 pub mod control;
 pub mod convert;
@@ -49,6 +50,7 @@ pub mod suggest;
 pub mod summary;
 pub mod svg;
 
+pub use compare::Comparison;
 pub use contract::Report;
 pub use control::ControlPage;
 pub use identified::IdentifyReport;

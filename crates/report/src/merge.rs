@@ -74,7 +74,7 @@ pub fn map(recording: &str, page: Option<&str>, report: &Report) -> Statistics {
     Statistics { recordings: vec![result], failed: Vec::new() }
 }
 
-fn mechanism(found: &Mechanism) -> MechanismResult {
+pub(crate) fn mechanism(found: &Mechanism) -> MechanismResult {
     MechanismResult {
         law: Law {
             kind: found.kind.clone(),

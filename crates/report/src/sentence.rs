@@ -1,12 +1,16 @@
 //! The conclusion in plain language, worded from the numbers of a [`Report`]; [`identified`] does the same
 //! for an identification, [`recordings`] for many recordings.
 
+pub mod comparison;
 pub mod control;
 pub mod identified;
 pub mod recordings;
 
-use crate::contract::{FitSet, Interval, Location, Mechanism, Names, Ordered, Report, Verdict};
+use crate::contract::{Fit, FitSet, Interval, Location, Mechanism, Names, Ordered, Report, Verdict};
 use crate::{expression, format};
+
+/// A held-out error that is larger by less than this is the same.
+const LOSS: f64 = 1.02;
 
 /// The summary of a report: the headline first, then what a reader must know beside it.
 ///
@@ -89,6 +93,7 @@ fn missing(report: &Report, out: &mut Vec<String>) {
             change.of, change.from, change.to
         ));
     }
+    out.extend(losses(&report.fit));
     for mechanism in &report.mechanisms {
         let twins: Vec<String> = mechanism
             .alternatives
@@ -223,6 +228,34 @@ fn error_change(fit: &FitSet, baseline: Baseline) -> Option<Change> {
     }
     let of = if before.len() > 1 { format!(" of {}", expression::text(best.0)) } else { String::new() };
     Some(Change { of, from: format::percent_short(best.1), to: format::percent_short(best.2) })
+}
+
+/// The channels of the held-out recordings that the improved model simulates worse than the calibrated one does.
+fn losses(fit: &Fit) -> impl Iterator<Item = String> + '_ {
+    let before = &fit.holdout.calibrated;
+    let several = before.len() > 1;
+    before.iter().filter_map(move |(channel, from)| {
+        let to = fit.holdout.improved.get(channel)?;
+        if to.nrmse.is_nan() || to.nrmse <= LOSS * from.nrmse {
+            return None;
+        }
+        let of = if several { format!(" of {}", expression::text(channel)) } else { String::new() };
+        let change = |a: f64, b: f64| {
+            let verb = if b > a { "rises" } else { "falls" };
+            format!("{verb} from {} to {}", format::percent_short(a), format::percent_short(b))
+        };
+        let windows = match (from.nrmse_windowed, to.nrmse_windowed, fit.window_s) {
+            (Some(a), Some(b), Some(window)) => {
+                format!(" (restarted every {} s it {})", format::significant(window, 3), change(a, b))
+            }
+            _ => String::new(),
+        };
+        Some(format!(
+            "The held-out error{of} {}{windows}: what was found describes the training recordings and does not carry \
+             over.",
+            change(from.nrmse, to.nrmse)
+        ))
+    })
 }
 
 /// `a`, `a and b`, `a, b and c`.

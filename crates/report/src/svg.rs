@@ -13,7 +13,7 @@ use crate::summary::Pooled;
 
 const WIDTH: f64 = 520.0;
 const HEIGHT: f64 = 350.0;
-const LEFT: f64 = 66.0;
+const LEFT: f64 = 78.0;
 const TOP: f64 = 14.0;
 const BOTTOM: f64 = 50.0;
 
@@ -200,7 +200,7 @@ pub fn state_map(map: &StateMap, alt: &str) -> Option<String> {
     let frame = Frame {
         x: range(points.iter().map(|p| p.0), 0.0)?,
         y: range(points.iter().map(|p| p.1), 0.0)?,
-        right: WIDTH - 92.0,
+        right: WIDTH - 100.0,
     };
     let (columns, rows) = CELLS;
     let cell = |value: f64, (low, high): (f64, f64), count: usize| {
@@ -238,7 +238,7 @@ pub fn state_map(map: &StateMap, alt: &str) -> Option<String> {
 }
 
 fn colour_bar(out: &mut String, top: f64, value_label: &str) {
-    let (x, width) = (WIDTH - 80.0, 13.0);
+    let (x, width) = (WIDTH - 90.0, 13.0);
     let height = HEIGHT - BOTTOM - TOP;
     let step = height / LEVELS as f64;
     for level in 0..LEVELS {
@@ -321,6 +321,30 @@ pub fn law_plot(plot: &MechanismPlot, alt: &str) -> Option<LawPlot> {
     out.push_str("</svg>");
     let outside = finite.iter().filter(|[x, y]| !frame.contains(*x, *y)).count();
     Some(LawPlot { svg: out, outside, every })
+}
+
+/// Two estimates of one number on one scale, before above after, with their intervals. A picture of what the row beside
+/// it says in numbers: nothing for a screen reader. `None` where a value or an interval is missing.
+pub fn change_plot(before: (f64, Option<Interval>), after: (f64, Option<Interval>)) -> Option<String> {
+    const SIZE: (f64, f64) = (132.0, 30.0);
+    let (a, b) = (before.1?, after.1?);
+    let all = [before.0, a.low, a.high, after.0, b.low, b.high];
+    let (low, high) = range(all.into_iter(), 0.08).filter(|_| all.iter().all(|v| v.is_finite()))?;
+    let px = |x: f64| (x - low) / (high - low) * SIZE.0;
+    let mut out =
+        format!("<svg class=\"change\" viewBox=\"0 0 {} {}\" aria-hidden=\"true\">", SIZE.0, SIZE.1);
+    for (class, y, value, ci) in [("before", 9.0, before.0, a), ("after", 21.0, after.0, b)] {
+        let (from, to, x) = (px(ci.low), px(ci.high), px(value));
+        let _ = write!(
+            out,
+            "<path class=\"{class}\" d=\"M{from:.1} {y}H{to:.1}M{from:.1} {}v6M{to:.1} {}v6\"/>\
+             <circle class=\"{class}\" cx=\"{x:.1}\" cy=\"{y}\" r=\"3\"/>",
+            y - 3.0,
+            y - 3.0
+        );
+    }
+    out.push_str("</svg>");
+    Some(out)
 }
 
 /// A plane of poles.

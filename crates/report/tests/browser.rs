@@ -1,6 +1,6 @@
 //! The page in a real browser: the script runs, draws every plot and reaches for nothing.
 
-use run::{dom, root};
+use run::{dom, faults, root};
 
 #[path = "common/browser.rs"]
 mod run;
@@ -74,4 +74,42 @@ fn flat_and_missing_series_are_drawn_without_error() {
     let Some(dom) = dom(&page.to_html().unwrap()) else { return };
     assert!(root(&dom).contains("data-errors=\"0\""), "{}", root(&dom));
     assert!(root(&dom).contains("data-plots=\"10\""), "{}", root(&dom));
+}
+
+#[test]
+fn the_page_keeps_nobody_out() {
+    let Some(faults) = faults(&sample::page().to_html().unwrap()) else { return };
+    assert!(faults.is_empty(), "{faults:#?}");
+}
+
+/// What the audit is worth: it finds each of these.
+#[test]
+fn the_audit_finds_what_keeps_a_reader_out() {
+    let page = "<!DOCTYPE html><html><body><main><h1 id=\"a\">Title</h1><h3 id=\"a\">Too deep</h3>\
+                <p style=\"color:#999\">pale</p><div style=\"width:2000px\">wide</div><a href=\"#b\">nowhere</a>\
+                <section aria-labelledby=\"c\"></section>\
+                <div style=\"overflow:auto\"><div style=\"width:1999px\">box</div></div>\
+                <table><tr><th></th><td>1</td></tr></table><svg></svg><canvas></canvas><b role=\"button\">x</b>\
+                </main></body></html>";
+    let Some(faults) = faults(page) else { return };
+    for part in [
+        "px wide, the window 320",
+        "scrolls, but not by keyboard",
+        "no language",
+        "0 of header",
+        "0 of nav[aria-label]",
+        "does not skip",
+        "a heading is skipped before",
+        "twice: ",
+        "named by nothing",
+        "leads nowhere",
+        "no caption",
+        "no scope or empty",
+        "a drawing without words",
+        "a plot without words",
+        "no switch",
+        "contrast 2.85",
+    ] {
+        assert!(faults.iter().any(|fault| fault.contains(part)), "{part}: {faults:#?}");
+    }
 }

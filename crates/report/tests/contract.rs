@@ -1,8 +1,8 @@
 //! `report.json` against its schema, and the schema against its checked-in copy.
 #![allow(clippy::unwrap_used, reason = "helpers of tests panic like the tests themselves")]
 
-use greybox_report::Report;
 use greybox_report::contract::{Interval, Location, Names, Verdict, schema};
+use greybox_report::{Report, sentence};
 
 #[path = "common/schema.rs"]
 mod documents;
@@ -139,4 +139,30 @@ fn one_name_stays_a_string() {
 fn a_malformed_report_names_the_place() {
     let error = Report::from_json("{\n  \"verdict\": \"maybe\"\n}").unwrap_err().to_string();
     assert!(error.contains("maybe") && error.contains("line 2"), "{error}");
+}
+
+/// What does not carry over to the recordings held out is said, channel by channel, and what does is not.
+#[test]
+fn a_held_out_error_that_rises_is_told() {
+    let mut report = sample::page().report;
+    let told = |report: &Report| {
+        let said = sentence::summary(report);
+        said.into_iter().filter(|s| s.contains("does not carry over")).collect::<Vec<_>>()
+    };
+    assert_eq!(told(&report), Vec::<String>::new());
+    let channels: Vec<String> = report.fit.holdout.improved.keys().cloned().collect();
+    let worse = &channels[0];
+    report.fit.window_s = Some(2.0);
+    report.fit.holdout.calibrated[worse].nrmse = 0.32;
+    report.fit.holdout.calibrated[worse].nrmse_windowed = Some(0.2545);
+    report.fit.holdout.improved[worse].nrmse = 0.3667;
+    report.fit.holdout.improved[worse].nrmse_windowed = Some(0.241);
+    let said = told(&report);
+    assert_eq!(said.len(), 1, "{said:?}");
+    assert!(
+        said[0].contains("rises from 32 % to 37 % (restarted every 2.00 s it falls from 25 % to 24 %)"),
+        "{said:?}"
+    );
+    report.fit.holdout.improved[worse].nrmse = 0.321;
+    assert_eq!(told(&report), Vec::<String>::new());
 }

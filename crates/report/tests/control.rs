@@ -154,7 +154,7 @@ fn every_verdict_has_its_words() {
     let html = page.to_html().unwrap().replace('\u{a0}', " ");
     assert!(html.contains("θ leaves every bound after 0.25 s."));
     assert!(html.contains("No perturbed plants were tried") && html.contains("not limited"));
-    let main = own_part(&html).split("<main>").nth(1).unwrap();
+    let main = own_part(&html).split("<main ").nth(1).unwrap();
     assert!(!main.contains("<section id=\"family\"") && !main.contains("NaN") && !main.contains(">inf"));
 }
 
@@ -217,4 +217,10 @@ fn poles_that_cannot_be_drawn_are_left_out() {
     let svg = pole_plot(&[&[[0.999, 0.001], [0.999, -0.001]]], Plane::Sampled, "z").unwrap();
     let edge = svg.split("class=\"edge\" d=\"").nth(1).unwrap().split('"').next().unwrap();
     assert!(edge.starts_with('M') && edge.contains('L'), "{edge}");
+}
+
+#[test]
+fn the_page_keeps_nobody_out() {
+    let Some(faults) = browser::faults(&page().to_html().unwrap()) else { return };
+    assert!(faults.is_empty(), "{faults:#?}");
 }

@@ -267,3 +267,9 @@ fn the_browser_draws_all_plots() {
     assert!(root.contains("data-plots=\"10\"") && root.contains("data-errors=\"0\""), "{root}");
     assert_eq!(dom.matches("<canvas").count(), 10);
 }
+
+#[test]
+fn the_page_keeps_nobody_out() {
+    let Some(faults) = browser::faults(&page().to_html().unwrap()) else { return };
+    assert!(faults.is_empty(), "{faults:#?}");
+}

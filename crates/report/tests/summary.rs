@@ -210,3 +210,9 @@ fn a_browser_shows_the_page() {
     assert_eq!(dom.matches("<svg").count(), dom.matches("</svg>").count());
     assert!(dom.contains("id=\"reading\""));
 }
+
+#[test]
+fn the_page_keeps_nobody_out() {
+    let Some(faults) = browser::faults(&summary().to_html().unwrap()) else { return };
+    assert!(faults.is_empty(), "{faults:#?}");
+}

@@ -4,8 +4,8 @@ use std::ops::Range;
 
 use crate::error::SparseError;
 use crate::library::Library;
-use crate::product::add_products;
-use crate::rows::{CACHED, Rows, check_finite, check_ranges, count, panels};
+use crate::product::{RowPanel, add_products};
+use crate::rows::{Rows, check_finite, check_ranges, count, panels};
 
 /// Rows of a panel: its columns stay in the caches while they are multiplied.
 pub(crate) const PANEL: usize = 256;
@@ -135,26 +135,21 @@ impl Gram {
                 expected: rows.rows(),
             });
         }
-        let m = rows.columns() + 1;
-        let mut sums = vec![vec![0.0; m * m]; samples.len()];
-        // Rows that a sample leaves out take part with a weight of zero: to skip them costs more than to multiply them.
-        let mut roots = [0.0; CACHED];
-        let mut panel = vec![0.0; CACHED * m];
-        for start in (0..rows.rows()).step_by(CACHED) {
-            let end = (start + CACHED).min(rows.rows());
-            let n = end - start;
+        let k = rows.columns();
+        let mut sums = vec![vec![0.0; (k + 1) * (k + 1)]; samples.len()];
+        let mut panel = RowPanel::new(PANEL.min(rows.rows()), k);
+        let mut picked = vec![(0, 0.0); PANEL];
+        for start in (0..rows.rows()).step_by(PANEL) {
+            let range = start..(start + PANEL).min(rows.rows());
+            panel.fill(&rows.target()[range.clone()], (0..k).map(|j| &rows.column(j)[range.clone()]));
             for (weights, sums) in samples.iter().zip(&mut sums) {
-                for (root, &weight) in roots.iter_mut().zip(&weights[start..end]) {
-                    *root = f64::from(weight).sqrt();
+                // Every row is written; those left out are written over.
+                let mut count = 0;
+                for (row, &weight) in (0..).zip(&weights[range.clone()]) {
+                    picked[count] = (row, f64::from(weight));
+                    count += usize::from(weight > 0);
                 }
-                for (j, to) in panel[..n * m].chunks_exact_mut(n).enumerate() {
-                    let from = if j < rows.columns() { rows.column(j) } else { rows.target() };
-                    for ((to, root), from) in to.iter_mut().zip(&roots).zip(&from[start..end]) {
-                        *to = root * from;
-                    }
-                }
-                let columns: Vec<&[f64]> = panel[..n * m].chunks_exact(n).collect();
-                add_products(&columns, sums);
+                panel.add_products(&picked[..count], sums);
             }
         }
         let counts = samples.iter().map(|weights| weights.iter().map(|&w| w as usize).sum());

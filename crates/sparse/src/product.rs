@@ -193,6 +193,108 @@ impl<const V: usize, const C: usize> WithSimd for Group<'_, V, C> {
     }
 }
 
+/// Sums that one pass over the rows makes at once: with a vector of a row and a factor they fill 16 registers.
+const SUMS: usize = 9;
+
+/// Rows that lie one after the other, the target first, then the columns, then zeros.
+pub(crate) struct RowPanel {
+    values: Vec<f64>,
+    columns: usize,
+    stride: usize,
+}
+
+impl RowPanel {
+    /// Room for so many rows of so many columns.
+    pub(crate) fn new(rows: usize, columns: usize) -> Self {
+        // Whole vectors, whatever their width, and whole groups of sums.
+        let stride = (1 + columns.next_multiple_of(8)).next_multiple_of(SUMS);
+        Self { values: vec![0.0; rows * stride], columns, stride }
+    }
+
+    /// Takes the first rows from their columns, all of one length.
+    pub(crate) fn fill<'a>(&mut self, target: &'a [f64], columns: impl Iterator<Item = &'a [f64]>) {
+        for (place, column) in std::iter::once(target).chain(columns).enumerate() {
+            for (row, value) in self.values.chunks_exact_mut(self.stride).zip(column) {
+                row[place] = *value;
+            }
+        }
+    }
+
+    /// Adds w r rᵀ of every row r = [columns, target] picked, with its weight, to the lower triangle of `sums`
+    /// (column-major). The order of the additions is that of the rows, whatever the width of the machine's vectors.
+    pub(crate) fn add_products(&self, picked: &[(u32, f64)], sums: &mut [f64]) {
+        Arch::new().dispatch(Weighted { panel: self, picked, sums });
+    }
+}
+
+struct Weighted<'a> {
+    panel: &'a RowPanel,
+    picked: &'a [(u32, f64)],
+    sums: &'a mut [f64],
+}
+
+impl WithSimd for Weighted<'_> {
+    type Output = ();
+
+    #[inline(always)]
+    fn with_simd<S: Simd>(self, simd: S) {
+        let Weighted { panel, picked, sums } = self;
+        let (k, m) = (panel.columns, panel.columns + 1);
+        let lanes = size_of::<S::f64s>() / size_of::<f64>();
+        let mut tile = [0.0; SUMS * 8];
+        for first in (0..k).step_by(lanes) {
+            // The target, and the columns up to the last of this vector.
+            for group in (0..(first + lanes).min(k) + 1).step_by(SUMS) {
+                simd.vectorize(WeightedTile { panel, picked, first, group, out: &mut tile });
+                for (factor, products) in (group..).zip(tile[..SUMS * lanes].chunks_exact(lanes)) {
+                    for (i, product) in (first..k).zip(products) {
+                        match factor.checked_sub(1) {
+                            None => sums[i * m + k] += product,
+                            Some(j) if j <= i => sums[j * m + i] += product,
+                            Some(_) => {}
+                        }
+                    }
+                }
+            }
+        }
+        for &(row, weight) in picked {
+            let target = panel.values[row as usize * panel.stride];
+            sums[k * m + k] += weight * target * target;
+        }
+    }
+}
+
+/// The products of a vector of columns from `first` on with the factors from `group` on.
+struct WeightedTile<'a> {
+    panel: &'a RowPanel,
+    picked: &'a [(u32, f64)],
+    first: usize,
+    group: usize,
+    out: &'a mut [f64; SUMS * 8],
+}
+
+impl WithSimd for WeightedTile<'_> {
+    type Output = ();
+
+    #[inline(always)]
+    fn with_simd<S: Simd>(self, simd: S) {
+        let lanes = size_of::<S::f64s>() / size_of::<f64>();
+        let mut sums = [simd.splat_f64s(0.0); SUMS];
+        for &(row, weight) in self.picked {
+            let row = &self.panel.values[row as usize * self.panel.stride..][..self.panel.stride];
+            let values = S::as_simd_f64s(&row[1 + self.first..][..lanes]).0[0];
+            let factors = &row[self.group..][..SUMS];
+            let weighted = simd.mul_f64s(simd.splat_f64s(weight), values);
+            for b in 0..SUMS {
+                sums[b] = simd.mul_add_f64s(simd.splat_f64s(factors[b]), weighted, sums[b]);
+            }
+        }
+        for b in 0..SUMS {
+            S::as_mut_simd_f64s(&mut self.out[b * lanes..][..lanes]).0[0] = sums[b];
+        }
+    }
+}
+
 #[cfg(test)]
 mod tests {
     use super::*;
@@ -236,6 +338,29 @@ mod tests {
                     if i >= j {
                         assert!((sums[j * m + i] - wanted).abs() < 1e-12 * n as f64, "{m} {n} {i} {j}");
                     }
+                }
+            }
+        }
+    }
+
+    #[test]
+    fn weighted_rows_equal_the_plain_sums_for_every_size() {
+        for (k, n) in [(1, 1), (2, 7), (7, 9), (8, 64), (9, 33), (16, 100), (17, 65), (24, 30)] {
+            let columns: Vec<Vec<f64>> = (0..=k).map(|j| normal(n, 300 + j as u64)).collect();
+            let mut panel = RowPanel::new(n, k);
+            panel.fill(&columns[k], columns[..k].iter().map(Vec::as_slice));
+            let weights: Vec<u32> = (0..n).map(|i| (i * i % 4) as u32).collect();
+            let picked: Vec<(u32, f64)> =
+                (0..).zip(&weights).filter(|(_, w)| **w > 0).map(|(i, w)| (i, f64::from(*w))).collect();
+            let m = k + 1;
+            let mut sums = vec![1.0; m * m];
+            panel.add_products(&picked, &mut sums);
+            for j in 0..m {
+                for i in 0..m {
+                    let rows = columns[i].iter().zip(&columns[j]).zip(&weights);
+                    let plain: f64 = rows.map(|((a, b), w)| f64::from(*w) * a * b).sum();
+                    let wanted = if i >= j { 1.0 + plain } else { 1.0 };
+                    assert!((sums[j * m + i] - wanted).abs() < 1e-12 * (n as f64 + 1.0), "{k} {n} {i} {j}");
                 }
             }
         }

@@ -173,7 +173,7 @@ fn term_view(term: &Term) -> TermView {
     TermView {
         term_html: expression::html(&term.expression),
         parameter_html: term.parameter.as_deref().map(expression::html).unwrap_or_default(),
-        value: format::with_interval(term.value, term.ci95),
+        value: format::cell(term.value, term.ci95),
         interval: format::interval(term.ci95),
         inclusion: term.inclusion.map_or_else(|| "always".to_owned(), format::probability),
         bar: term

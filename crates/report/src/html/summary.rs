@@ -186,7 +186,7 @@ fn pooled(name: &str, over: &Pooled) -> PooledView {
     });
     PooledView {
         name_html: expression::html(name),
-        value: format::with_interval(over.value, over.ci95),
+        value: format::cell(over.value, over.ci95),
         unit: format::unit(&over.unit),
         method: match over.method {
             Method::None => "no interval",

@@ -32,12 +32,44 @@ pub(crate) fn dom(html: &str) -> Option<String> {
     Some(run(&browser, dir.path(), &file))
 }
 
+/// What keeps a reader out of the page, at the widths of a small phone, a phone and a desk: each a sentence. `None`
+/// without a browser. What is looked for stands in `audit.js`.
+pub(crate) fn faults(html: &str) -> Option<Vec<String>> {
+    let frames: String = [320, 390, 1280]
+        .map(|width| {
+            format!(
+                "<iframe width=\"{width}\" height=\"900\" data-width=\"{width}\" srcdoc=\"{}\"></iframe>",
+                html.replace('&', "&amp;").replace('"', "&quot;")
+            )
+        })
+        .concat();
+    let outer = format!(
+        "<!DOCTYPE html><html><body>{frames}<ul></ul><script>{}\n\
+         addEventListener('load', () => {{\
+           for (const frame of document.querySelectorAll('iframe')) {{\
+             for (const fault of audit(frame.contentDocument)) {{\
+               const line = document.createElement('li');\
+               line.textContent = frame.dataset.width + ' px: ' + fault;\
+               document.querySelector('ul').append(line);\
+             }}\
+             frame.remove();\
+           }}\
+           document.documentElement.dataset.audited = '1';\
+         }});</script></body></html>",
+        include_str!("audit.js")
+    );
+    let dom = dom(&outer)?;
+    assert!(root(&dom).contains("data-audited=\"1\""), "the audit broke off: {}", root(&dom));
+    let lines = dom.split("<li>").skip(1).map(|rest| rest.split("</li>").next().unwrap().to_owned());
+    Some(lines.collect())
+}
+
 fn run(browser: &Path, dir: &Path, file: &Path) -> String {
     let output = Command::new(browser)
         .args(["--headless", "--no-sandbox", "--disable-gpu", "--disable-quic", "--no-first-run"])
         .args(["--disable-background-networking", "--disable-component-update", "--disable-sync"])
         .arg(format!("--user-data-dir={}", dir.join("profile").display()))
-        .args(["--window-size=1200,900", "--dump-dom"])
+        .args(["--hide-scrollbars", "--window-size=1200,900", "--dump-dom"])
         .arg(format!("file://{}", file.display()))
         .output()
         .unwrap_or_else(|error| panic!("cannot run {}: {error}", browser.display()));

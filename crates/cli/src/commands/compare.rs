@@ -1,0 +1,66 @@
+//! `greybox compare`: what changed from one diagnosis to another.
+
+use std::path::{Path, PathBuf};
+
+use clap::Args;
+use greybox_report::{Comparison, Report, ReportError};
+
+use crate::answer::Answer;
+use crate::failure::Failure;
+use crate::output::OutputFolder;
+
+/// The files of a comparison.
+const FILES: [&str; 2] = ["comparison.json", "comparison.html"];
+
+/// Hold two diagnoses against each other: before and after a repair, with another load, of another model
+#[derive(Debug, Args)]
+#[command(after_help = "Example:
+  greybox compare march april --out change
+
+BEFORE and AFTER are folders that `greybox diagnose` wrote, or their report.json. With --out, the folder gets
+comparison.json and comparison.html.")]
+pub(crate) struct Arguments {
+    /// The earlier diagnosis
+    #[arg(value_name = "BEFORE")]
+    before: PathBuf,
+
+    /// The later one
+    #[arg(value_name = "AFTER")]
+    after: PathBuf,
+
+    /// Folder for the comparison; made where it is missing
+    #[arg(long, value_name = "DIR")]
+    out: Option<PathBuf>,
+}
+
+pub(crate) fn run(arguments: &Arguments) -> Result<Answer, Failure> {
+    let (before, after) = (read(&arguments.before)?, read(&arguments.after)?);
+    let name = |path: &Path| path.display().to_string();
+    let comparison = Comparison::of((&name(&arguments.before), &before), (&name(&arguments.after), &after));
+    let unwritten = |e: ReportError| Failure::internal(e.to_string());
+    let json = comparison.to_json().map_err(unwritten)?;
+    if let Some(path) = &arguments.out {
+        let out = OutputFolder::prepare(path)?;
+        out.spares(&FILES, [&arguments.before, &arguments.after])?;
+        let html = comparison.to_html().map_err(unwritten)?;
+        out.write(&[(FILES[0], json.as_bytes()), (FILES[1], html.as_bytes())])?;
+    }
+    let mut text: String = comparison.summary.iter().map(|s| format!("{s}\n")).collect();
+    for caution in &comparison.cautions {
+        text.push_str(&format!("  caution: {caution}\n"));
+    }
+    if let Some(path) = &arguments.out {
+        text.push_str(&format!("\n{}\n", path.join(FILES[1]).display()));
+    }
+    Ok(Answer::new(text, serde_json::from_str(&json).map_err(|e| Failure::internal(e.to_string()))?))
+}
+
+/// The report of a folder, or of a file.
+fn read(path: &Path) -> Result<Report, Failure> {
+    let file = if path.is_dir() { path.join("report.json") } else { path.to_owned() };
+    let mend = "name a folder that `greybox diagnose` wrote, or its report.json";
+    let text = std::fs::read_to_string(&file)
+        .map_err(|e| Failure::file(&file, format!("cannot be read: {e}")).mend(mend))?;
+    Report::from_json(&text)
+        .map_err(|e| Failure::file(&file, format!("this is no report of a diagnosis: {e}")).mend(mend))
+}
