@@ -1,8 +1,6 @@
 //! Two diagnoses side by side: what counts as a change, the schema, and the page.
 #![allow(clippy::unwrap_used, reason = "helpers of tests panic like the tests themselves")]
 
-use std::sync::OnceLock;
-
 use greybox_report::Comparison;
 use greybox_report::compare::schema;
 use greybox_report::contract::{Estimate, Finding, Interval, Parameter, Report, Severity, Verdict};
@@ -11,23 +9,12 @@ use greybox_report::contract::{Estimate, Finding, Interval, Parameter, Report, S
 mod browser;
 #[path = "common/schema.rs"]
 mod documents;
+#[path = "common/reports.rs"]
+mod reports;
 #[path = "../examples/sample/mod.rs"]
 mod sample;
 
-/// The sample's report, whose signals take a while to make.
-fn sampled() -> &'static Report {
-    static REPORT: OnceLock<Report> = OnceLock::new();
-    REPORT.get_or_init(|| sample::page().report)
-}
-
-/// The sample's report with this much friction.
-fn report(fc: f64, half: f64) -> Report {
-    let mut report = sampled().clone();
-    let estimate =
-        Estimate { value: fc, ci95: Some(Interval::new(fc - half, fc + half)), unit: "N m".into() };
-    report.mechanisms[0].parameters.insert("fc".into(), estimate);
-    report
-}
+use reports::{sampled, with_friction};
 
 fn compared(before: &Report, after: &Report) -> Comparison {
     Comparison::of(("march", before), ("april <2>", after))
@@ -40,9 +27,9 @@ fn the_checked_in_schema_is_current() {
 
 #[test]
 fn a_comparison_satisfies_the_schema_and_comes_back_unchanged() {
-    let mut after = report(0.09, 0.004);
+    let mut after = with_friction(0.09, 0.004);
     after.fit.holdout.improved["theta"].nrmse = f64::INFINITY;
-    let text = compared(&report(0.06, 0.004), &after).to_json().unwrap();
+    let text = compared(&with_friction(0.06, 0.004), &after).to_json().unwrap();
     let json = documents::assert_valid(&text, &schema());
     let back: Comparison = serde_json::from_str(&text).unwrap();
     assert_eq!(back.to_json().unwrap(), text);
@@ -67,22 +54,22 @@ fn a_report_beside_itself_has_not_changed() {
 #[test]
 fn a_change_is_more_than_the_half_width_of_the_difference() {
     for (after, changed) in [(0.149, false), (0.151, true), (0.049, true), (0.051, false)] {
-        let c = compared(&report(0.1, 0.03), &report(after, 0.04));
+        let c = compared(&with_friction(0.1, 0.03), &with_friction(after, 0.04));
         assert_eq!(c.mechanisms[0].parameters["fc"].changed, Some(changed), "{after}");
         assert_eq!(c.summary[1].contains("but changed: f"), changed, "{:?}", c.summary);
     }
     // Without an interval, or in another unit, nothing can be said.
-    let mut other = report(0.2, 0.01);
+    let mut other = with_friction(0.2, 0.01);
     other.mechanisms[0].parameters["fc"].unit = "mN m".into();
-    assert_eq!(compared(&report(0.1, 0.01), &other).mechanisms[0].parameters["fc"].changed, None);
+    assert_eq!(compared(&with_friction(0.1, 0.01), &other).mechanisms[0].parameters["fc"].changed, None);
     other.mechanisms[0].parameters["fc"].ci95 = None;
-    assert_eq!(compared(&report(0.1, 0.01), &other).mechanisms[0].parameters["fc"].changed, None);
+    assert_eq!(compared(&with_friction(0.1, 0.01), &other).mechanisms[0].parameters["fc"].changed, None);
 }
 
 #[test]
 fn what_is_new_what_is_gone_and_what_moved_are_told_apart() {
-    let old = report(0.06, 0.004);
-    let mut new = report(0.06, 0.004);
+    let old = with_friction(0.06, 0.004);
+    let mut new = with_friction(0.06, 0.004);
     new.mechanisms[0].kind = "viscous_friction".into();
     let c = compared(&old, &new);
     assert_eq!(c.mechanisms.len(), old.mechanisms.len() + 1);
@@ -90,7 +77,7 @@ fn what_is_new_what_is_gone_and_what_moved_are_told_apart() {
     assert_eq!(c.summary.iter().filter(|s| s.ends_with(" is gone.")).count(), 1, "{:?}", c.summary);
 
     // So is a law of the same kind and place with other parameters; the two are told apart.
-    let mut other = report(0.06, 0.004);
+    let mut other = with_friction(0.06, 0.004);
     other.mechanisms[0].expression = "fd*sign(theta')".into();
     let fc = other.mechanisms[0].parameters.shift_remove("fc").unwrap();
     other.mechanisms[0].parameters.insert("fd".into(), fc);
@@ -104,7 +91,7 @@ fn what_is_new_what_is_gone_and_what_moved_are_told_apart() {
     assert!(c.summary.iter().any(|s| s.ends_with("fc·sign(θ′), is gone.")), "{:?}", c.summary);
 
     // The same kind in another equation is another mechanism.
-    let mut moved = report(0.06, 0.004);
+    let mut moved = with_friction(0.06, 0.004);
     moved.mechanisms[0].location.equation = Some("link".into());
     assert_eq!(compared(&old, &moved).mechanisms.len(), old.mechanisms.len() + 1);
 
@@ -130,7 +117,7 @@ fn what_makes_figures_incomparable_is_said() {
 
 /// More friction, and a finding that was not there.
 fn changed() -> Comparison {
-    let mut after = report(0.09, 0.004);
+    let mut after = with_friction(0.09, 0.004);
     after.findings.push(Finding {
         severity: Severity::Warning,
         code: "clipping".into(),
@@ -139,7 +126,7 @@ fn changed() -> Comparison {
         message: "it clips".into(),
         mend: None,
     });
-    compared(&report(0.06, 0.004), &after)
+    compared(&with_friction(0.06, 0.004), &after)
 }
 
 #[test]
@@ -176,7 +163,7 @@ fn hostile_names_do_nothing_in_the_browser() {
     let evil = "</title></style><script>document.documentElement.dataset.owned='1'</script>\
                 <img src=x onerror=\"document.documentElement.dataset.owned='2'\">";
     let hostile = |fc: f64| {
-        let mut report = report(fc, 0.004);
+        let mut report = with_friction(fc, 0.004);
         report.model.name = evil.into();
         report.model.file = evil.into();
         report.greybox.version = format!("{fc} {evil}");

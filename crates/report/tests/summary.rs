@@ -1,9 +1,7 @@
 //! `summary.json` against its schema, the algebra of merging, and the page.
 #![allow(clippy::unwrap_used, reason = "helpers of tests panic like the tests themselves")]
 
-use std::sync::OnceLock;
-
-use greybox_report::contract::{Estimate, Interval, ModelId, Producer, Report, Verdict};
+use greybox_report::contract::{Interval, ModelId, Producer, Report, Verdict};
 use greybox_report::merge::{conclude, failed, map, reduce};
 use greybox_report::summary::{Method, Statistics, Summary, schema};
 
@@ -11,21 +9,16 @@ use greybox_report::summary::{Method, Statistics, Summary, schema};
 mod browser;
 #[path = "common/schema.rs"]
 mod documents;
+#[path = "common/reports.rs"]
+mod reports;
 #[path = "../examples/sample/mod.rs"]
 mod sample;
 
-/// The sample's report, whose signals take a while to make.
-fn sampled() -> &'static Report {
-    static REPORT: OnceLock<Report> = OnceLock::new();
-    REPORT.get_or_init(|| sample::page().report)
-}
+use reports::{sampled, with_friction};
 
 /// The sample's report with this much friction and another inertia.
 fn report(fc: f64, half: f64) -> Report {
-    let mut report = sampled().clone();
-    let estimate =
-        Estimate { value: fc, ci95: Some(Interval::new(fc - half, fc + half)), unit: "N m".into() };
-    report.mechanisms[0].parameters.insert("fc".into(), estimate);
+    let mut report = with_friction(fc, half);
     let inertia = &mut report.parameters["J"];
     inertia.value *= 1.0 + fc;
     inertia.ci95 = Some(Interval::new(0.99 * inertia.value, 1.01 * inertia.value));

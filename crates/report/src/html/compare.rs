@@ -30,8 +30,8 @@ struct CompareTemplate<'a> {
 
 struct View {
     common: Common,
-    badge: &'static str,
-    class: &'static str,
+    verdict: &'static str,
+    verdict_class: &'static str,
     headline: String,
     sentences: Vec<String>,
     cautions: Vec<String>,
@@ -100,8 +100,8 @@ impl View {
                 seed: c.after.greybox.seed,
                 ..Common::default()
             },
-            badge: if different { "Changed" } else { "Unchanged" },
-            class: if different { "missing" } else { "consistent" },
+            verdict: if different { "Changed" } else { "Unchanged" },
+            verdict_class: if different { "missing" } else { "consistent" },
             headline,
             sentences,
             cautions: c.cautions.clone(),
