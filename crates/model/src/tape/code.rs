@@ -7,6 +7,10 @@ use super::{Op, Reg, Switch, powi};
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub(super) enum Code {
     One(Op),
+    /// a².
+    Square(Reg),
+    /// a³.
+    Cube(Reg),
     /// a b, then a b + c.
     MulAdd(Reg, Reg, Reg),
     /// a b, then a b − c.
@@ -29,7 +33,7 @@ pub(super) fn compile(ops: &[Op], first: usize) -> Vec<Code> {
                 i += 2;
             }
             None => {
-                code.push(Code::One(ops[i]));
+                code.push(single(ops[i]));
                 i += 1;
             }
         }
@@ -58,6 +62,15 @@ fn pair(op: Op, product: Reg, next: Op) -> Option<Code> {
     }
 }
 
+/// The commonest powers have no exponent to ask for.
+fn single(op: Op) -> Code {
+    match op {
+        Op::Powi(a, 2) => Code::Square(a),
+        Op::Powi(a, 3) => Code::Cube(a),
+        op => Code::One(op),
+    }
+}
+
 /// Runs `code`, whose results go to the registers from `first` on. With `NATURAL` every mode is taken from the
 /// arguments' values and left in `modes`; else `lambda[k]` is the value of a sticking sign `k`.
 #[inline(always)]
@@ -79,6 +92,14 @@ pub(super) fn run<const NATURAL: bool>(
             Code::One(Op::Mul(a, b)) => g(a) * g(b),
             Code::One(Op::Div(a, b)) => g(a) / g(b),
             Code::One(Op::Powi(a, n)) => powi(g(a), n),
+            Code::Square(a) => {
+                let x = g(a);
+                x * x
+            }
+            Code::Cube(a) => {
+                let x = g(a);
+                x * x * x
+            }
             Code::One(Op::Pow(a, b)) => g(a).powf(g(b)),
             Code::One(Op::Switch(k)) => {
                 let s = &switches[k as usize];
