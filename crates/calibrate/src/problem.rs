@@ -129,6 +129,16 @@ impl Work {
     }
 }
 
+/// Most steps that are tried from one point, each more damped than the one before.
+const TRIALS: usize = 30;
+
+/// The first step is at most so many times as long as the parameters are (Moré: 0.1 to 100).
+const FIRST_RADIUS: f64 = 1.0;
+
+/// Bounds of the damping.
+const LEAST_DAMPING: f64 = 1e-12;
+const MOST_DAMPING: f64 = 1e18;
+
 /// Residual where the simulation says no number (a logarithm of what is negative, an overflow), in units of the scale:
 /// much more than any that it may have, and not so much that a fit cannot leave such a place.
 const UNDEFINED: f64 = 1e3;
@@ -165,7 +175,7 @@ pub struct SegmentRows {
 /// How a fit ended.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Ending {
-    /// The relative decrease fell below the tolerance.
+    /// The relative decrease fell below the tolerance, or no step promises one above it.
     Converged,
     /// No step decreases the cost any more.
     Stalled,
@@ -390,8 +400,7 @@ impl Problem<'_> {
                     let y = &measured[c][segment.range.clone()];
                     for k in 0..n {
                         let v = d[c * n + k] * inverse;
-                        let defined = !y[k].is_nan() && trajectory.y[c * n + k].is_finite() && v.is_finite();
-                        column[c * n + k] = if defined { v } else { 0.0 };
+                        column[c * n + k] = if y[k].is_nan() || !v.is_finite() { 0.0 } else { v };
                     }
                 }
                 whiten(column);
@@ -464,7 +473,10 @@ impl Problem<'_> {
         (rss, count)
     }
 
-    /// Levenberg–Marquardt from `point` (Marquardt scaling, bounds by projection).
+    /// Levenberg–Marquardt from `point` in a region of trust (Moré, *The Levenberg–Marquardt algorithm:
+    /// implementation and theory*, 1978), bounds by projection. A parameter is scaled by the largest norm that its
+    /// column has had: where the model does not feel it for a while, its step stays bounded. The region grows and
+    /// shrinks by how much of the decrease that the linear model promised came true.
     pub fn fit(&self, point: Point, limits: Limits) -> Fit {
         let (nx, np) = (self.system.nx, self.free.len());
         let width = nx + np + 1;
@@ -476,12 +488,14 @@ impl Problem<'_> {
         let pinned = |i: usize, j: usize| {
             self.start_priors[i][j].1 == 0.0 || (continued[i] && self.carried.contains(&j))
         };
-        let mut lambda = 1e-3;
+        let mut radius = 0.0_f64;
+        let mut damping = 1.0_f64;
         let mut ending = Ending::Limit;
         let mut iterations = 0;
         let mut rows = self.rows(&point, true, None);
         let mut cost = self.cost_of(&rows, &point);
         let mut small = 0;
+        let mut sizes = vec![0.0; np];
         while iterations < limits.iterations && !self.work.is_given_up() {
             iterations += 1;
             let reduced: Vec<Reduced> = rows
@@ -501,15 +515,48 @@ impl Problem<'_> {
                 })
                 .collect();
             let global = self.stack(&reduced, &point.parameters, nx, np);
+            for (j, size) in sizes.iter_mut().enumerate() {
+                let square: f64 = (0..=j).map(|i| global[i * (np + 1) + j].powi(2)).sum();
+                *size = square.max(*size);
+            }
+            let scaled = |values: &mut dyn Iterator<Item = f64>| -> f64 {
+                values.zip(&sizes).map(|(v, size)| v * v * size).sum::<f64>().sqrt()
+            };
+            if iterations == 1 {
+                let size = scaled(&mut self.free.iter().map(|f| point.parameters[f.index]));
+                radius = FIRST_RADIUS * if size > 0.0 { size } else { cost.sqrt() };
+            }
             let mut accepted = false;
-            for _ in 0..12 {
-                let Some(step) = self.step(&global, np, lambda, &point.parameters) else { break };
+            let mut otherwise = Ending::Stalled;
+            for _ in 0..TRIALS {
+                let Some((step, lambda)) = self.step_within(&global, &sizes, radius, &point.parameters)
+                else {
+                    break;
+                };
+                let length = scaled(&mut step.iter().copied());
+                if iterations == 1 {
+                    radius = radius.min(length);
+                }
                 let mut trial = point.clone();
                 for (f, d) in self.free.iter().zip(&step) {
                     trial.parameters[f.index] = (trial.parameters[f.index] + d).clamp(f.lower, f.upper);
                 }
                 let moved: Vec<f64> =
                     self.free.iter().map(|f| trial.parameters[f.index] - point.parameters[f.index]).collect();
+                let shrink = damping / (1.0 + 0.1 * lambda.min(1e6));
+                let promised = self.promised(&global, &reduced, &moved, shrink);
+                if promised < f64::EPSILON * cost {
+                    let whole = |(f, d): (&Free, &f64)| {
+                        (f.lower..=f.upper).contains(&(point.parameters[f.index] + d))
+                    };
+                    if self.free.iter().zip(&step).all(whole) {
+                        otherwise = Ending::Converged;
+                        break;
+                    }
+                    // A bound cut the step to one that is not worth a simulation.
+                    radius = 0.25 * radius.min(length);
+                    continue;
+                }
                 for (i, red) in reduced.iter().enumerate() {
                     let rhs: Vec<f64> = (0..nx)
                         .map(|a| {
@@ -518,7 +565,6 @@ impl Problem<'_> {
                         })
                         .collect();
                     let dx = qr::back_substitute(&red.triangle, width, nx, &rhs);
-                    let shrink = 1.0 / (1.0 + 0.1 * lambda.min(1e6));
                     for (j, d) in dx.iter().enumerate() {
                         if !pinned(i, j) {
                             trial.starts[i][j] += d * shrink;
@@ -526,22 +572,32 @@ impl Problem<'_> {
                     }
                 }
                 let value = self.cost(&trial);
-                if value.is_finite() && value < cost {
+                // How much of the decrease that the linear model promised came true says how far it reaches.
+                let gained = if value.is_finite() { (cost - value) / promised } else { f64::NEG_INFINITY };
+                if gained <= 0.25 {
+                    // Where the parabola through the cost, its slope and the new cost has its minimum.
+                    let slope = 2.0 * promised;
+                    let least = slope / (2.0 * (slope - (cost - value)));
+                    let shorter = if gained.is_finite() { least.clamp(0.1, 0.5) } else { 0.1 };
+                    radius = shorter * radius.min(10.0 * length);
+                } else if gained >= 0.75 || lambda == 0.0 {
+                    radius = 2.0 * length;
+                }
+                if gained > 1e-4 {
                     let decrease = (cost - value) / cost.max(1e-300);
                     point = trial;
-                    lambda = (lambda * 0.2).max(1e-9);
                     small = if decrease < limits.tolerance { small + 1 } else { 0 };
                     cost = value;
+                    damping = (2.0 * damping).min(1.0);
                     accepted = true;
                     break;
                 }
-                lambda *= if lambda < 1.0 { 10.0 } else { 6.0 };
-                if lambda > 1e12 {
-                    break;
+                if np == 0 {
+                    damping *= 0.25;
                 }
             }
             if !accepted {
-                ending = Ending::Stalled;
+                ending = otherwise;
                 break;
             }
             if small >= 2 || cost < 1e-20 {
@@ -556,6 +612,21 @@ impl Problem<'_> {
         self.take_over(&rows, &continued, &mut point);
         let (rss, count) = self.rss(&rows);
         Fit { cost: self.cost_of(&rows, &point), point, rss, count, iterations, ending }
+    }
+
+    /// Decrease of the cost that the linear model expects where the parameters move so and the initial states by the
+    /// share `shrink` of what would suit them best.
+    fn promised(&self, global: &[f64], reduced: &[Reduced], moved: &[f64], shrink: f64) -> f64 {
+        let (nx, np) = (self.system.nx, moved.len());
+        let (width, stride) = (nx + np + 1, np + 1);
+        let of_starts = |r: &Reduced| (0..nx).map(|a| r.triangle[a * width + nx + np].powi(2)).sum::<f64>();
+        let of_parameters = (0..np).map(|i| {
+            let row = &global[i * stride..(i + 1) * stride];
+            let left = row[np] - row[i..np].iter().zip(&moved[i..]).map(|(r, d)| r * d).sum::<f64>();
+            row[np].powi(2) - left.powi(2)
+        });
+        let starts = (1.0 - (1.0 - shrink).powi(2)) * reduced.iter().map(of_starts).sum::<f64>();
+        starts + of_parameters.sum::<f64>()
     }
 
     /// Triangle of [J_p | r] over all segments with the prior's rows, stride np + 1.
@@ -580,8 +651,43 @@ impl Problem<'_> {
         qr::triangle(&mut a, m, np + 1)
     }
 
+    /// The step of at most `radius` in the scaled parameters, and its damping (Moré 1978).
+    fn step_within(
+        &self,
+        global: &[f64],
+        sizes: &[f64],
+        radius: f64,
+        parameters: &[f64],
+    ) -> Option<(Vec<f64>, f64)> {
+        let length = |step: &[f64]| step.iter().zip(sizes).map(|(d, size)| d * d * size).sum::<f64>().sqrt();
+        let within = |lambda: f64, least: f64| {
+            let step = self.step(global, sizes, lambda, parameters)?;
+            let found = length(&step);
+            (found <= 1.1 * radius).then_some((found >= least, step))
+        };
+        if let Some((_, step)) = within(LEAST_DAMPING, 0.0) {
+            return Some((step, 0.0));
+        }
+        let (mut low, mut high) = (LEAST_DAMPING.ln(), MOST_DAMPING.ln());
+        let mut best = None;
+        for _ in 0..40 {
+            let middle = 0.5 * (low + high);
+            let Some((near, step)) = within(middle.exp(), 0.9 * radius) else {
+                low = middle;
+                continue;
+            };
+            best = Some((step, middle.exp()));
+            if near {
+                break;
+            }
+            high = middle;
+        }
+        best
+    }
+
     /// Damped step from the global triangle; parameters at a bound that push outward stay.
-    fn step(&self, global: &[f64], np: usize, lambda: f64, parameters: &[f64]) -> Option<Vec<f64>> {
+    fn step(&self, global: &[f64], sizes: &[f64], lambda: f64, parameters: &[f64]) -> Option<Vec<f64>> {
+        let np = sizes.len();
         if np == 0 {
             return Some(Vec::new());
         }
@@ -596,12 +702,10 @@ impl Problem<'_> {
                     a[j * m + np + j] = 1.0;
                     continue;
                 }
-                let mut size = 0.0;
                 for i in 0..=j {
                     a[j * m + i] = global[i * stride + j];
-                    size += global[i * stride + j].powi(2);
                 }
-                a[j * m + np + j] = (lambda * size).sqrt().max(1e-150);
+                a[j * m + np + j] = (lambda * sizes[j]).sqrt().max(1e-150);
             }
             for i in 0..np {
                 a[np * m + i] = global[i * stride + np];

@@ -11,6 +11,7 @@ pub mod search;
 pub mod smoother;
 pub mod spectra;
 pub mod surface;
+mod uncertainty;
 
 pub use diagnosis::{Calibration, DiagnoseError, Diagnosis, Estimate, Options, Verdict, calibrate, diagnose};
 pub use library::{Mechanism, MechanismError, built_in};

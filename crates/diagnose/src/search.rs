@@ -15,6 +15,7 @@ use crate::evidence::{Evidence, Side, folds, kappa, least_kappa, weigh};
 use crate::library::Mechanism;
 use crate::place::{Place, places};
 use crate::screen::{Pair, Scored, first_states, screen, screen_pairs};
+use crate::uncertainty::Uncertainty;
 use crate::{Observer, Stage};
 
 /// Number of segments of the first and last level, where nothing else decides.
@@ -1555,6 +1556,82 @@ impl<'a> Search<'a> {
             }
         }
         let total = calibrated_rss(calibrated, scale);
+        let mut undetermined = Vec::new();
+        let best = loop {
+            if weighed.is_empty() {
+                return None;
+            }
+            let best = self.best_of(&weighed, open, total, scale);
+            if !self.gives_way(&weighed, best, current, open, scale) {
+                break best;
+            }
+            undetermined.push(weighed.remove(best));
+        };
+        let (chosen, fitted, evidence) = weighed.remove(best);
+        let likelihood = by_likelihood(&fitted, &evidence, scale);
+        let tell = |(c, f, e): (usize, Fitted, Evidence), undetermined: bool| {
+            // The data cannot separate what fits as well with no more parameters, nor what the evidence
+            // leaves at odds that no one would bet on: close scores, or criteria that contradict each other
+            // (BIC asks for certainty, Akaike's for a better prediction).
+            let as_good = self.complexity(&f) <= self.complexity(&fitted)
+                && !likelihood
+                && f.fit.rss.iter().zip(&fitted.fit.rss).all(|(x, y)| *x < 1.005 * y);
+            let disputed = likelihood && (e.score < evidence.score) != (e.akaike < evidence.akaike);
+            let close = (e.score - evidence.score).abs() < UNDECIDED;
+            let equivalent = as_good || disputed || close || undetermined;
+            let instance = f.parts.last()?.instance.clone();
+            Some(Rival { candidate: open[c].clone(), instance, evidence: e, equivalent })
+        };
+        let rivals =
+            undetermined.into_iter().map(|u| (u, true)).chain(weighed.into_iter().map(|w| (w, false)));
+        let rivals = rivals.filter_map(|(trial, undetermined)| tell(trial, undetermined)).collect();
+        Some((open[chosen].clone(), fitted, rivals, evidence))
+    }
+
+    /// Whether a refinement is no choice: the law that it refines is at hand, and the 95 % interval of one of the
+    /// refinement's strengths is wider than the largest of them, so that the data do not show its parts.
+    fn gives_way(
+        &self,
+        weighed: &[(usize, Fitted, Evidence)],
+        best: usize,
+        current: &Fitted,
+        open: &[Candidate],
+        scale: &[f64],
+    ) -> bool {
+        let (candidate, fitted) = (&open[weighed[best].0], &weighed[best].1);
+        let mechanism = &self.library[candidate.mechanism];
+        let standing = current.parts.iter().map(|p| &p.candidate);
+        let mut at_hand = standing.chain(weighed.iter().map(|(c, ..)| &open[*c]));
+        let refined = at_hand.any(|c| {
+            c.place == candidate.place && mechanism.refines.contains(&self.library[c.mechanism].kind)
+        });
+        if !refined {
+            return false;
+        }
+        let Some(part) = fitted.parts.last() else { return false };
+        let widths = Uncertainty::of(fitted, scale).widths();
+        let strengths: Vec<(f64, f64)> = mechanism
+            .parameters()
+            .zip(&part.instance.names)
+            .filter(|(plain, _)| mechanism.linear.iter().any(|l| l == plain))
+            .filter_map(|(_, name)| {
+                let index = fitted.setup.model.parameter(name)?;
+                let at = fitted.setup.free.iter().position(|f| f.index == index)?;
+                Some((fitted.fit.point.parameters[index].abs(), widths[at]))
+            })
+            .collect();
+        let largest = strengths.iter().map(|s| s.0).fold(0.0, f64::max);
+        strengths.iter().any(|s| s.1 > largest)
+    }
+
+    /// The best by score, unless a simpler one is as good.
+    fn best_of(
+        &self,
+        weighed: &[(usize, Fitted, Evidence)],
+        open: &[Candidate],
+        total: f64,
+        scale: &[f64],
+    ) -> usize {
         let priority = |c: usize| self.library[open[c].mechanism].rank;
         let mut best = 0;
         for i in 1..weighed.len() {
@@ -1580,27 +1657,7 @@ impl<'a> Search<'a> {
                 best = i;
             }
         }
-        if weighed.is_empty() {
-            return None;
-        }
-        let (chosen, fitted, evidence) = weighed.remove(best);
-        let likelihood = by_likelihood(&fitted, &evidence, scale);
-        let rivals = weighed
-            .into_iter()
-            .filter_map(|(c, f, e)| {
-                // The data cannot separate what fits as well with no more parameters, nor what the evidence
-                // leaves at odds that no one would bet on: close scores, or criteria that contradict each other
-                // (BIC asks for certainty, Akaike's for a better prediction).
-                let as_good = self.complexity(&f) <= self.complexity(&fitted)
-                    && !likelihood
-                    && f.fit.rss.iter().zip(&fitted.fit.rss).all(|(x, y)| *x < 1.005 * y);
-                let disputed = likelihood && (e.score < evidence.score) != (e.akaike < evidence.akaike);
-                let equivalent = as_good || disputed || (e.score - evidence.score).abs() < UNDECIDED;
-                let instance = f.parts.last()?.instance.clone();
-                Some(Rival { candidate: open[c].clone(), instance, evidence: e, equivalent })
-            })
-            .collect();
-        Some((open[chosen].clone(), fitted, rivals, evidence))
+        best
     }
 
     /// Drops what no longer pays.
