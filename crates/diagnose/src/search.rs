@@ -85,6 +85,9 @@ const STARTING_POINTS: usize = 3;
 const STEPS_TO_TELL: usize = 3;
 /// Log-likelihood gain that another hold must bring.
 const HOLD_GAIN: f64 = 10.0;
+
+/// Score that a mechanism keeps, or goes.
+const LEAST_SCORE: f64 = 10.0;
 /// A simpler model wins when its score is no further behind than this.
 const PARSIMONY: f64 = 4.0;
 /// Least share of the calibrated model's misfit that a second or later mechanism must explain.
@@ -574,11 +577,22 @@ impl<'a> Search<'a> {
 
     /// `fitted` without part `index`, refitted.
     fn without(&self, fitted: &Fitted, index: usize, scale: &[f64], iterations: usize) -> Option<Fitted> {
-        let n0 = self.nominal.model.parameters.len();
         let mut parts = self.parts(fitted);
         parts.remove(index);
+        self.reassembled(fitted, &parts, scale, iterations)
+    }
+
+    /// The model with other parts at these values, from a fit's parameters.
+    fn reassembled(
+        &self,
+        fitted: &Fitted,
+        parts: &[(Candidate, Vec<f64>, Vec<f64>)],
+        scale: &[f64],
+        iterations: usize,
+    ) -> Option<Fitted> {
+        let n0 = self.nominal.model.parameters.len();
         let head = &fitted.fit.point.parameters[..n0];
-        let (setup, kept) = self.assemble(&fitted.setup.holds, head, &parts, &fitted.setup).ok()?;
+        let (setup, kept) = self.assemble(&fitted.setup.holds, head, parts, &fitted.setup).ok()?;
         let mut parameters = head.to_vec();
         parameters.extend(parts.iter().flat_map(|p| p.1.iter().copied()));
         let level = same_level(&setup, &fitted.level);
@@ -845,6 +859,7 @@ impl<'a> Search<'a> {
                 state.current = self.refit(&state.current, &state.scale, 5);
             }
         }
+        self.simplify(&mut state);
         let current = state.current;
         let better_holds = (0..current.setup.holds.len())
             .filter(|&i| current.setup.holds[i] != self.nominal.holds[i])
@@ -1484,7 +1499,6 @@ impl<'a> Search<'a> {
 
     /// The last part written as the sum of simpler mechanisms that it equals exactly.
     fn split(&self, fitted: &Fitted, scale: &[f64]) -> Option<Fitted> {
-        let n0 = self.nominal.model.parameters.len();
         let mut parts = self.parts(fitted);
         let (whole, values, _) = parts.pop()?;
         let mechanism = &self.library[whole.mechanism];
@@ -1505,14 +1519,7 @@ impl<'a> Search<'a> {
             })?;
             parts.push((part.clone(), vec![expression.eval(&|n, _| value(n))?], Vec::new()));
         }
-        let head = &fitted.fit.point.parameters[..n0];
-        let (setup, kept) = self.assemble(&fitted.setup.holds, head, &parts, &fitted.setup).ok()?;
-        let mut parameters = head.to_vec();
-        parameters.extend(parts.iter().flat_map(|p| p.1.iter().copied()));
-        let level = same_level(&setup, &fitted.level);
-        let starts = transfer(&fitted.setup, &level, &fitted.fit.point.starts, &setup, &[]);
-        let fit = setup.fit(&level, scale, &[Point { parameters, starts }], limits(3));
-        Some(Fitted { setup, parts: kept, level, fit })
+        self.reassembled(fitted, &parts, scale, 3)
     }
 
     /// The model without the winner, from the winner's parameters.
@@ -1588,8 +1595,7 @@ impl<'a> Search<'a> {
         Some((open[chosen].clone(), fitted, rivals, evidence))
     }
 
-    /// Whether a refinement is no choice: the law that it refines is at hand, and the 95 % interval of one of the
-    /// refinement's strengths is wider than the largest of them, so that the data do not show its parts.
+    /// Whether a refinement is no choice: the law that it refines is at hand, and the data do not show its parts.
     fn gives_way(
         &self,
         weighed: &[(usize, Fitted, Evidence)],
@@ -1599,16 +1605,21 @@ impl<'a> Search<'a> {
         scale: &[f64],
     ) -> bool {
         let (candidate, fitted) = (&open[weighed[best].0], &weighed[best].1);
-        let mechanism = &self.library[candidate.mechanism];
         let standing = current.parts.iter().map(|p| &p.candidate);
         let mut at_hand = standing.chain(weighed.iter().map(|(c, ..)| &open[*c]));
-        let refined = at_hand.any(|c| {
-            c.place == candidate.place && mechanism.refines.contains(&self.library[c.mechanism].kind)
-        });
-        if !refined {
-            return false;
-        }
-        let Some(part) = fitted.parts.last() else { return false };
+        at_hand.any(|c| self.is_refined_by(c, candidate))
+            && self.is_undetermined(fitted, fitted.parts.len().wrapping_sub(1), scale)
+    }
+
+    fn is_refined_by(&self, law: &Candidate, refinement: &Candidate) -> bool {
+        law.place == refinement.place
+            && self.library[refinement.mechanism].refines.contains(&self.library[law.mechanism].kind)
+    }
+
+    /// Whether the 95 % interval of one of a part's strengths is wider than the largest of them.
+    fn is_undetermined(&self, fitted: &Fitted, part: usize, scale: &[f64]) -> bool {
+        let Some(part) = fitted.parts.get(part) else { return false };
+        let mechanism = &self.library[part.candidate.mechanism];
         let widths = Uncertainty::of(fitted, scale).widths();
         let strengths: Vec<(f64, f64)> = mechanism
             .parameters()
@@ -1622,6 +1633,30 @@ impl<'a> Search<'a> {
             .collect();
         let largest = strengths.iter().map(|s| s.0).fold(0.0, f64::max);
         strengths.iter().any(|s| s.1 > largest)
+    }
+
+    /// The model with a law in place of its refinement, from the refinement's parameters.
+    fn simpler(&self, fitted: &Fitted, index: usize, scale: &[f64]) -> Option<Fitted> {
+        let mut parts = self.parts(fitted);
+        let (refinement, values, _) = &parts[index];
+        let law = self.all.iter().find(|c| self.is_refined_by(c, refinement))?;
+        if parts.iter().any(|p| p.0 == *law) {
+            return None;
+        }
+        let mechanism = &self.library[refinement.mechanism];
+        let known: Vec<(&str, f64)> = mechanism.parameters().zip(values.iter().copied()).collect();
+        let strength = known
+            .iter()
+            .filter(|(n, _)| mechanism.linear.iter().any(|l| l == n))
+            .map(|k| k.1)
+            .max_by(|a, b| a.abs().total_cmp(&b.abs()))?;
+        let inner = &self.library[law.mechanism];
+        let values = inner.parameters().map(|n| {
+            let linear = inner.linear.iter().any(|l| l == n);
+            if linear { Some(strength) } else { known.iter().find(|k| k.0 == n).map(|k| k.1) }
+        });
+        parts[index] = (law.clone(), values.collect::<Option<_>>()?, Vec::new());
+        self.reassembled(fitted, &parts, scale, LAST_STEPS)
     }
 
     /// The best by score, unless a simpler one is as good.
@@ -1677,7 +1712,7 @@ impl<'a> Search<'a> {
                 (false, true) => 0.004,
                 (false, false) => 0.01,
             };
-            if e.score < 10.0 || e.drop < least {
+            if e.score < LEAST_SCORE || e.drop < least {
                 let gone = state.current.parts[index].candidate.clone();
                 self.observer.dropped(&self.library[gone.mechanism].kind);
                 state.accepted.retain(|a| a.candidate != gone);
@@ -1686,6 +1721,35 @@ impl<'a> Search<'a> {
             } else {
                 index += 1;
             }
+        }
+    }
+
+    /// Puts a law in the place of its refinement where the data do not show the refinement's parts, and the law fits
+    /// as well.
+    fn simplify(&self, state: &mut State) {
+        for index in 0..state.current.parts.len() {
+            let Part { candidate: refinement, instance, .. } = state.current.parts[index].clone();
+            let mechanism = &self.library[refinement.mechanism];
+            if mechanism.refines.is_empty() || !self.is_undetermined(&state.current, index, &state.scale) {
+                continue;
+            }
+            let Some(simpler) = self.simpler(&state.current, index, &state.scale) else { continue };
+            let over = self.weigh(&simpler, &state.current, &state.scale);
+            if over.score >= LEAST_SCORE {
+                continue;
+            }
+            let Some(base) = self.without(&simpler, index, &state.scale, 12) else { continue };
+            let evidence = self.weigh(&base, &simpler, &state.scale);
+            self.observer.dropped(&mechanism.kind);
+            let law = simpler.parts[index].candidate.clone();
+            if let Some(known) = state.accepted.iter_mut().find(|a| a.candidate == refinement) {
+                known.rivals.retain(|r| r.candidate != law);
+                let before = std::mem::replace(&mut known.evidence, evidence);
+                known.candidate = law;
+                let rival = Rival { candidate: refinement, instance, evidence: before, equivalent: true };
+                known.rivals.insert(0, rival);
+            }
+            state.current = simpler;
         }
     }
 }
