@@ -55,7 +55,8 @@ pub(crate) fn diagnose<'py>(
             library: own.map(|own| own.library.mechanisms),
             work: work.map_or(usual.work, |work| work.saturating_mul(BILLION)),
         };
-        let found = greybox_diagnose::diagnose(&loaded.model, &train, &holdout, &options, watch)?;
+        let found = greybox_diagnose::diagnose(&loaded.model, &train, &holdout, &options, watch)
+.map_err(|e| Failure::diagnosis(&loaded.path, e))?;
         watch.stage("writing the report");
         diagnosis::Results::of(&found, &loaded, &train, &holdout)
     })?;
@@ -186,7 +187,8 @@ pub(crate) fn calibrate<'py>(
     let results = watched(py, progress, move |watch| {
         let Recordings { train, holdout } = fitting(sources, &loaded.model)?;
         calibration::has_free_parameter(&loaded)?;
-        let found = greybox_diagnose::calibrate(&loaded.model, &train, &holdout, watch)?;
+        let found = greybox_diagnose::calibrate(&loaded.model, &train, &holdout, watch)
+.map_err(|e| Failure::diagnosis(&loaded.path, e))?;
         watch.stage("writing the report");
         calibration::Results::of(&found, &loaded, &train, &holdout)
     })?;

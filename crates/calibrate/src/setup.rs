@@ -1,9 +1,11 @@
 //! A model together with the data it is fitted to: everything the fits of a diagnosis share.
 
+use std::ops::Range;
 use std::sync::Arc;
 
+use greybox_model::system::CompileError;
 use greybox_model::{Expr, Func, Hold, Model, System};
-use greybox_simulate::{Environment, Method, Seeds, integrate};
+use greybox_simulate::{Environment, MOST_TRIALS, Method, Seeds, Trajectory, integrate};
 use rayon::prelude::*;
 
 use crate::data::{Data, Hats};
@@ -22,6 +24,9 @@ const ONE_SIDED: usize = 60;
 
 /// Mean square of these samples over that of all from which a start is in doubt.
 const BADLY_STARTED: f64 = 2.0;
+
+/// Steps between two samples beyond which a model is not simulated.
+const MOST_SUBSTEPS: usize = 512;
 
 /// A compiled model, its data, and how to integrate it.
 #[derive(Debug, Clone)]
@@ -51,6 +56,48 @@ pub struct Setup {
     pub work: Arc<Work>,
 }
 
+/// A model that cannot be laid out.
+#[derive(Debug, Clone, PartialEq, thiserror::Error)]
+pub enum SetupError {
+    /// It does not compile.
+    #[error(transparent)]
+    Compile(#[from] CompileError),
+    /// Its fastest mode needs more steps than can be taken.
+    #[error(
+        "the model is stiff: it has a mode of about {rate:.1e} 1/s, which takes more than {MOST_SUBSTEPS} steps between \
+         two samples, {dt} s apart. Check the values and units of masses, capacities and stiffnesses; a part that fast \
+         is better left out, its state replaced by the value at which it settles"
+    )]
+    Stiff {
+        /// The largest |λ| that was seen, 1/s.
+        rate: f64,
+        /// Sample interval, s.
+        dt: f64,
+    },
+}
+
+/// A stretch of the data, simulated exactly.
+struct Reference {
+    piece: usize,
+    range: Range<usize>,
+    x0: Vec<f64>,
+    run: Trajectory,
+}
+
+impl Reference {
+    /// Steps per sample.
+    fn steps(&self) -> f64 {
+        self.run.steps as f64 / self.run.diverged.unwrap_or(self.run.n).max(1) as f64
+    }
+
+    /// Whether it takes more steps than there may be, for a mode that is that fast.
+    fn is_beyond_reach(&self, dt: f64) -> bool {
+        let stable = |steps: usize| self.run.fastest * dt > 3.25 * steps as f64;
+        let given_up = self.run.exhausted.is_some() && stable(MOST_TRIALS);
+        given_up || (self.run.is_stiff() && self.steps() > MOST_SUBSTEPS as f64 && stable(MOST_SUBSTEPS))
+    }
+}
+
 /// A name that is no state of the model.
 #[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
 #[error("the model has no state `{name}` to carry from segment to segment; its states are {available}")]
@@ -74,12 +121,8 @@ impl Setup {
     /// Lays out a model. `nominal_free` are the parameters to fit (see [`free_parameters`]).
     ///
     /// # Errors
-    /// When the model does not compile.
-    pub fn new(
-        model: &Model,
-        data: Arc<Data>,
-        free: Vec<Free>,
-    ) -> Result<Setup, greybox_model::system::CompileError> {
+    /// When the model does not compile, or has a mode so much faster than the samples that it cannot be simulated.
+    pub fn new(model: &Model, data: Arc<Data>, free: Vec<Free>) -> Result<Setup, SetupError> {
         let system = Arc::new(System::compile(model)?);
         let hats = Arc::new(Hats::new(model, &data));
         let holds: Vec<Hold> = model.inputs.iter().map(|i| i.hold).collect();
@@ -98,7 +141,14 @@ impl Setup {
             work: Arc::default(),
         };
         let tolerance: Vec<f64> = setup.data.spread.iter().map(|s| 1e-3 * s).collect();
-        setup.choose_method(&tolerance, JUDGED);
+        let references = setup.references(JUDGED);
+        for r in &references {
+            let dt = setup.data.pieces[r.piece].dt;
+            if r.is_beyond_reach(dt) {
+                return Err(SetupError::Stiff { rate: r.run.fastest, dt });
+            }
+        }
+        setup.method = setup.cheapest(&tolerance, &references);
         Ok(setup)
     }
 
@@ -108,11 +158,7 @@ impl Setup {
     ///
     /// # Errors
     /// When the model does not compile.
-    pub fn with_model(
-        &self,
-        model: Model,
-        free: Vec<Free>,
-    ) -> Result<Setup, greybox_model::system::CompileError> {
+    pub fn with_model(&self, model: Model, free: Vec<Free>) -> Result<Setup, CompileError> {
         let system = Arc::new(System::compile(&model)?);
         let hats = if system.nx == self.system.nx {
             self.hats.clone()
@@ -168,23 +214,35 @@ impl Setup {
     /// twentieth of the noise and 10⁻⁶ of the signal) over stretches of `length` samples of the data (those that
     /// a fit simulates in one go), judged against Dormand–Prince with tight tolerances.
     pub fn choose_method(&mut self, tolerance: &[f64], length: usize) {
+        let references = self.references(length);
+        self.method = self.cheapest(tolerance, &references);
+    }
+
+    /// What methods are judged against.
+    fn references(&self, length: usize) -> Vec<Reference> {
         let Some((piece, data)) = self.data.pieces.iter().enumerate().max_by_key(|(_, p)| p.len.min(JUDGED))
         else {
-            return;
+            return Vec::new();
         };
         let n = length.clamp(2, JUDGED).min(data.len);
         let count = (JUDGED / n).clamp(1, STRETCHES);
-        let parameters: Vec<f64> = self.model.parameters.iter().map(|p| p.value).collect();
-        let starts: Vec<(usize, Vec<f64>)> = (0..count)
-            .map(|i| i * (data.len - n) / count)
-            .map(|from| (from, self.start(piece, from)))
-            .collect();
-        let run = |(from, x0): &(usize, Vec<f64>), method| {
-            let (environment, seeds) = (&self.environments[piece], Seeds::default());
-            integrate(&self.system, environment, &parameters, x0, *from..from + n, method, &seeds)
-        };
-        let exact = Method::Adaptive { rtol: 1e-9, atol: 1e-10 };
-        let references: Vec<_> = starts.iter().map(|s| run(s, exact)).collect();
+        (0..count)
+            .map(|i| {
+                let from = i * (data.len - n) / count;
+                let x0 = self.start(piece, from);
+                let exact = Method::Adaptive { rtol: 1e-9, atol: 1e-10 };
+                let run = self.stretch(piece, from..from + n, &x0, exact);
+                Reference { piece, range: from..from + n, x0, run }
+            })
+            .collect()
+    }
+
+    fn stretch(&self, piece: usize, range: Range<usize>, x0: &[f64], method: Method) -> Trajectory {
+        let environment = &self.environments[piece];
+        integrate(&self.system, environment, &self.values(), x0, range, method, &Seeds::default())
+    }
+
+    fn cheapest(&self, tolerance: &[f64], references: &[Reference]) -> Method {
         let limit: Vec<f64> = (0..self.system.ny)
             .map(|c| tolerance[c].max(0.05 * self.data.sigma[c]).max(1e-6 * self.data.spread[c]))
             .collect();
@@ -200,17 +258,21 @@ impl Setup {
             Method::Dp5 { substeps: 8 },
             Method::Dp5 { substeps: 16 },
         ];
+        // A fast mode needs small steps whatever the accuracy.
+        let fast = references.iter().any(|r| r.steps() > 16.0);
+        let fine = [32, 64, 128, 256, MOST_SUBSTEPS].map(|substeps| Method::Dp5 { substeps });
         let accurate = |method: &Method| {
-            starts.iter().zip(&references).all(|(start, reference)| {
-                let trial = run(start, *method);
-                let good = reference.diverged.unwrap_or(n).saturating_sub(1).max(2).min(n);
+            references.iter().all(|reference| {
+                let n = reference.range.len();
+                let trial = self.stretch(reference.piece, reference.range.clone(), &reference.x0, *method);
+                let good = reference.run.diverged.unwrap_or(n).saturating_sub(1).max(2).min(n);
                 limit.iter().enumerate().all(|(c, limit)| {
-                    (0..good).all(|k| (trial.y[c * n + k] - reference.y[c * n + k]).abs() <= *limit)
+                    (0..good).all(|k| (trial.y[c * n + k] - reference.run.y[c * n + k]).abs() <= *limit)
                 })
             })
         };
-        let method = ladder.into_iter().find(accurate);
-        self.method = method.unwrap_or(Method::Dp5 { substeps: 32 });
+        let method = ladder.into_iter().chain(fine.into_iter().filter(|_| fast)).find(accurate);
+        method.unwrap_or(Method::Dp5 { substeps: if fast { MOST_SUBSTEPS } else { 32 } })
     }
 
     /// Parameter values of the model.

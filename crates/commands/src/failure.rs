@@ -68,6 +68,14 @@ impl Failure {
         Failure::input(format!("{file}: {message}")).at("file", file)
     }
 
+    /// A diagnosis or calibration of the model at `path` that could not be made.
+    pub fn diagnosis(path: &Path, error: DiagnoseError) -> Failure {
+        match error {
+            DiagnoseError::Setup(error) => Failure::file(path, error),
+            other => other.into(),
+        }
+    }
+
     /// A fault of greybox or of the machine.
     pub fn internal(message: impl Into<String>) -> Failure {
         Failure::new(Cause::Internal, message)

@@ -5,9 +5,8 @@ use std::ops::Deref;
 use std::sync::Arc;
 
 use greybox_calibrate::{
-    Data, DataError, FreeRun, Limits, Point, Score, Setup, Work, free_parameters, window_length,
+    Data, DataError, FreeRun, Limits, Point, Score, Setup, SetupError, Work, free_parameters, window_length,
 };
-use greybox_model::system::CompileError;
 use greybox_model::{Expr, Func, Hold, Model};
 use greybox_recording::Recording;
 use rayon::prelude::*;
@@ -51,9 +50,9 @@ pub enum DiagnoseError {
     /// The recordings do not fit the model.
     #[error(transparent)]
     Data(#[from] DataError),
-    /// The model does not compile.
+    /// The model does not compile, or cannot be simulated.
     #[error(transparent)]
-    Compile(#[from] CompileError),
+    Setup(#[from] SetupError),
     /// A mechanism file is wrong.
     #[error(transparent)]
     Mechanism(#[from] MechanismError),
@@ -378,31 +377,25 @@ fn conclude(
         .collect();
 
     // Free runs.
-    let role = |data: &Arc<Data>, held: bool| -> Result<Role, DiagnoseError> {
-        let run = |f: &Setup, parameters: &[f64], scale: &[f64]| -> Result<Run, DiagnoseError> {
-            let setup = if held {
-                let mut s = Setup::new(&f.model, data.clone(), Vec::new())?;
-                s.method = f.method;
-                s
-            } else {
-                f.clone()
-            };
+    let role = |data: &Arc<Data>, held: bool| -> Role {
+        let run = |f: &Setup, parameters: &[f64], scale: &[f64]| -> Run {
+            let setup = if held { f.with_data(data.clone()) } else { f.clone() };
             let run = setup.free_run(parameters, scale);
             let scores = setup.scores(&run, parameters, window, None);
             let by_recording =
                 (0..data.recordings.len()).map(|r| setup.scores(&run, parameters, window, Some(r))).collect();
-            Ok(Run { run, scores, by_recording })
+            Run { run, scores, by_recording }
         };
         let nominal_scale: Vec<f64> = data.spread.iter().map(|s| s.max(1e-300)).collect();
-        Ok(Role {
+        Role {
             data: data.clone(),
-            nominal: run(nominal, &nominal.values(), &nominal_scale)?,
-            calibrated: run(&calibrated.setup, &calibrated.fit.point.parameters, &calibrated_scale)?,
-            improved: run(&improved.setup, &improved.fit.point.parameters, &scale)?,
-        })
+            nominal: run(nominal, &nominal.values(), &nominal_scale),
+            calibrated: run(&calibrated.setup, &calibrated.fit.point.parameters, &calibrated_scale),
+            improved: run(&improved.setup, &improved.fit.point.parameters, &scale),
+        }
     };
-    let mut train_role = role(&train, false)?;
-    let mut holdout_role = role(&holdout, true)?;
+    let mut train_role = role(&train, false);
+    let mut holdout_role = role(&holdout, true);
 
     // Mechanisms, remainder, verdict.
     // Where nothing was found, what the search's own noise model leaves white.
@@ -1196,19 +1189,18 @@ pub fn calibrate(
         })
         .collect();
     let spread: Vec<f64> = train.spread.iter().map(|s| s.max(1e-300)).collect();
-    let runs = |data: &Arc<Data>| -> Result<Both, DiagnoseError> {
-        let mut setup = Setup::new(model, data.clone(), Vec::new())?;
-        setup.method = fitted.setup.method;
+    let runs = |data: &Arc<Data>| -> Both {
+        let setup = fitted.setup.with_data(data.clone());
         let before = setup.free_run(&nominal.values(), &spread);
         let after = setup.free_run(values, &scale);
         let scores = (
             setup.scores(&before, &nominal.values(), window, None),
             setup.scores(&after, values, window, None),
         );
-        Ok((scores, (before, after)))
+        (scores, (before, after))
     };
-    let (train_scores, train_runs) = runs(&train)?;
-    let (holdout_scores, holdout_runs) = runs(&holdout)?;
+    let (train_scores, train_runs) = runs(&train);
+    let (holdout_scores, holdout_runs) = runs(&holdout);
     Ok(Calibration {
         model: calibrated,
         parameters,

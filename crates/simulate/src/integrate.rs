@@ -155,6 +155,23 @@ pub struct Trajectory {
     pub evaluations: usize,
     /// Accepted steps.
     pub steps: usize,
+    /// Of [`Method::Adaptive`]'s accepted steps, those that stability kept short and not accuracy: h|λ| > 3.25, with
+    /// |λ| estimated from the two stages at the step's end (Hairer & Wanner, Solving Ordinary Differential Equations
+    /// II, section IV.2).
+    pub stiff_steps: usize,
+    /// The largest |λ| of all of [`Method::Adaptive`]'s accepted steps, 1/s: how fast the fastest mode is.
+    pub fastest: f64,
+    /// First sample that [`Method::Adaptive`] did not reach within [`MOST_TRIALS`] steps from the one before; the
+    /// solution counts as diverged there.
+    pub exhausted: Option<usize>,
+}
+
+impl Trajectory {
+    /// Whether stability, and not accuracy, kept most of [`Method::Adaptive`]'s steps short: the model is stiff at this
+    /// tolerance, and made for an implicit method.
+    pub fn is_stiff(&self) -> bool {
+        2 * self.stiff_steps > self.steps
+    }
 }
 
 /// Everything a simulation needs apart from where it starts and ends.
@@ -260,9 +277,15 @@ impl Simulation<'_> {
 /// The trajectory's magnitude, relative to its inputs and start, beyond which it counts as diverged.
 const LIMIT: f64 = 1e9;
 
-/// Steps shorter than this share of the sample interval are taken whatever their error, so that every
-/// simulation ends.
-const SMALLEST_STEP: f64 = 1e-5;
+/// Steps that [`Method::Adaptive`] tries from one sample to the next before it gives up, so that every simulation
+/// ends.
+pub const MOST_TRIALS: usize = 10_000;
+
+/// Error of a step that leaves the numbers.
+const UNDEFINED: f64 = 1e10;
+
+/// Beyond this h|λ| a step of Dormand and Prince's method is at the border of its stability.
+const STABLE: f64 = 3.25;
 
 /// Simulates samples `range` of `env` from state `x0` at the first of them.
 ///
@@ -323,6 +346,8 @@ struct Core<'a> {
     lost: bool,
     zero_hold: bool,
     events_here: usize,
+    /// Steps tried since the last sample, with error control.
+    trials_here: usize,
     rhs_history: Vec<History>,
     out_regs: Vec<f64>,
     out_modes: Vec<i8>,
@@ -464,6 +489,7 @@ impl<'a> Core<'a> {
             lost: false,
             zero_hold: env.inputs.iter().any(|u| u.hold() == Hold::Zero),
             events_here: 0,
+            trials_here: 0,
             rhs_history: vec![History::default(); tape.delays.len()],
             out_regs,
             out_modes,
@@ -556,6 +582,7 @@ impl<'a> Core<'a> {
         let s0 = k as f64 * self.env.dt;
         let s1 = (k + 1) as f64 * self.env.dt;
         self.events_here = 0;
+        self.trials_here = 0;
         if self.zero_hold {
             self.fresh = false;
         }
@@ -657,10 +684,17 @@ impl<'a> Core<'a> {
             if let Some((rtol, atol)) = self.tolerance {
                 let error = self.error(h, rtol, atol);
                 let grow = (0.9 * error.max(1e-10).powf(-0.2)).clamp(0.2, 5.0);
-                if error > 1.0 && h > SMALLEST_STEP * self.env.dt {
+                self.trials_here += 1;
+                if self.trials_here > MOST_TRIALS {
+                    self.result.exhausted = Some(usize::MAX);
+                    self.result.diverged = Some(usize::MAX);
+                    continue;
+                }
+                if error > 1.0 && h > tiny {
                     self.h_next = h * grow.min(0.9);
                     continue;
                 }
+                self.watch_stiffness(h);
                 if h >= 0.99 * self.h_next.min(remaining) || grow < 1.0 {
                     self.h_next = h * grow;
                 }
@@ -696,6 +730,10 @@ impl<'a> Core<'a> {
                 None => h * noise,
             };
             let e = dot(self.tableau.e, &self.rates.f[r * self.rates.stages..]) * h;
+            // (The larger of zero and no number would be zero.)
+            if !(e.is_finite() && noise.is_finite()) {
+                return UNDEFINED;
+            }
             let e = (e.abs() - noise).max(0.0);
             let size = self.x[r].abs().max(self.x1[r].abs());
             let floor = self.reach[r].max(size).max(f64::MIN_POSITIVE);
@@ -703,7 +741,29 @@ impl<'a> Core<'a> {
             sum += e * e;
         }
         let error = (sum / nx as f64).sqrt();
-        if error.is_finite() { error } else { 1e10 }
+        if error.is_finite() { error } else { UNDEFINED }
+    }
+
+    /// Whether stability bounds the trial step: its last two stages are both at its end, and the difference of their
+    /// rates over that of their states is the largest |λ|.
+    fn watch_stiffness(&mut self, h: f64) {
+        let end = self.tableau.b.len();
+        let last = &self.stages[end - 1].regs[System::STATES..][..self.system.nx];
+        let (mut rates, mut states, mut size) = (0.0, 0.0, 0.0);
+        for (r, (x1, x)) in self.x1.iter().zip(last).enumerate() {
+            rates += (self.rates.at(end, r) - self.rates.at(end - 1, r)).powi(2);
+            states += (x1 - x).powi(2);
+            size += x1 * x1;
+        }
+        // Stages that differ by rounding alone tell nothing.
+        if states <= 1e-24 * size {
+            return;
+        }
+        let rate = (rates / states).sqrt();
+        if rate.is_finite() {
+            self.result.stiff_steps += usize::from(h * rate > STABLE);
+            self.result.fastest = self.result.fastest.max(rate);
+        }
     }
 
     /// Takes the trial step over: sensitivities, state, time, history.

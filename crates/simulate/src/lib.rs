@@ -6,7 +6,7 @@ mod signal;
 pub mod small;
 
 pub use integrate::{
-    Carry, Environment, Force, Method, Seeds, SignalLanes, Simulation, Trajectory, delayed_states,
-    has_history, integrate,
+    Carry, Environment, Force, MOST_TRIALS, Method, Seeds, SignalLanes, Simulation, Trajectory,
+    delayed_states, has_history, integrate,
 };
 pub use signal::{FINE, Signal};

@@ -305,3 +305,21 @@ fn a_system_that_blows_up_is_frozen_and_said() {
         assert!(t.y.iter().all(|v| v.is_finite()));
     }
 }
+
+/// A fast decay towards a slow motion, x' = −a (x − z), z'' = −z.
+#[test]
+fn a_mode_far_faster_than_the_samples_ends_the_simulation() {
+    let run = |a: f64| {
+        let m = model(&[], &[("x", 1), ("z", 2)], &[("a", a)], &["x' = a*(z - x)", "z'' = -z"], &["x"]);
+        run(&m, &free(50, 0.1), &[1.0, 1.0, 0.0], Method::Adaptive { rtol: 1e-6, atol: 1e-8 })
+    };
+    let slow = run(1.0);
+    assert!(!slow.is_stiff() && slow.exhausted.is_none());
+    let stiff = run(1e4);
+    assert!(stiff.is_stiff() && stiff.exhausted.is_none() && stiff.diverged.is_none());
+    assert!((stiff.fastest / 1e4 - 1.0).abs() < 0.01, "{}", stiff.fastest);
+    assert!((stiff.y[49] - 4.9f64.cos()).abs() < 3e-4, "{}", stiff.y[49]);
+    let refused = run(1e9);
+    assert_eq!(refused.exhausted, Some(1));
+    assert!((refused.fastest / 1e9 - 1.0).abs() < 0.01, "{}", refused.fastest);
+}

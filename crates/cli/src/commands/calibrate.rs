@@ -28,7 +28,8 @@ pub(crate) fn run(arguments: &Arguments) -> Result<Answer, Failure> {
 
     let progress = Progress::open();
     let Recordings { train, holdout } = &recordings;
-    let calibration = greybox_diagnose::calibrate(&loaded.model, train, holdout, &progress)?;
+    let calibration = greybox_diagnose::calibrate(&loaded.model, train, holdout, &progress)
+        .map_err(|e| Failure::diagnosis(&loaded.path, e))?;
     drop(progress);
     let results = Results::of(&calibration, &loaded, train, holdout)?;
     out.write(&results.files())?;

@@ -113,7 +113,8 @@ pub(crate) fn diagnose(
     options: &Options,
 ) -> Result<Results, Failure> {
     let progress = Progress::open();
-    let diagnosis = greybox_diagnose::diagnose(&loaded.model, train, holdout, options, &progress)?;
+    let diagnosis = greybox_diagnose::diagnose(&loaded.model, train, holdout, options, &progress)
+        .map_err(|e| Failure::diagnosis(&loaded.path, e))?;
     progress.stage("writing the report");
     Results::of(&diagnosis, loaded, train, holdout)
 }

@@ -11,6 +11,7 @@ impl Core<'_> {
         let (nx, ny, lanes, n) = (system.nx, system.ny, self.lanes, self.result.n);
         if self.result.diverged.is_some() {
             self.result.diverged = Some(row);
+            self.result.exhausted = self.result.exhausted.map(|_| row);
             return;
         }
         for i in 0..nx {

@@ -208,7 +208,8 @@ impl Batch<'_> {
         let (train, holdout) =
             loading::train_and_holdout(std::slice::from_ref(&task.recording), self.holdout, self.map)?;
         let diagnosis =
-            greybox_diagnose::diagnose(&self.loaded.model, &train, &holdout, &self.options, &Quiet)?;
+            greybox_diagnose::diagnose(&self.loaded.model, &train, &holdout, &self.options, &Quiet)
+                .map_err(|e| Failure::diagnosis(&self.loaded.path, e))?;
         let results = Results::of(&diagnosis, &self.loaded, &train, &holdout)?;
         let done = serde_json::to_string_pretty(&Done::new(inputs, &results.files()))
             .map_err(|e| unwritten(e.into()))?;
