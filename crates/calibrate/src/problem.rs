@@ -400,7 +400,8 @@ impl Problem<'_> {
                     let y = &measured[c][segment.range.clone()];
                     for k in 0..n {
                         let v = d[c * n + k] * inverse;
-                        column[c * n + k] = if y[k].is_nan() || !v.is_finite() { 0.0 } else { v };
+                        let defined = !y[k].is_nan() && trajectory.y[c * n + k].is_finite() && v.is_finite();
+                        column[c * n + k] = if defined { v } else { 0.0 };
                     }
                 }
                 whiten(column);
