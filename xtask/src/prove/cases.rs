@@ -138,6 +138,7 @@ fn emps_velocity(report: &Report) -> Vec<Figure> {
             (calibrated - 0.183).abs() <= 0.01,
         ),
         Figure::judged("held-out nrmse of qd, improved", figure(improved), "≤ 0.07", improved <= 0.07),
+        determined(report, "friction"),
     ]
 }
 
@@ -156,8 +157,22 @@ fn emps_position(report: &Report) -> Vec<Figure> {
             millimetres <= 2.3,
         ),
     ];
+    figures.push(determined(report, "friction"));
     figures.extend(no_worse(&report.fit.holdout, "q"));
     figures
+}
+
+/// Whether the 95 % intervals of a family's laws are narrower than their values: a law whose parts the recordings do
+/// not show is none that was found.
+fn determined(report: &Report, family: &str) -> Figure {
+    let parameters =
+        report.mechanisms.iter().filter(|m| m.family == family).flat_map(|m| m.parameters.iter());
+    let widths = parameters.map(|(_, p)| {
+        p.ci95.map_or(f64::INFINITY, |c| 0.5 * (c.high - c.low) / p.value.abs().max(f64::MIN_POSITIVE))
+    });
+    let widest = widths.fold(0.0, f64::max);
+    let name = format!("widest interval of its {family}");
+    Figure::judged(name, format!("{:.0} %", 100.0 * widest), "≤ 100 %", widest <= 1.0)
 }
 
 /// The Silverbox. The cubic and a quadratic spring by hand reach 0.314 and 0.388 mV; the best published
@@ -397,6 +412,18 @@ pub(crate) mod tests {
             missed(&emps_position(&bad)),
             ["window", "held-out windowed rms of q", "held-out nrmse_windowed of q, improved"]
         );
+    }
+
+    #[test]
+    fn a_law_whose_parts_are_not_determined_meets_no_goal() {
+        let mut r = report("missing_physics", &["stribeck_friction"], "q");
+        r.mechanisms[0].family = "friction".into();
+        for (name, half) in [("fs", 0.5), ("fc", 1.5)] {
+            let estimate = json!({"value": -1.0, "ci95": [-1.0 - half, -1.0 + half], "unit": "N"});
+            r.mechanisms[0].parameters.insert(name.into(), serde_json::from_value(estimate).unwrap());
+            let found = missed(&emps_position(&r)).contains(&"widest interval of its friction");
+            assert_eq!(found, half > 1.0);
+        }
     }
 
     #[test]
