@@ -6,6 +6,7 @@
 mod cases;
 mod concealed;
 mod identify;
+mod statistics;
 mod table;
 
 use std::path::{Path, PathBuf};
@@ -28,10 +29,13 @@ pub(crate) struct Arguments {
     /// Measure identification over seeds on virtual rigs instead
     #[arg(long)]
     identify: bool,
-    /// Seed of the concealed suite; first seed of --identify
+    /// Measure coverage, false alarms and the reliability of confidence over seeds instead
+    #[arg(long, conflicts_with_all = ["recordings", "identify", "floors"])]
+    statistics: bool,
+    /// Seed of the concealed suite; first seed of --identify and --statistics
     #[arg(long, value_name = "N", default_value_t = 1)]
     seed: u64,
-    /// Cases of the concealed suite (three rounds of 42 otherwise); seeds per case of --identify, at most
+    /// Cases of the concealed suite (three rounds of 42 otherwise); seeds per case of --identify and --statistics
     #[arg(long, value_name = "N")]
     count: Option<usize>,
     /// Keep the concealed suite's cases, truths and results here (target/prove/concealed otherwise)
@@ -108,6 +112,10 @@ pub(crate) fn run(root: &Path, arguments: &Arguments) -> Result<Ending> {
     if arguments.identify {
         let outcomes = identify::run(arguments.seed, arguments.count, arguments.only.as_deref())?;
         return conclude(&outcomes, arguments.json.as_deref());
+    }
+    if arguments.statistics {
+        let found = statistics::run(arguments.seed, arguments.count, arguments.only.as_deref())?;
+        return conclude(&found.outcomes, arguments.json.as_deref());
     }
     let folder = match &arguments.recordings {
         Some(given) if given.is_dir() => given.clone(),

@@ -371,7 +371,7 @@ fn peers_case(seeds: &[u64], dt: f64, sigma: f64, goal: usize) -> Result<Vec<Fig
     Ok(figures)
 }
 
-fn coverage(name: &str, covered: (usize, usize)) -> Figure {
+pub(super) fn coverage(name: &str, covered: (usize, usize)) -> Figure {
     let rate = 100.0 * covered.0 as f64 / covered.1.max(1) as f64;
     // The intervals of one seed are correlated; a quarter of them counts as independent. Two standard deviations
     // of a small count are allowed beyond the goal.
@@ -385,15 +385,27 @@ fn interval_case(seeds: &[u64]) -> Result<Vec<Figure>> {
     let options = Options { replicates: 0, ..peers_options() };
     let make = |seed| Ok(vec![duffing_recording(seed, 0.01, 40.0, 0.01, [0.0, 0.0])?]);
     let trials = run_seeds(seeds, make, &options, &[DUFFING], None)?;
-    let covered = trials.iter().fold((0, 0), |s, t| (s.0 + t.covered.0, s.1 + t.covered.1));
     let by_rows: Vec<(usize, usize)> = seeds.par_iter().map(|s| row_bootstrap(*s)).collect::<Result<_>>()?;
     let (held, all) = by_rows.iter().fold((0, 0), |s, c| (s.0 + c.0, s.1 + c.1));
     let rate = format!("{:.1} % of {all}", 100.0 * held as f64 / all.max(1) as f64);
     Ok(vec![
-        coverage("95 % intervals that hold the truth", covered),
+        interval_figure(&trials),
         Figure::plain("the same by the thesis's bootstrap of single rows", rate),
         efficiency_figure(&trials),
     ])
+}
+
+/// The same of the oscillator alone.
+pub(super) fn intervals(seeds: &[u64]) -> Result<Figure> {
+    let options = Options { replicates: 0, ..peers_options() };
+    let make = |seed| Ok(vec![duffing_recording(seed, 0.01, 40.0, 0.01, [0.0, 0.0])?]);
+    let trials = run_seeds(seeds, make, &options, &[DUFFING], None)?;
+    Ok(interval_figure(&trials))
+}
+
+fn interval_figure(trials: &[Trial]) -> Figure {
+    let covered = trials.iter().fold((0, 0), |s, t| (s.0 + t.covered.0, s.1 + t.covered.1));
+    coverage("95 % intervals that hold the truth", covered)
 }
 
 /// Thesis Algorithm 2's intervals: mean ± 1.96 standard deviations over 30 draws of half of the rows, on the windowed

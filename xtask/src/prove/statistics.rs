@@ -1,0 +1,375 @@
+//! `cargo xtask prove --statistics`: whether what greybox says of its own certainty is so, over seeds.
+//!
+//! *Coverage*: how many of the 95 % intervals hold the truth. *False alarms*: how often physics is missing where none
+//! is. *Reliability*: of the mechanisms that are named with a confidence, how many are right. The recordings come from
+//! an oscillator of this file's own, whose parameters, force and noise are drawn anew for each seed.
+
+use anyhow::{Context, Result};
+use greybox_diagnose::{Diagnosis, Options, Quiet, Verdict, calibrate, diagnose};
+use greybox_model::Model;
+use greybox_recording::{Channel, Recording};
+use rand::{RngExt, SeedableRng};
+use rand_distr::{Distribution, StandardNormal};
+use rand_pcg::Pcg64Mcg;
+use rayon::prelude::*;
+
+use super::{Figure, Outcome, identify};
+
+/// Seeds of every figure.
+const SEEDS: usize = 400;
+/// Bounds of the bins of confidence.
+const BINS: [f64; 6] = [0.0, 0.5, 0.7, 0.9, 0.97, 1.0];
+
+const MODEL: &str = r#"
+name = "oscillator"
+[inputs]
+f = { unit = "N" }
+[states]
+x = { unit = "m" }
+[parameters]
+m = { value = 1.0, unit = "kg" }
+c = { value = 0.6, unit = "N s/m" }
+k = { value = 40.0, unit = "N/m" }
+[equations]
+mass = "m*x'' + c*x' + k*x = f"
+"#;
+
+/// What a case leaves out of the model: kind, parameter, and the range of its strength.
+#[derive(Debug, Clone, Copy)]
+struct Effect {
+    kind: &'static str,
+    parameter: &'static str,
+    strength: (f64, f64),
+    /// Force that it takes away, at position, velocity and strength; dry friction is no function of them.
+    force: fn(f64, f64, f64) -> f64,
+    dry: bool,
+}
+
+const EFFECTS: [Effect; 4] = [
+    Effect {
+        kind: "coulomb_friction",
+        parameter: "fc",
+        strength: (0.2, 0.8),
+        force: |_, _, _| 0.0,
+        dry: true,
+    },
+    Effect {
+        kind: "cubic_stiffness",
+        parameter: "k3",
+        strength: (100.0, 400.0),
+        force: |x, _, s| s * x * x * x,
+        dry: false,
+    },
+    Effect {
+        kind: "quadratic_drag",
+        parameter: "cd",
+        strength: (0.3, 1.5),
+        force: |_, v, s| s * v * v.abs(),
+        dry: false,
+    },
+    Effect { kind: "constant_offset", parameter: "f0", strength: (0.3, 1.5), force: |_, _, s| s, dry: false },
+];
+
+/// Noise of a sensor.
+#[derive(Debug, Clone, Copy, PartialEq)]
+enum Noise {
+    White,
+    /// First-order autoregression with this coefficient.
+    Coloured(f64),
+}
+
+/// A machine and how it was recorded.
+#[derive(Debug, Clone)]
+struct Drawn {
+    /// m, c and k.
+    truth: [f64; 3],
+    effect: Option<(Effect, f64)>,
+    train: Recording,
+    holdout: Recording,
+}
+
+/// Draws a machine of a case: `level` bounds the noise over the motion.
+fn draw(seed: u64, effect: Option<Effect>, noise: Noise, level: (f64, f64)) -> Result<Drawn> {
+    let mut random = Pcg64Mcg::seed_from_u64(seed);
+    let mut around = |value: f64| value * random.random_range(0.85..1.15);
+    let truth = [around(1.0), around(0.6), around(40.0)];
+    let effect = effect.map(|e| (e, random.random_range(e.strength.0..e.strength.1)));
+    let level = (random.random_range(level.0.ln()..=level.1.ln())).exp();
+    let train = record(&mut random, &truth, effect, noise, level, 2000)?;
+    let holdout = record(&mut random, &truth, effect, noise, level, 1000)?;
+    Ok(Drawn { truth, effect, train, holdout })
+}
+
+/// x'' = (f − c x' − k x − effect)/m, 200 small steps a sample, semi-implicit, so that dry friction sticks exactly.
+fn record(
+    random: &mut Pcg64Mcg,
+    truth: &[f64; 3],
+    effect: Option<(Effect, f64)>,
+    noise: Noise,
+    level: f64,
+    n: usize,
+) -> Result<Recording> {
+    let [m, c, k] = *truth;
+    let (dt, fine) = (0.01, 200);
+    let sines: Vec<[f64; 2]> = (0..8)
+        .map(|_| [random.random_range(1.0_f64..14.0), random.random_range(0.0..std::f64::consts::TAU)])
+        .collect();
+    let time: Vec<f64> = (0..n).map(|i| i as f64 * dt).collect();
+    let force: Vec<f64> =
+        time.iter().map(|t| sines.iter().map(|[w, p]| 2.0 * (w * t + p).sin()).sum()).collect();
+    let (mut x, mut v) = (0.02, 0.0);
+    let h = dt / fine as f64;
+    let dry = effect.filter(|(e, _)| e.dry).map_or(0.0, |(_, s)| h * s / m);
+    let mut motion = Vec::with_capacity(n);
+    for i in 0..n {
+        motion.push(x);
+        for j in 0..fine {
+            let w = j as f64 / fine as f64;
+            let f = force[i] + w * (force[(i + 1).min(n - 1)] - force[i]);
+            let missing = effect.map_or(0.0, |(e, s)| (e.force)(x, v, s));
+            let free = v + h * (f - c * v - k * x - missing) / m;
+            let next = if free.abs() <= dry { 0.0 } else { free - dry * free.signum() };
+            // The trapezoid's position: an error of second order in the step.
+            x += 0.5 * h * (v + next);
+            v = next;
+        }
+    }
+    let rms = (motion.iter().map(|x| x * x).sum::<f64>() / n as f64).sqrt();
+    let mut coloured = 0.0;
+    let measured = motion.iter().map(|x| {
+        let white: f64 = StandardNormal.sample(random);
+        let noise = match noise {
+            Noise::White => white,
+            Noise::Coloured(a) => {
+                coloured = a * coloured + (1.0 - a * a).sqrt() * white;
+                coloured
+            }
+        };
+        x + level * rms * noise
+    });
+    let measured = measured.collect();
+    let channel = |name: &str, values| Channel { name: name.to_owned(), unit: None, values };
+    Ok(Recording::from_columns("simulated", time, vec![channel("f", force), channel("x", measured)])?)
+}
+
+/// Intervals that hold the truth, and all.
+#[derive(Debug, Clone, Copy, Default)]
+struct Covered {
+    held: usize,
+    all: usize,
+}
+
+impl Covered {
+    fn count(&mut self, truth: f64, interval: Option<(f64, f64)>) {
+        if let Some((low, high)) = interval {
+            self.all += 1;
+            self.held += usize::from(low <= truth && truth <= high);
+        }
+    }
+
+    fn and(self, other: Covered) -> Covered {
+        Covered { held: self.held + other.held, all: self.all + other.all }
+    }
+}
+
+/// What one diagnosis of a machine with something left out says.
+#[derive(Debug, Clone, Copy)]
+struct Named {
+    /// Confidence of the first mechanism and whether it is the right one; `None` where none is named.
+    first: Option<(f64, bool)>,
+    /// The intervals, where just the right one is named.
+    covered: Covered,
+}
+
+fn named(drawn: &Drawn, (effect, strength): (Effect, f64), diagnosis: &Diagnosis) -> Named {
+    let mut covered = Covered::default();
+    if let [only] = diagnosis.mechanisms.as_slice()
+        && only.kind == effect.kind
+    {
+        for (p, truth) in diagnosis.parameters.iter().zip(drawn.truth) {
+            covered.count(truth, p.improved.ci95);
+        }
+        for (_, _, e) in only.parameters.iter().filter(|(n, ..)| n.starts_with(effect.parameter)) {
+            covered.count(strength, e.ci95);
+        }
+    }
+    let first = diagnosis.mechanisms.first().map(|f| (f.confidence, f.kind == effect.kind));
+    Named { first, covered }
+}
+
+/// All that is measured.
+pub(crate) struct Statistics {
+    seeds: usize,
+    pub(crate) outcomes: Vec<Outcome>,
+    bins: Vec<Bin>,
+}
+
+/// Answers whose confidence lies in one bin.
+#[derive(Debug, Clone, Copy)]
+struct Bin {
+    low: f64,
+    high: f64,
+    answers: usize,
+    right: usize,
+    /// Mean confidence.
+    told: f64,
+}
+
+impl Bin {
+    fn rate(&self) -> f64 {
+        self.right as f64 / self.answers.max(1) as f64
+    }
+
+    /// 95 % interval of the rate (Wilson, J. Am. Stat. Assoc. 22, 1927).
+    fn interval(&self) -> (f64, f64) {
+        let (n, p, z) = (self.answers as f64, self.rate(), 1.96_f64);
+        let centre = (p + z * z / (2.0 * n)) / (1.0 + z * z / n);
+        let half = z / (1.0 + z * z / n) * (p * (1.0 - p) / n + z * z / (4.0 * n * n)).sqrt();
+        (centre - half, centre + half)
+    }
+
+    /// Whether the confidence is no higher than the answers deserve.
+    fn is_honest(&self) -> bool {
+        self.told <= self.interval().1
+    }
+}
+
+fn bins(answers: &[(f64, bool)]) -> Vec<Bin> {
+    let bin = |bounds: &[f64]| {
+        let last = bounds[1] >= 1.0;
+        let inside: Vec<&(f64, bool)> =
+            answers.iter().filter(|(c, _)| *c >= bounds[0] && (*c < bounds[1] || last)).collect();
+        Bin {
+            low: bounds[0],
+            high: bounds[1],
+            answers: inside.len(),
+            right: inside.iter().filter(|a| a.1).count(),
+            told: inside.iter().map(|a| a.0).sum::<f64>() / inside.len().max(1) as f64,
+        }
+    };
+    BINS.windows(2).map(bin).collect()
+}
+
+fn over<T: Send>(seeds: &[u64], work: impl Fn(u64) -> Result<T> + Sync) -> Result<Vec<T>> {
+    seeds.par_iter().map(|seed| work(*seed)).collect()
+}
+
+/// Intervals of `calibrate` where the model is right.
+fn calibrated(seeds: &[u64], noise: Noise) -> Result<Figure> {
+    let model = Model::from_toml(MODEL, "model.toml")?;
+    let counts = over(seeds, |seed| {
+        let drawn = draw(seed, None, noise, (0.01, 0.05))?;
+        let found = calibrate(&model, &[drawn.train], &[drawn.holdout], &Quiet)?;
+        let mut covered = Covered::default();
+        for (p, truth) in found.parameters.iter().zip(drawn.truth) {
+            covered.count(truth, p.calibrated.ci95);
+        }
+        Ok(covered)
+    })?;
+    let all = counts.into_iter().fold(Covered::default(), Covered::and);
+    Ok(identify::coverage("95 % intervals that hold the truth", (all.held, all.all)))
+}
+
+/// How often `diagnose` says that nothing is missing where nothing is.
+fn nulls(seeds: &[u64], noise: Noise) -> Result<Vec<Figure>> {
+    let model = Model::from_toml(MODEL, "model.toml")?;
+    let verdicts = over(seeds, |seed| {
+        let drawn = draw(seed, None, noise, (0.003, 0.1))?;
+        Ok(diagnose(&model, &[drawn.train], &[drawn.holdout], &Options::default(), &Quiet)?.verdict)
+    })?;
+    let of = |verdict| verdicts.iter().filter(|v| **v == verdict).count();
+    let (n, alarms) = (seeds.len(), of(Verdict::MissingPhysics));
+    Ok(vec![
+        Figure::judged(
+            "false alarms",
+            format!("{alarms} of {n}"),
+            "<= 2 %",
+            // (One of a handful proves nothing.)
+            alarms as f64 <= (0.02 * n as f64).max(1.0),
+        ),
+        Figure::plain("unexplained", format!("{} of {n}", of(Verdict::Unexplained))),
+    ])
+}
+
+/// Diagnoses of machines with one thing left out, by the noise over their motion.
+fn effects(seeds: &[u64], level: (f64, f64)) -> Result<Vec<(Effect, Named)>> {
+    let model = Model::from_toml(MODEL, "model.toml")?;
+    let all: Vec<(usize, u64)> = seeds.iter().enumerate().map(|(i, s)| (i % EFFECTS.len(), *s)).collect();
+    all.par_iter()
+        .map(|(kind, seed)| {
+            let drawn = draw(*seed, Some(EFFECTS[*kind]), Noise::White, level)?;
+            let (train, holdout) = ([drawn.train.clone()], [drawn.holdout.clone()]);
+            let found = diagnose(&model, &train, &holdout, &Options::default(), &Quiet)?;
+            let effect = drawn.effect.context("nothing was left out")?;
+            Ok((effect.0, named(&drawn, effect, &found)))
+        })
+        .collect()
+}
+
+fn effect_figures(found: &[(Effect, Named)]) -> Vec<Figure> {
+    let all = found.iter().fold(Covered::default(), |sum, (_, n)| sum.and(n.covered));
+    let mut figures = vec![identify::coverage("95 % intervals that hold the truth", (all.held, all.all))];
+    for effect in EFFECTS {
+        let of: Vec<&Named> = found.iter().filter(|(e, _)| e.kind == effect.kind).map(|(_, n)| n).collect();
+        let right = of.iter().filter(|n| n.first.is_some_and(|f| f.1)).count();
+        let covered = of.iter().fold(Covered::default(), |sum, n| sum.and(n.covered));
+        let rate = 100.0 * covered.held as f64 / covered.all.max(1) as f64;
+        let told = format!("{right} of {} named, {rate:.1} % of {} intervals", of.len(), covered.all);
+        figures.push(Figure::plain(effect.kind, told));
+    }
+    figures
+}
+
+fn bin_figures(bins: &[Bin]) -> Vec<Figure> {
+    let told = |b: &Bin| {
+        let (low, high) = b.interval();
+        let name = format!("confidence {:.2} to {:.2}", b.low, b.high);
+        let measured = format!(
+            "{:.1} % of {} right ({:.0} to {:.0} %), told {:.1} %",
+            100.0 * b.rate(),
+            b.answers,
+            100.0 * low,
+            100.0 * high,
+            100.0 * b.told
+        );
+        Figure::judged(name, measured, "no less than told", b.is_honest())
+    };
+    bins.iter().filter(|b| b.answers > 0).map(told).collect()
+}
+
+/// Runs everything on `count` seeds (400 otherwise).
+pub(crate) fn run(first: u64, count: Option<usize>, only: Option<&str>) -> Result<Statistics> {
+    let n = count.unwrap_or(SEEDS);
+    let seeds: Vec<u64> = (0..n as u64).map(|i| first.wrapping_mul(7_368_787).wrapping_add(i)).collect();
+    let mut statistics = Statistics { seeds: n, outcomes: Vec::new(), bins: Vec::new() };
+    let mut case = |name: &str, work: &mut dyn FnMut() -> Result<Vec<Figure>>| -> Result<()> {
+        if only.is_none_or(|o| name.contains(o)) {
+            eprintln!("{name} ({n} seeds) …");
+            statistics.outcomes.push(Outcome { case: name.to_owned(), figures: work()? });
+        }
+        Ok(())
+    };
+    case("identify, white noise", &mut || Ok(vec![identify::intervals(&seeds)?]))?;
+    case("calibrate, white noise", &mut || Ok(vec![calibrated(&seeds, Noise::White)?]))?;
+    case("calibrate, coloured noise", &mut || Ok(vec![calibrated(&seeds, Noise::Coloured(0.8))?]))?;
+    case("nothing missing, white noise", &mut || nulls(&seeds, Noise::White))?;
+    case("nothing missing, coloured noise", &mut || nulls(&seeds, Noise::Coloured(0.8)))?;
+    let mut answers = Vec::new();
+    let mut note = |found: &[(Effect, Named)]| answers.extend(found.iter().filter_map(|(_, n)| n.first));
+    case("one effect missing, noise of 0.3 to 5 %", &mut || {
+        let found = effects(&seeds, (0.003, 0.05))?;
+        note(&found);
+        Ok(effect_figures(&found))
+    })?;
+    case("one effect missing, noise of 10 to 60 %", &mut || {
+        let found = effects(&seeds, (0.1, 0.6))?;
+        note(&found);
+        Ok(effect_figures(&found))
+    })?;
+    let bins = bins(&answers);
+    if !answers.is_empty() {
+        statistics.outcomes.push(Outcome { case: "confidence".into(), figures: bin_figures(&bins) });
+    }
+    statistics.bins = bins;
+    Ok(statistics)
+}
