@@ -297,7 +297,7 @@ fn find_channel(
             channel: channel.to_string(),
             role,
             name: name.to_string(),
-            available: available.join(", "),
+            available: greybox_recording::told(available),
         });
     };
     let found = &recording.channels[index];
