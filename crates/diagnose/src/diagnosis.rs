@@ -70,9 +70,19 @@ pub enum DiagnoseError {
         /// Samples needed.
         needed: usize,
     },
-    /// The simulation leaves every bound with the nominal parameters and cannot be calibrated.
+    /// No measured channel moves.
     #[error(
-        "the simulation of the nominal model diverges within the first samples of `{file}`, whatever its parameters: check signs and units of the model's equations"
+        "{file}: no measured channel ever moves ({channels}): there is nothing to learn from. Excite the machine, and check that the sensors were connected"
+    )]
+    Still {
+        /// File.
+        file: String,
+        /// The channels.
+        channels: String,
+    },
+    /// The simulation leaves every bound at once and cannot be calibrated.
+    #[error(
+        "{file}: the simulation of the model diverges within the first samples, whatever its parameters. Check that no inertia is zero and nothing is divided by zero, and the signs and units of the equations"
     )]
     Diverges {
         /// File.
@@ -302,6 +312,13 @@ pub fn layout(model: &Model, train: &[Recording], holdout: &[Recording]) -> Resu
     if found < needed {
         return Err(DiagnoseError::TooShort { file: whole.recordings.join(", "), found, needed });
     }
+    if whole.spread.iter().all(|s| s.is_nan() || *s <= 0.0) {
+        let channels: Vec<String> = whole.channels.iter().map(|c| format!("`{}`", c.name)).collect();
+        return Err(DiagnoseError::Still {
+            file: whole.recordings.join(", "),
+            channels: channels.join(", "),
+        });
+    }
     if holdout.is_empty() {
         let (head, tail) = Data::split_tail(train, HELD_OUT_SHARE);
         if !head.is_empty() {
@@ -319,6 +336,14 @@ pub fn layout(model: &Model, train: &[Recording], holdout: &[Recording]) -> Resu
         format!("recordings held out: {}", held.recordings.join(", "))
     };
     Ok(Layout { train: Arc::new(whole), holdout: Arc::new(held), source })
+}
+
+/// Sees that one of the runs goes beyond the first samples.
+fn follows<const N: usize>(runs: [&FreeRun; N], data: &Data) -> Result<(), DiagnoseError> {
+    match runs.iter().all(|run| run.is_lost()) {
+        true => Err(DiagnoseError::Diverges { file: data.recordings.join(", ") }),
+        false => Ok(()),
+    }
 }
 
 fn conclude(
@@ -402,6 +427,7 @@ fn conclude(
         })
     };
     let mut train_role = role(&train, false)?;
+    follows([&train_role.calibrated.run, &train_role.improved.run], &train)?;
     let mut holdout_role = role(&holdout, true)?;
 
     // Mechanisms, remainder, verdict.
@@ -1311,6 +1337,7 @@ pub fn calibrate(
         Ok((scores, (before, after)))
     };
     let (train_scores, train_runs) = runs(&train)?;
+    follows([&train_runs.1], &train)?;
     let (holdout_scores, holdout_runs) = runs(&holdout)?;
     Ok(Calibration {
         model: calibrated,
