@@ -50,6 +50,9 @@ pub(crate) struct Cli {
     pub(crate) log: bool,
 }
 
+/// The unit of `--work`, in operations.
+pub(crate) const BILLION: u64 = 1_000_000_000;
+
 /// What the model calls the channels of the recordings.
 #[derive(Debug, Args)]
 pub(crate) struct Channels {

@@ -2,11 +2,12 @@
 
 use clap::{Args, ValueEnum};
 use greybox_commands::identify::{FILES, Results};
-use greybox_identify::{DelayedState, Library, Monomials, Options, Streamed};
+use greybox_identify::{DelayedState, Library, MOST_WORK, Monomials, Options, Streamed};
 use greybox_model::Hold;
 use greybox_report::convert::identification::{MODEL_FILE, Sources};
 
 use crate::answer::Answer;
+use crate::arguments::BILLION;
 use crate::arguments::{Recordings, Study};
 use crate::failure::Failure;
 use crate::loading;
@@ -85,8 +86,12 @@ pub(crate) struct Arguments {
     replicates: u16,
 
     /// Seed of every random choice
-    #[arg(long, value_name = "N", default_value_t = 0)]
+    #[arg(long, value_name = "N", default_value_t = 0, allow_negative_numbers = true)]
     seed: u64,
+
+    /// Most work of the fits, in billions of operations; the report says when it was not enough
+    #[arg(long, value_name = "N", default_value_t = MOST_WORK / BILLION, allow_negative_numbers = true)]
+    work: u64,
 }
 
 /// A part of the library.
@@ -194,6 +199,7 @@ fn options(arguments: &Arguments) -> Result<Options, Failure> {
         delay,
         replicates: usize::from(arguments.replicates),
         seed: arguments.seed,
+        work: arguments.work.saturating_mul(BILLION),
         ..usual
     })
 }
