@@ -30,6 +30,11 @@ impl Answer {
         Answer { text, json: None }
     }
 
+    /// Adds words, which JSON does not have.
+    pub(crate) fn add(&mut self, words: &str) {
+        self.text.push_str(words);
+    }
+
     /// Prints on standard output.
     ///
     /// # Errors

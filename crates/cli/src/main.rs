@@ -5,6 +5,7 @@
 
 mod answer;
 mod arguments;
+mod case;
 mod commands;
 mod done;
 mod failure;

@@ -363,12 +363,15 @@ fn conclude(
     let window = window_length(&durations, dt);
     observer.stage(Stage::Simulating);
     let mut baseline = Baseline::of(&found, &nominal.values());
+    let mut limited = found.limited;
     let improved = if found.improved.parts.is_empty() {
         baseline.fitted.clone()
     } else {
         // The search fits the baseline with a scale that its mechanisms made small, and only where it goes on with
         // it. What is compared with is the best that the equations can do alone.
-        let alone = Baseline::of(&alone(nominal, false, &Untold(observer)), &nominal.values());
+        let alone = alone(nominal, false, &Untold(observer));
+        limited |= alone.limited;
+        let alone = Baseline::of(&alone, &nominal.values());
         if alone.misfit.total_cmp(&baseline.misfit).is_lt() {
             baseline = alone;
         }
@@ -517,7 +520,7 @@ fn conclude(
         holds,
         better_holds: found.better_holds.iter().map(|b| b.0).collect(),
         seed: options.seed,
-        limited: found.limited,
+        limited,
     })
 }
 
@@ -1286,6 +1289,8 @@ pub struct Calibration {
     pub data: Arc<Data>,
     /// Held-out data.
     pub held: Arc<Data>,
+    /// The fits ended at their limit of work, not because nothing more was to be gained.
+    pub limited: bool,
     /// Free runs on the training recordings: nominal, calibrated.
     pub train_runs: (FreeRun, FreeRun),
     /// Free runs on the held-out recordings.
@@ -1348,6 +1353,7 @@ pub fn calibrate(
         window,
         data: train,
         held: holdout,
+        limited: found.limited,
         train_runs,
         holdout_runs,
     })

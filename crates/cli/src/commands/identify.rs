@@ -9,6 +9,7 @@ use greybox_report::convert::identification::{MODEL_FILE, Sources};
 use crate::answer::Answer;
 use crate::arguments::BILLION;
 use crate::arguments::{Recordings, Study};
+use crate::case::Subject;
 use crate::failure::Failure;
 use crate::loading;
 use crate::progress::Progress;
@@ -78,7 +79,7 @@ pub(crate) struct Arguments {
 
     /// Read the recordings in blocks of so many rows, in constant memory, whatever their length; without --holdout
     /// the last block is held out
-    #[arg(long, value_name = "ROWS", value_parser = clap::value_parser!(u32).range(1000..))]
+    #[arg(long, value_name = "ROWS", value_parser = clap::value_parser!(u32).range(1000..), conflicts_with = "save_case")]
     block: Option<u32>,
 
     /// Resampled data sets behind the inclusion probabilities
@@ -145,6 +146,12 @@ impl From<Between> for Hold {
 }
 
 pub(crate) fn run(arguments: &Arguments) -> Result<Answer, Failure> {
+    let study = &arguments.study;
+    let subject = Subject { channels: (&arguments.inputs, &arguments.states), ..study.subject(&FILES) };
+    study.case.around(&subject, || work(arguments))
+}
+
+fn work(arguments: &Arguments) -> Result<Answer, Failure> {
     let options = options(arguments)?;
     let (found, recordings, out, progress) = match arguments.block {
         None => {
