@@ -54,6 +54,11 @@ pub(crate) struct Cli {
 /// The unit of `--work`, in operations.
 pub(crate) const BILLION: u64 = 1_000_000_000;
 
+/// A seed, or an amount of work.
+pub(crate) fn whole(text: &str) -> Result<u64, String> {
+    text.parse().map_err(|_| format!("write a whole number from 0 to {}, such as 7", u64::MAX))
+}
+
 /// What the model calls the channels of the recordings.
 #[derive(Debug, Args)]
 pub(crate) struct Channels {

@@ -328,7 +328,7 @@ mod tests {
 
     fn renamed(arguments: &[&str]) -> Vec<String> {
         let inputs = Inputs {
-            model: Some(("/home/me/m.toml".into(), "model/m.toml".into())),
+            model: Some(("/elsewhere/me/m.toml".into(), "model/m.toml".into())),
             recordings: vec![
                 ("a/run.csv".into(), "recordings/1/run.csv".into()),
                 ("b/run.csv".into(), "recordings/2/run.csv".into()),
@@ -343,7 +343,7 @@ mod tests {
     fn a_case_names_no_place_of_its_maker() {
         let told = renamed(&[
             "diagnose",
-            "/home/me/m.toml",
+            "/elsewhere/me/m.toml",
             "a/run.csv",
             "--holdout=b/run.csv",
             "--mechanisms",
@@ -351,7 +351,7 @@ mod tests {
             "--seed",
             "3",
             "--out",
-            "/home/me/out",
+            "/elsewhere/me/out",
             "--save-case=c",
             "--with-data",
             "--json",

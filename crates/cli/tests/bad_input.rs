@@ -3,7 +3,8 @@
 //! The rows stand here; `UPDATE=1 cargo test -p greybox-cli --test bad_input` writes them, with what the command says now,
 //! into `docs/src/bad-input.md`. Without it the page and the command must agree to the byte.
 
-#![cfg(unix)]
+// The words of the operating system stand in the page.
+#![cfg(target_os = "linux")]
 // Helpers of a test file are tests too; the lint configuration knows only the annotated functions.
 #![allow(missing_docs, clippy::unwrap_used)]
 
@@ -19,7 +20,7 @@ use rows::{Row, rows};
 use serde_json::Value;
 use spring::{MODEL, recording};
 
-#[allow(dead_code, reason = "a row is run by a shell")]
+#[allow(dead_code, reason = "rows are run by a shell")]
 mod common;
 #[path = "bad_input/rows.rs"]
 mod rows;
@@ -229,4 +230,60 @@ fn every_row_of_the_table_says_what_the_page_says() {
         assert_eq!(now, then, "the page is stale, or the command has changed: run this test with UPDATE=1");
     }
     assert_eq!(text, body, "the page is stale: run this test with UPDATE=1");
+}
+
+/// Killed while it works: nothing is there, and the same command runs.
+#[test]
+fn a_run_that_is_killed_leaves_nothing_and_runs_again() {
+    let bench = bench();
+    bench.write("run.csv", &recording(4000, 0.0));
+    let before = tree(&bench.path(""));
+    let arguments = ["diagnose", "model.toml", "run.csv", "--out", "out"];
+    let mut child = Command::new(env!("CARGO_BIN_EXE_greybox"))
+        .current_dir(bench.path(""))
+        .args(arguments)
+        .stdout(Stdio::null())
+        .stderr(Stdio::null())
+        .spawn()
+        .unwrap();
+    thread::sleep(Duration::from_millis(300));
+    assert!(child.try_wait().unwrap().is_none(), "it ended before it could be killed");
+    child.kill().unwrap();
+    child.wait().unwrap();
+    assert_eq!(tree(&bench.path("")), before);
+    let again = bench.greybox(&[&arguments[..], &["--work", "1"]].concat());
+    assert_eq!(again.code, 0, "{}", again.stderr);
+    assert_eq!(common::names(&bench.path("out")), ["improved.toml", "report.html", "report.json"]);
+}
+
+/// Of two runs into one folder, the folder holds all that one of them wrote.
+#[test]
+fn two_runs_at_once_leave_the_results_of_one() {
+    let bench = bench();
+    let line = |seed: u8, out: &str| {
+        format!("greybox diagnose model.toml run.csv --work 1 --seed {seed} --out {out} > {seed}.txt")
+    };
+    let said = shell(&bench, &format!("{} & {} & wait", line(1, "out"), line(2, "out")));
+    assert_eq!(said, Said { code: 0, stdout: String::new(), stderr: String::new() });
+    let alone = [1, 2].map(|seed| {
+        let out = format!("alone{seed}");
+        assert_eq!(shell(&bench, &line(seed, &out)).code, 0);
+        tree(&bench.path(&out))
+    });
+    assert_ne!(alone[0], alone[1], "the seed is told");
+    let both = tree(&bench.path("out"));
+    assert!(alone.contains(&both), "a mixture: {:?}", both.iter().map(|(name, _)| name).collect::<Vec<_>>());
+}
+
+/// A byte order mark and line ends of other systems are no fault.
+#[test]
+fn a_mark_at_the_beginning_is_no_fault() {
+    let bench = bench();
+    let plain = shell(&bench, "greybox check run.csv");
+    assert_eq!(plain.code, 0, "{plain:?}");
+    let run = bench.read("run.csv");
+    for text in [format!("\u{feff}{run}"), run.replace('\n', "\r\n"), run.trim_end().to_owned()] {
+        bench.write("run.csv", &text);
+        assert_eq!(shell(&bench, "greybox check run.csv"), plain);
+    }
 }

@@ -83,7 +83,7 @@ pub enum DiagnoseError {
     },
     /// The simulation leaves every bound at once and cannot be calibrated.
     #[error(
-        "{file}: the simulation of the model diverges within the first samples, whatever its parameters. Check that no inertia is zero and nothing is divided by zero, and the signs and units of the equations"
+        "{file}: the simulation of the model diverges within the first samples, whatever its parameters. Check that no inertia is zero, nothing is divided by zero and no equation follows from the others, and the signs and units of the equations"
     )]
     Diverges {
         /// File.

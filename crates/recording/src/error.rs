@@ -35,7 +35,8 @@ impl fmt::Display for Place {
             write!(f, ":{line}")?;
         }
         if let Some((number, name)) = &self.column {
-            write!(f, ":{name} (column {number})")?;
+            let colon = if name.is_empty() { "" } else { ":" };
+            write!(f, "{colon}{name} (column {number})")?;
         }
         Ok(())
     }

@@ -61,6 +61,15 @@ fn read(path: &Path) -> Result<Report, Failure> {
     let file = if path.is_dir() { path.join("report.json") } else { path.to_owned() };
     let mend = "name a folder that `greybox diagnose` wrote, or its report.json";
     let text = loading::text(&file).map_err(|failure| failure.mend(mend))?;
-    Report::from_json(&text)
-        .map_err(|e| Failure::file(&file, format!("this is no report of a diagnosis: {e}")).mend(mend))
+    Report::from_json(&text).map_err(|e| {
+        Failure::file(&file, format!("this is no report of a diagnosis: {}", cause(&e))).mend(mend)
+    })
+}
+
+/// What the JSON lacks; the file has another name than the reader thinks.
+fn cause(error: &ReportError) -> String {
+    match error {
+        ReportError::Json(json) => json.to_string(),
+        other => other.to_string(),
+    }
 }

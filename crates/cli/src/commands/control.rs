@@ -6,6 +6,7 @@ use clap::{Args, ValueEnum};
 use greybox_commands::control::{self as commands, FILES, Request};
 
 use crate::answer::Answer;
+use crate::arguments::whole;
 use crate::failure::Failure;
 use crate::loading;
 use crate::output::OutputFolder;
@@ -95,7 +96,7 @@ pub(crate) struct Arguments {
     members: usize,
 
     /// Seed of the perturbed plants
-    #[arg(long, value_name = "N", default_value_t = 0, allow_negative_numbers = true)]
+    #[arg(long, value_name = "N", value_parser = whole, default_value_t = 0, allow_negative_numbers = true)]
     seed: u64,
 
     /// Folder for the results; made where it is missing

@@ -10,7 +10,7 @@ use greybox_diagnose::Options;
 use greybox_recording::Recording;
 
 use crate::answer::Answer;
-use crate::arguments::{BILLION, ModelStudy};
+use crate::arguments::{BILLION, ModelStudy, whole};
 use crate::case::Subject;
 use crate::failure::Failure;
 use crate::loading::{self, LoadedModel, Mechanisms};
@@ -39,7 +39,7 @@ pub(crate) struct Arguments {
     inputs: ModelStudy,
 
     /// Seed of every random choice
-    #[arg(long, value_name = "N", default_value_t = 0, allow_negative_numbers = true)]
+    #[arg(long, value_name = "N", value_parser = whole, default_value_t = 0, allow_negative_numbers = true)]
     seed: u64,
 
     /// Folder of mechanisms of your own (*.toml), tried beside the built-in ones
@@ -47,7 +47,7 @@ pub(crate) struct Arguments {
     mechanisms: Option<PathBuf>,
 
     /// Most work of the search, in billions of operations; the report says when it was not enough
-    #[arg(long, value_name = "N", default_value_t = Options::default().work / BILLION, allow_negative_numbers = true)]
+    #[arg(long, value_name = "N", value_parser = whole, default_value_t = Options::default().work / BILLION, allow_negative_numbers = true)]
     work: u64,
 }
 

@@ -7,8 +7,7 @@ use greybox_model::Hold;
 use greybox_report::convert::identification::{MODEL_FILE, Sources};
 
 use crate::answer::Answer;
-use crate::arguments::BILLION;
-use crate::arguments::{Recordings, Study};
+use crate::arguments::{BILLION, Recordings, Study, whole};
 use crate::case::Subject;
 use crate::failure::Failure;
 use crate::loading;
@@ -87,11 +86,11 @@ pub(crate) struct Arguments {
     replicates: u16,
 
     /// Seed of every random choice
-    #[arg(long, value_name = "N", default_value_t = 0, allow_negative_numbers = true)]
+    #[arg(long, value_name = "N", value_parser = whole, default_value_t = 0, allow_negative_numbers = true)]
     seed: u64,
 
     /// Most work of the fits, in billions of operations; the report says when it was not enough
-    #[arg(long, value_name = "N", default_value_t = MOST_WORK / BILLION, allow_negative_numbers = true)]
+    #[arg(long, value_name = "N", value_parser = whole, default_value_t = MOST_WORK / BILLION, allow_negative_numbers = true)]
     work: u64,
 }
 
