@@ -587,7 +587,7 @@ pub fn clock_offsets(recording: &Recording, inputs: &[&str], outputs: &[&str]) -
         (0..columns.len()).map(|c| (is(inputs, c), is(outputs, c))).unzip();
     let asked = |&(a, b): &(usize, usize)| {
         let known = [a, b].iter().all(|&c| driven[c] || measured[c]);
-        !(roles && !known) && !(driven[a] && driven[b])
+        (!roles || known) && !(driven[a] && driven[b])
     };
     let pairs = (0..columns.len()).flat_map(|a| (a + 1..columns.len()).map(move |b| (a, b)));
     let mut pairs = pairs.filter(asked);
