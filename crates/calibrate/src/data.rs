@@ -297,7 +297,7 @@ fn find_channel(
             channel: channel.to_string(),
             role,
             name: name.to_string(),
-            available: available.join(", "),
+            available: greybox_recording::told(available),
         });
     };
     let found = &recording.channels[index];
@@ -339,9 +339,10 @@ fn noise_level(y: &[f64]) -> f64 {
     if least.is_nan() { least } else { least.max(rounding) }
 }
 
-/// RMS about the mean.
+/// RMS about the mean; exactly zero where nothing moves.
 pub fn spread(values: &[f64]) -> f64 {
-    if values.is_empty() {
+    // The mean of equal values is not always that value.
+    if values.iter().all(|v| *v == values[0]) {
         return 0.0;
     }
     let mean = values.iter().sum::<f64>() / values.len() as f64;

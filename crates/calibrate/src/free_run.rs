@@ -17,6 +17,16 @@ pub struct FreeRun {
     pub x: Vec<Vec<f64>>,
     /// Whether a piece diverged.
     pub diverged: bool,
+    /// Samples per piece that were simulated before it diverged, or all; the last of them is held to the end.
+    pub lengths: Vec<usize>,
+}
+
+impl FreeRun {
+    /// Whether no piece could be followed beyond its first samples.
+    pub fn is_lost(&self) -> bool {
+        const FIRST: usize = 3;
+        self.diverged && self.lengths.iter().all(|n| *n <= FIRST)
+    }
 }
 
 /// Fit of one channel.
@@ -56,8 +66,9 @@ impl Setup {
             })
             .collect();
         let diverged = pieces.iter().any(|(_, run)| run.diverged.is_some());
-        let mut out = FreeRun { starts: vec![], y: vec![], x: vec![], diverged };
-        for (x0, run) in pieces {
+        let mut out = FreeRun { starts: vec![], y: vec![], x: vec![], diverged, lengths: vec![] };
+        for ((x0, run), piece) in pieces.into_iter().zip(&self.data.pieces) {
+            out.lengths.push(run.diverged.unwrap_or(piece.len));
             out.starts.push(x0);
             out.y.push(run.y);
             out.x.push(run.x);

@@ -104,9 +104,22 @@ pub struct Problem<'a> {
 pub struct Work {
     done: AtomicU64,
     given_up: AtomicBool,
+    /// Most of it; 0: no limit.
+    most: u64,
 }
 
 impl Work {
+    /// Work that ends at a limit: every fit that adds up here ends with the step that it is at. For fits one after the
+    /// other; of several at once it would depend on chance which one ends.
+    pub fn within(most: u64) -> Work {
+        Work { most: most.max(1), ..Work::default() }
+    }
+
+    /// Whether it met its limit.
+    pub fn is_spent(&self) -> bool {
+        self.most > 0 && self.done() > self.most
+    }
+
     /// So far.
     pub fn done(&self) -> u64 {
         self.done.load(Ordering::Relaxed)
@@ -497,7 +510,7 @@ impl Problem<'_> {
         let mut cost = self.cost_of(&rows, &point);
         let mut small = 0;
         let mut sizes = vec![0.0; np];
-        while iterations < limits.iterations && !self.work.is_given_up() {
+        while iterations < limits.iterations && !self.work.is_given_up() && !self.work.is_spent() {
             iterations += 1;
             let reduced: Vec<Reduced> = rows
                 .par_iter()

@@ -1,7 +1,8 @@
 //! What a command that finished has to say.
 
 use std::io::{ErrorKind, Write};
-use std::process::ExitCode;
+
+use crate::failure::Failure;
 
 /// For whom a command speaks.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -29,20 +30,32 @@ impl Answer {
         Answer { text, json: None }
     }
 
-    /// Prints on standard output; exit 0, or 1 where standard output cannot be written.
-    pub(crate) fn print(&self, manner: Manner) -> ExitCode {
-        match (&self.json, manner) {
+    /// Adds words, which JSON does not have.
+    pub(crate) fn add(&mut self, words: &str) {
+        self.text.push_str(words);
+    }
+
+    /// Prints on standard output.
+    ///
+    /// # Errors
+    /// Bad input: standard output cannot be written.
+    pub(crate) fn print(&self, manner: Manner) -> Result<(), Failure> {
+        let printed = match (&self.json, manner) {
             (Some(json), Manner::Json) => print(&format!("{json:#}\n")),
             _ => print(&self.text),
-        }
+        };
+        printed.map_err(|e| {
+            Failure::input(format!("standard output cannot be written: {e}"))
+                .mend("see that the disk has room; what `--out` names is written")
+        })
     }
 }
 
 /// Writes to standard output. A reader that has heard enough (`greybox … | head`) is no failure.
-pub(crate) fn print(text: &str) -> ExitCode {
+pub(crate) fn print(text: &str) -> std::io::Result<()> {
     let mut out = std::io::stdout().lock();
     match out.write_all(text.as_bytes()).and_then(|()| out.flush()) {
-        Err(e) if e.kind() != ErrorKind::BrokenPipe => ExitCode::from(1),
-        _ => ExitCode::SUCCESS,
+        Err(e) if e.kind() == ErrorKind::BrokenPipe => Ok(()),
+        printed => printed,
     }
 }

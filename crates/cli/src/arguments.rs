@@ -7,6 +7,7 @@ use clap::error::ErrorKind;
 use clap::{Args, Parser, Subcommand};
 
 use crate::answer::Answer;
+use crate::case::{CaseOptions, Subject};
 use crate::commands::{
     calibrate, check, compare, control, demo, diagnose, export, identify, mechanisms, new, shell, simulate,
 };
@@ -50,6 +51,14 @@ pub(crate) struct Cli {
     pub(crate) log: bool,
 }
 
+/// The unit of `--work`, in operations.
+pub(crate) const BILLION: u64 = 1_000_000_000;
+
+/// A seed, or an amount of work.
+pub(crate) fn whole(text: &str) -> Result<u64, String> {
+    text.parse().map_err(|_| format!("write a whole number from 0 to {}, such as 7", u64::MAX))
+}
+
 /// What the model calls the channels of the recordings.
 #[derive(Debug, Args)]
 pub(crate) struct Channels {
@@ -90,6 +99,9 @@ pub(crate) struct Study {
     /// Folder for the results; made where it is missing
     #[arg(long, value_name = "DIR")]
     pub(crate) out: PathBuf,
+
+    #[command(flatten)]
+    pub(crate) case: CaseOptions,
 }
 
 /// What a [`Study`] reads.
@@ -107,6 +119,20 @@ impl Study {
     pub(crate) fn recordings(&self) -> Result<Recordings, Failure> {
         let (train, holdout) = loading::train_and_holdout(&self.train, &self.holdout, &self.channels.map)?;
         Ok(Recordings { train, holdout })
+    }
+
+    /// What a case of it holds: its files, and the names of its results.
+    pub(crate) fn subject<'a>(&'a self, files: &'a [&'a str]) -> Subject<'a> {
+        Subject {
+            model: None,
+            train: &self.train,
+            holdout: &self.holdout,
+            map: &self.channels.map,
+            mechanisms: None,
+            channels: (&[], &[]),
+            out: &self.out,
+            files,
+        }
     }
 
     /// The folder for `results`, none of which may replace an input.
@@ -202,7 +228,12 @@ impl Cli {
             Err(e) if matches!(e.kind(), ErrorKind::DisplayHelp | ErrorKind::DisplayVersion) => {
                 Ok(Err(Answer::words(e.render().to_string())))
             }
-            Err(e) if e.kind() == ErrorKind::DisplayHelpOnMissingArgumentOrSubcommand => {
+            Err(e)
+                if matches!(
+                    e.kind(),
+                    ErrorKind::DisplayHelpOnMissingArgumentOrSubcommand | ErrorKind::MissingSubcommand
+                ) =>
+            {
                 Err(Failure::input("no command is given").mend(
                     "name one: `greybox diagnose`, `identify`, `calibrate`, `simulate`, `check`, `compare`, `control`, \
                      `export`, `new`, `mechanisms` or `demo`; \

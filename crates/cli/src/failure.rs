@@ -16,7 +16,8 @@ pub(crate) fn usage(rendered: &str) -> Failure {
 /// Prints on standard error, and in JSON on standard output too where that is spoken.
 pub(crate) fn print(failure: &Failure, manner: Manner) -> ExitCode {
     if manner == Manner::Json {
-        answer::print(&format!("{:#}\n", failure.to_json()));
+        // Where standard output cannot be written, standard error says what is wrong.
+        let _ = answer::print(&format!("{:#}\n", failure.to_json()));
     }
     // With standard error closed there is nobody left to tell.
     let _ = std::io::stderr().lock().write_all(failure.to_string().as_bytes());

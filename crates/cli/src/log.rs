@@ -1,6 +1,7 @@
 //! `--log`: what is being done, on standard error, and what it cost.
 
 use std::fmt::Write as _;
+use std::io::Write as _;
 use std::sync::Mutex;
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::time::Instant;
@@ -48,9 +49,8 @@ impl Log {
     }
 
     /// A stage begins, and the one before ends.
-    #[allow(clippy::print_stderr, reason = "it is what --log asks for")]
     pub(crate) fn stage(&self, what: &str) {
-        eprintln!("{:9.2} s  {what}", self.start.elapsed().as_secs_f64());
+        tell(&format!("{:9.2} s  {what}\n", self.start.elapsed().as_secs_f64()));
         let mut stages = self.stages.lock().unwrap_or_else(std::sync::PoisonError::into_inner);
         stages.end();
         stages.running = Some((sort(what), Instant::now(), ProcessTime::now()));
@@ -58,12 +58,16 @@ impl Log {
 }
 
 impl Drop for Log {
-    #[allow(clippy::print_stderr, reason = "it is what --log asks for")]
     fn drop(&mut self) {
         let stages = self.stages.get_mut().unwrap_or_else(std::sync::PoisonError::into_inner);
         stages.end();
-        eprint!("{:9.2} s  done\n\n{}", self.start.elapsed().as_secs_f64(), table(&stages.costs));
+        tell(&format!("{:9.2} s  done\n\n{}", self.start.elapsed().as_secs_f64(), table(&stages.costs)));
     }
+}
+
+/// On standard error. Where that is full or closed nobody reads the log, and the work goes on.
+fn tell(text: &str) {
+    let _ = std::io::stderr().lock().write_all(text.as_bytes());
 }
 
 impl Stages {

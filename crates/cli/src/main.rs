@@ -5,6 +5,7 @@
 
 mod answer;
 mod arguments;
+mod case;
 mod commands;
 mod done;
 mod failure;
@@ -23,11 +24,11 @@ use greybox_commands::{loading, story};
 fn main() -> ExitCode {
     let arguments: Vec<OsString> = std::env::args_os().collect();
     let manner = if arguments.iter().any(|a| a == "--json") { Manner::Json } else { Manner::Text };
-    match std::panic::catch_unwind(|| run(arguments)) {
-        Ok(Ok(answer)) => answer.print(manner),
-        Ok(Err(failure)) => failure::print(&failure, manner),
-        // The default hook has said where on standard error.
-        Err(_) => failure::print(&Failure::fault(), manner),
+    // The default hook has said on standard error where a panic was.
+    let outcome = std::panic::catch_unwind(|| run(arguments)).unwrap_or_else(|_| Err(Failure::fault()));
+    match outcome.and_then(|answer| answer.print(manner)) {
+        Ok(()) => ExitCode::SUCCESS,
+        Err(failure) => failure::print(&failure, manner),
     }
 }
 

@@ -3,7 +3,9 @@
 use std::fs::{self, File, TryLockError};
 use std::io;
 use std::path::{Path, PathBuf};
-use std::sync::atomic::{AtomicUsize, Ordering};
+use std::sync::atomic::{AtomicBool, AtomicUsize, Ordering};
+use std::thread;
+use std::time::Duration;
 
 use crate::failure::Failure;
 use crate::loading::same_file;
@@ -17,6 +19,17 @@ pub(crate) struct OutputFolder {
     path: PathBuf,
     /// Tells its files that wait from those of other folders of this process.
     number: usize,
+    /// This process keeps it ([`keep`](Self::keep)).
+    kept: AtomicBool,
+}
+
+/// What a file of a new folder holds.
+#[derive(Debug)]
+pub(crate) enum Content {
+    /// This text.
+    Text(String),
+    /// What the file at this path holds.
+    Copy(PathBuf),
 }
 
 /// How many folders this process has made.
@@ -24,6 +37,10 @@ static FOLDERS: AtomicUsize = AtomicUsize::new(0);
 
 /// Name of the files that wait: head, number of the process, number of the folder, tail.
 const WAITING: (&str, &str) = (".greybox-", ".partial");
+/// Files that wait for longer, and that nobody holds, were left by a run that was killed.
+const FORGOTTEN: Duration = Duration::from_secs(60);
+/// Longest that a run waits for another one that is moving its files into the same folder, in steps.
+const TURN: (u32, Duration) = (200, Duration::from_millis(10));
 
 impl OutputFolder {
     /// The folder at `path`, which need not exist.
@@ -31,7 +48,8 @@ impl OutputFolder {
     /// # Errors
     /// Bad input when `path` or something above it is a file, or the folder cannot be written.
     pub(crate) fn prepare(path: &Path) -> Result<OutputFolder, Failure> {
-        let folder = OutputFolder { path: path.to_owned(), number: FOLDERS.fetch_add(1, Ordering::Relaxed) };
+        let number = FOLDERS.fetch_add(1, Ordering::Relaxed);
+        let folder = OutputFolder { path: path.to_owned(), number, kept: AtomicBool::new(false) };
         if path.as_os_str().is_empty() {
             return Err(
                 Failure::input("the output folder has no name").mend("give one, such as `--out result`")
@@ -97,22 +115,78 @@ impl OutputFolder {
         for (name, _) in files {
             ordinary(&self.path.join(name))?;
         }
-        let stage = self.stage();
-        let result = fs::create_dir(&stage).and_then(|()| {
+        self.staged(|stage| {
             for (name, content) in files {
                 fs::write(stage.join(name), content)?;
             }
             if self.path.is_dir() {
-                return self.replace(&stage, files);
+                return self.replace(stage, files);
             }
-            if let Some(parent) = self.path.parent() {
-                fs::create_dir_all(parent)?;
+            match self.appear(stage) {
+                // Another run has made the folder meanwhile.
+                Err(_) if self.path.is_dir() => self.replace(stage, files),
+                appeared => appeared,
             }
-            fs::rename(&stage, &self.path)
+        })
+    }
+
+    /// Writes `files` (name, content) to a folder that is not there yet; names may have folders.
+    ///
+    /// # Errors
+    /// Bad input when the folder is there, or it or a file cannot be written; then nothing is.
+    pub(crate) fn write_new(&self, files: &[(String, Content)]) -> Result<(), Failure> {
+        self.staged(|stage| {
+            for (name, content) in files {
+                let path = stage.join(name);
+                if let Some(parent) = path.parent() {
+                    fs::create_dir_all(parent)?;
+                }
+                match content {
+                    Content::Text(text) => fs::write(&path, text)?,
+                    Content::Copy(from) => drop(fs::copy(from, &path)?),
+                }
+            }
+            self.appear(stage)
+        })
+    }
+
+    /// Does `work` with a folder for files that wait, which is gone afterwards.
+    fn staged(&self, work: impl FnOnce(&Path) -> io::Result<()>) -> Result<(), Failure> {
+        let stage = self.stage();
+        if let Some(near) = stage.parent() {
+            sweep(near);
+        }
+        let result = fs::create_dir(&stage).and_then(|()| {
+            let _held = locked(&stage);
+            work(&stage)
         });
         // Gone already where it became the folder itself.
         let _ = fs::remove_dir_all(&stage);
         result.map_err(|e| self.refused(&e))
+    }
+
+    /// The staged files become the folder.
+    fn appear(&self, stage: &Path) -> io::Result<()> {
+        if let Some(parent) = self.path.parent() {
+            fs::create_dir_all(parent)?;
+        }
+        fs::rename(stage, &self.path)
+    }
+
+    /// The folder held while files are moved into it, so that of two runs each moves all of its own. A wait has its end:
+    /// a run that keeps the folder for long writes beside these files.
+    fn turn(&self) -> Option<File> {
+        if self.kept.load(Ordering::Relaxed) {
+            return None;
+        }
+        let (steps, step) = TURN;
+        (0..steps).find_map(|_| {
+            let held = locked(&self.path);
+            if held.is_none() {
+                thread::sleep(step);
+            }
+            held
+        })
     }
 
     /// Makes the folder and keeps it for this process until the value returned is dropped, also by a kill. What a run
@@ -130,19 +204,17 @@ impl OutputFolder {
             return Err(Failure::file(&self.path, "another run of greybox is writing to this folder")
                 .mend("wait for it to end, or name another folder after `--out`"));
         }
-        let (head, tail) = WAITING;
-        for entry in fs::read_dir(&self.path).into_iter().flatten().flatten() {
-            let name = entry.file_name();
-            if name.to_str().is_some_and(|n| n.starts_with(head) && n.ends_with(tail)) {
-                // Best effort: nothing reads it.
-                let _ = fs::remove_dir_all(entry.path());
-            }
+        self.kept.store(true, Ordering::Relaxed);
+        for path in waiting(&self.path) {
+            // Best effort: nothing reads it.
+            let _ = fs::remove_dir_all(path);
         }
         Ok(Kept { _lock: lock, made })
     }
 
     /// Moves the staged files over those of an existing folder; puts the old ones back when one fails.
     fn replace(&self, stage: &Path, files: &[(&str, &[u8])]) -> io::Result<()> {
+        let _held = self.turn();
         let old = stage.join("replaced");
         fs::create_dir(&old)?;
         for (done, (name, _)) in files.iter().enumerate() {
@@ -182,6 +254,34 @@ impl OutputFolder {
         Failure::file(&self.path, format!("the output cannot be written: {error}"))
             .mend("name a place after `--out` that you may write to, and see that the disk has room")
     }
+}
+
+/// What waits in a folder to be moved, of this run or another.
+fn waiting(folder: &Path) -> Vec<PathBuf> {
+    let (head, tail) = WAITING;
+    let entries = fs::read_dir(folder).into_iter().flatten().flatten();
+    let waits = |name: &str| name.starts_with(head) && name.ends_with(tail);
+    entries.filter(|entry| entry.file_name().to_str().is_some_and(waits)).map(|entry| entry.path()).collect()
+}
+
+/// Takes away what runs that were killed left waiting.
+fn sweep(folder: &Path) {
+    for path in waiting(folder) {
+        let modified = fs::metadata(&path).and_then(|m| m.modified());
+        let old = modified.is_ok_and(|time| time.elapsed().is_ok_and(|age| age > FORGOTTEN));
+        if old && locked(&path).is_some() {
+            // Best effort: nothing reads it.
+            let _ = fs::remove_dir_all(path);
+        }
+    }
+}
+
+/// A folder held against other processes until the value is dropped; nothing where another holds it, or where the system
+/// cannot lock a folder.
+fn locked(folder: &Path) -> Option<File> {
+    let file = File::open(folder).ok()?;
+    file.try_lock().ok()?;
+    Some(file)
 }
 
 /// A folder that is kept for this process.
@@ -295,6 +395,64 @@ mod tests {
         assert!(failure.to_string().contains("cannot be written"), "{failure}");
         assert_eq!(names(top.path()), ["x"]);
         assert_eq!(fs::read(top.path().join("x")).unwrap(), b"old");
+    }
+
+    #[test]
+    fn a_new_folder_has_folders_inside_or_is_not_there() {
+        let top = tempfile::tempdir().unwrap();
+        fs::write(top.path().join("data"), "1,2").unwrap();
+        let folder = OutputFolder::prepare(&top.path().join("a/case")).unwrap();
+        let text = |name: &str| (name.to_owned(), Content::Text("x".into()));
+        let copy = |from: &str| ("in/data".to_owned(), Content::Copy(top.path().join(from)));
+        folder.write_new(&[text("x"), copy("nowhere")]).unwrap_err();
+        assert_eq!(names(top.path()), ["data"]);
+        folder.write_new(&[text("x"), copy("data")]).unwrap();
+        assert_eq!(names(&top.path().join("a/case")), ["in", "x"]);
+        assert_eq!(fs::read(top.path().join("a/case/in/data")).unwrap(), b"1,2");
+        folder.write_new(&[text("y")]).unwrap_err();
+        assert_eq!(names(&top.path().join("a/case")), ["in", "x"]);
+        assert_eq!(names(top.path()), ["a", "data"]);
+    }
+
+    /// What a killed run left is taken away; what another run is writing is not.
+    #[cfg(unix)]
+    #[test]
+    fn what_was_left_waiting_goes() {
+        let top = tempfile::tempdir().unwrap();
+        let [left, held, young] =
+            ["1-0", "2-0", "3-0"].map(|n| top.path().join(format!(".greybox-{n}.partial")));
+        for path in [&left, &held, &young] {
+            fs::create_dir(path).unwrap();
+            fs::write(path.join("report.json"), "half").unwrap();
+        }
+        let past = std::time::SystemTime::now() - 2 * FORGOTTEN;
+        for path in [&left, &held] {
+            File::open(path).unwrap().set_modified(past).unwrap();
+        }
+        let _held = locked(&held).unwrap();
+        OutputFolder::prepare(top.path()).unwrap().write(&[("x", b"1")]).unwrap();
+        assert_eq!(names(top.path()), [".greybox-2-0.partial", ".greybox-3-0.partial", "x"]);
+    }
+
+    #[test]
+    fn two_runs_into_one_folder_leave_the_files_of_one() {
+        let top = tempfile::tempdir().unwrap();
+        for round in 0..20 {
+            let out = top.path().join(format!("{round}"));
+            thread::scope(|scope| {
+                for content in ["first", "second", "third"] {
+                    let folder = OutputFolder::prepare(&out).unwrap();
+                    scope.spawn(move || {
+                        let files = ["a", "b", "c", "d"].map(|name| (name, content.as_bytes()));
+                        folder.write(&files).unwrap();
+                    });
+                }
+            });
+            let read: Vec<String> =
+                ["a", "b", "c", "d"].map(|name| fs::read_to_string(out.join(name)).unwrap()).into();
+            assert!(read.iter().all(|content| *content == read[0]), "{read:?}");
+            assert_eq!(names(&out), ["a", "b", "c", "d"]);
+        }
     }
 
     #[test]

@@ -283,7 +283,7 @@ fn two_diagnoses_are_held_against_each_other() {
     assert_eq!(serde_json::from_str::<Value>(&printed.stdout).unwrap(), json);
 
     bench.write("no.json", "{\"verdict\": 3}");
-    for (path, part) in [("no.json", "this is no report of a diagnosis"), ("nowhere", "cannot be read")] {
+    for (path, part) in [("no.json", "this is no report of a diagnosis"), ("nowhere", "no such file")] {
         let refused = bench.greybox(&["compare", path, "out/friday", "--out", "none"]);
         assert_eq!(refused.code, 2, "{}", refused.stderr);
         assert!(

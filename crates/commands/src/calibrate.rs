@@ -44,7 +44,8 @@ impl Results {
         train: &[Recording],
         holdout: &[Recording],
     ) -> Result<Results, Failure> {
-        let findings = findings(&loaded.model, train.iter().chain(holdout));
+        let mut findings = findings(&loaded.model, train.iter().chain(holdout));
+        findings.extend(calibration.limited.then(limit));
         let report = report(loaded, calibration, findings);
         let options = WriteOptions { original: Some(&loaded.text), ..Default::default() };
         let model_toml = calibration.model.to_toml(&options);
@@ -138,6 +139,20 @@ fn findings<'a>(model: &Model, recordings: impl Iterator<Item = &'a Recording>) 
             })
         })
         .collect()
+}
+
+/// The fits ended before their end.
+fn limit() -> contract::Finding {
+    contract::Finding {
+        severity: contract::Severity::Warning,
+        code: "limit".to_owned(),
+        recording: None,
+        channel: None,
+        message: "the fits ended at their limit of work: the parameters may not be the best ones".to_owned(),
+        mend: Some(
+            "give it a shorter recording, or fix parameters that the recordings do not show".to_owned(),
+        ),
+    }
 }
 
 /// Scores by channel, in the units of the model.

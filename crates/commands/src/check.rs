@@ -5,7 +5,7 @@ use std::path::Path;
 
 use greybox_calibrate::Data;
 use greybox_model::{Model, Unit};
-use greybox_recording::{Finding, Recording, Severity, health};
+use greybox_recording::{Finding, Recording, Severity, health, told};
 use greybox_report::format;
 use serde::Serialize;
 use serde_json::json;
@@ -84,7 +84,7 @@ fn known(recording: &Recording, inputs: &[String]) -> Result<(), Failure> {
     };
     let names: Vec<String> = recording.channels.iter().map(|c| format!("`{}`", c.name)).collect();
     let message = format!("there is no channel `{unknown}`, which `--inputs` names");
-    Err(Failure::file(Path::new(&recording.name), message).mend(format!("name one of {}", names.join(", "))))
+    Err(Failure::file(Path::new(&recording.name), message).mend(format!("name one of {}", told(names))))
 }
 
 /// The health of a recording, its channels in the roles that the model gives them.

@@ -50,7 +50,7 @@ impl Failure {
     fn new(cause: Cause, message: impl Into<String>) -> Failure {
         Failure(Box::new(Details {
             cause,
-            message: message.into(),
+            message: plain(&message.into()),
             mend: None,
             place: Map::new(),
             excerpt: None,
@@ -89,7 +89,7 @@ impl Failure {
     /// Adds the mend.
     #[must_use]
     pub fn mend(mut self, mend: impl Into<String>) -> Failure {
-        self.0.mend = Some(mend.into());
+        self.0.mend = Some(plain(&mend.into()));
         self
     }
 
@@ -147,7 +147,7 @@ impl Failure {
             Some(file) => Failure::file(Path::new(file), problem),
             None => Failure::input(problem),
         };
-        failure.0.mend = help.map(str::to_owned);
+        failure.0.mend = help.map(plain);
         failure
     }
 
@@ -219,15 +219,51 @@ impl std::fmt::Display for Failure {
     }
 }
 
+/// Longest line of a source that is shown, and most of a quotation, in characters.
+const WIDEST: usize = 100;
+/// What is shown of a longer line before its mark.
+const BEFORE: usize = 40;
+
+/// A character of a source as a terminal may show it.
+fn shown(c: char) -> char {
+    if c.is_control() && c != '\t' { '\u{fffd}' } else { c }
+}
+
+/// Text of which nothing acts on a terminal, with long quotations (between backticks) cut.
+fn plain(text: &str) -> String {
+    let parts: Vec<String> = text
+        .split('`')
+        .enumerate()
+        .map(|(k, part)| match part.char_indices().nth(WIDEST) {
+            Some((end, _)) if k % 2 == 1 => format!("{}…", &part[..end]),
+            _ => part.to_owned(),
+        })
+        .collect();
+    let mut shown = String::with_capacity(text.len());
+    for c in parts.join("`").chars() {
+        match c {
+            '\n' => shown.push(c),
+            c if c.is_control() => shown.extend(c.escape_unicode()),
+            c => shown.push(c),
+        }
+    }
+    shown
+}
+
 impl Excerpt {
     fn new(text: &str, span: &Range<usize>, place: String, line: usize, column: usize) -> Excerpt {
-        let source = text.lines().nth(line - 1).unwrap_or_default();
-        let start = column - 1;
+        let source: Vec<char> = text.lines().nth(line - 1).unwrap_or_default().chars().map(shown).collect();
+        let start = (column - 1).min(source.len());
         let chars =
             text.get(span.clone()).and_then(|marked| marked.lines().next()).map_or(0, |m| m.chars().count());
-        let room = source.chars().count().saturating_sub(start);
-        let marked = start..start + chars.min(room).max(1);
-        Excerpt { place, line, text: source.to_owned(), marked }
+        let end = start + chars.min(source.len() - start).max(1);
+        // Of a long line, the part around its mark.
+        let from = if source.len() > WIDEST { start.saturating_sub(BEFORE) } else { 0 };
+        let to = source.len().min(from + WIDEST);
+        let (head, tail) = (if from > 0 { "…" } else { "" }, if to < source.len() { "…" } else { "" });
+        let text = format!("{head}{}{tail}", source[from..to].iter().collect::<String>());
+        let shift = |at: usize| at - from + head.chars().count();
+        Excerpt { place, line, text, marked: shift(start)..shift(end.min(to.max(start + 1))) }
     }
 
     /// Writes the excerpt; returns the empty gutter for the lines that follow.
@@ -366,6 +402,24 @@ mod tests {
             failure.to_string(),
             "error: wrong\n --> f:1:2\n  |\n1 | \tab\n  | \t^^\n  = mend: right\n"
         );
+    }
+
+    #[test]
+    fn a_long_line_is_cut_around_its_mark() {
+        let text = format!("{}oops{}", "a".repeat(300), "b".repeat(300));
+        let excerpt = Excerpt::new(&text, &(300..304), "f:1:301".into(), 1, 301);
+        assert_eq!(excerpt.text, format!("…{}oops{}…", "a".repeat(40), "b".repeat(56)));
+        assert_eq!(excerpt.marked, 41..45);
+        let excerpt = Excerpt::new(&text, &(0..604), "f:1:1".into(), 1, 1);
+        assert_eq!(excerpt.marked, 0..100);
+        assert_eq!(excerpt.text.chars().count(), 101);
+    }
+
+    #[test]
+    fn nothing_acts_on_the_terminal() {
+        let failure = Failure::input(format!("bad\u{1b}[31m `{}` \nmore", "x".repeat(200)));
+        assert_eq!(failure.to_string(), format!("error: bad\\u{{1b}}[31m `{}…` \nmore\n", "x".repeat(100)));
+        assert_eq!(Excerpt::new("a\u{0}b", &(0..1), "f:1:1".into(), 1, 1).text, "a\u{fffd}b");
     }
 
     #[test]

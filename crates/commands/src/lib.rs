@@ -5,6 +5,7 @@
 //! command line or writes a file, so that the command and the Python package give the same answer.
 
 pub mod calibrate;
+pub mod case;
 pub mod check;
 pub mod control;
 pub mod diagnose;

@@ -1,7 +1,7 @@
 //! Reading models and recordings, with errors for the usual mistakes.
 
 use std::fs;
-use std::io::ErrorKind;
+use std::io::{self, ErrorKind};
 use std::path::{Path, PathBuf};
 
 use greybox_diagnose::library::{self, Library};
@@ -55,14 +55,39 @@ fn read_text(path: &Path) -> Result<String, Failure> {
     if path.is_dir() {
         return Err(Failure::file(path, "this is a folder, not a model").mend("name one TOML file inside it"));
     }
-    let bytes = fs::read(path).map_err(|e| match e.kind() {
+    text(path)
+}
+
+/// The text of a file.
+///
+/// # Errors
+/// Bad input: no such file, a folder or a device, or a file that is no text.
+pub fn text(path: &Path) -> Result<String, Failure> {
+    let unread = |e: io::Error| match e.kind() {
         ErrorKind::NotFound => Failure::file(path, "no such file").mend("check the path and the spelling"),
         _ => Failure::file(path, format!("the file cannot be read: {e}")).mend("check its permissions"),
-    })?;
-    String::from_utf8(bytes).map_err(|e| {
-        let line = 1 + e.as_bytes()[..e.utf8_error().valid_up_to()].iter().filter(|&&b| b == b'\n').count();
-        Failure::file(path, format!("line {line}: the file is not UTF-8 text")).mend("save it again as UTF-8")
-    })
+    };
+    let kind = fs::metadata(path).map_err(unread)?.file_type();
+    if kind.is_dir() || greybox_recording::is_device(kind) {
+        let what = if kind.is_dir() { "folder" } else { "device" };
+        return Err(Failure::file(path, format!("this is a {what}, not a file")).mend("name a file"));
+    }
+    let bytes = fs::read(path).map_err(unread)?;
+    let line = |at: usize| 1 + bytes[..at].iter().filter(|&&b| b == b'\n').count();
+    if let Some(at) = bytes.iter().position(|&b| b == 0) {
+        return Err(Failure::file(
+            path,
+            format!("line {}: the file holds zero bytes, like a binary file", line(at)),
+        )
+        .mend("save it again as UTF-8 text"));
+    }
+    match std::str::from_utf8(&bytes) {
+        Ok(text) => Ok(text.to_owned()),
+        Err(e) => {
+            Err(Failure::file(path, format!("line {}: the file is not UTF-8 text", line(e.valid_up_to())))
+                .mend("save it again as UTF-8"))
+        }
+    }
 }
 
 /// The built-in mechanisms and those of a folder.

@@ -131,8 +131,10 @@ fn columns(model: &Model, recording: &Recording, run: &FreeRun) -> Vec<(String, 
             let channel = recording.channel(&measurement.channel)?;
             let factor = header_factor(channel.unit.as_deref(), &measurement.unit);
             let mut values = vec![f64::NAN; recording.time.len()];
-            for (piece, y) in recording.pieces.iter().zip(&run.y) {
-                let simulated = &y[c * piece.len..(c + 1) * piece.len];
+            for ((piece, y), length) in recording.pieces.iter().zip(&run.y).zip(&run.lengths) {
+                let mut simulated = y[c * piece.len..(c + 1) * piece.len].to_vec();
+                simulated[(*length).min(piece.len)..].fill(f64::NAN);
+                let simulated = &simulated;
                 at_rows(piece, &recording.time, simulated, &mut values);
             }
             for v in &mut values {

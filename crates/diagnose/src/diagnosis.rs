@@ -69,9 +69,19 @@ pub enum DiagnoseError {
         /// Samples needed.
         needed: usize,
     },
-    /// The simulation leaves every bound with the nominal parameters and cannot be calibrated.
+    /// No measured channel moves.
     #[error(
-        "the simulation of the nominal model diverges within the first samples of `{file}`, whatever its parameters: check signs and units of the model's equations"
+        "{file}: no measured channel ever moves ({channels}): there is nothing to learn from. Excite the machine, and check that the sensors were connected"
+    )]
+    Still {
+        /// File.
+        file: String,
+        /// The channels.
+        channels: String,
+    },
+    /// The simulation leaves every bound at once and cannot be calibrated.
+    #[error(
+        "{file}: the simulation of the model diverges within the first samples, whatever its parameters. Check that no inertia is zero, nothing is divided by zero and no equation follows from the others, and the signs and units of the equations"
     )]
     Diverges {
         /// File.
@@ -301,6 +311,13 @@ pub fn layout(model: &Model, train: &[Recording], holdout: &[Recording]) -> Resu
     if found < needed {
         return Err(DiagnoseError::TooShort { file: whole.recordings.join(", "), found, needed });
     }
+    if whole.spread.iter().all(|s| s.is_nan() || *s <= 0.0) {
+        let channels: Vec<String> = whole.channels.iter().map(|c| format!("`{}`", c.name)).collect();
+        return Err(DiagnoseError::Still {
+            file: whole.recordings.join(", "),
+            channels: channels.join(", "),
+        });
+    }
     if holdout.is_empty() {
         let (head, tail) = Data::split_tail(train, HELD_OUT_SHARE);
         if !head.is_empty() {
@@ -320,6 +337,14 @@ pub fn layout(model: &Model, train: &[Recording], holdout: &[Recording]) -> Resu
     Ok(Layout { train: Arc::new(whole), holdout: Arc::new(held), source })
 }
 
+/// Sees that one of the runs goes beyond the first samples.
+fn follows<const N: usize>(runs: [&FreeRun; N], data: &Data) -> Result<(), DiagnoseError> {
+    match runs.iter().all(|run| run.is_lost()) {
+        true => Err(DiagnoseError::Diverges { file: data.recordings.join(", ") }),
+        false => Ok(()),
+    }
+}
+
 fn conclude(
     nominal: &Setup,
     holdout: Arc<Data>,
@@ -336,12 +361,15 @@ fn conclude(
     let window = window_length(&durations, dt);
     observer.stage(Stage::Simulating);
     let mut baseline = Baseline::of(&found, &nominal.values());
+    let mut limited = found.limited;
     let improved = if found.improved.parts.is_empty() {
         baseline.fitted.clone()
     } else {
         // The search fits the baseline with a scale that its mechanisms made small, and only where it goes on with
         // it. What is compared with is the best that the equations can do alone.
-        let alone = Baseline::of(&alone(nominal, false, &Untold(observer)), &nominal.values());
+        let alone = alone(nominal, false, &Untold(observer));
+        limited |= alone.limited;
+        let alone = Baseline::of(&alone, &nominal.values());
         if alone.misfit.total_cmp(&baseline.misfit).is_lt() {
             baseline = alone;
         }
@@ -395,6 +423,7 @@ fn conclude(
         }
     };
     let mut train_role = role(&train, false);
+    follows([&train_role.calibrated.run, &train_role.improved.run], &train)?;
     let mut holdout_role = role(&holdout, true);
 
     // Mechanisms, remainder, verdict.
@@ -483,7 +512,7 @@ fn conclude(
         holds,
         better_holds: found.better_holds.iter().map(|b| b.0).collect(),
         seed: options.seed,
-        limited: found.limited,
+        limited,
     })
 }
 
@@ -1150,6 +1179,8 @@ pub struct Calibration {
     pub data: Arc<Data>,
     /// Held-out data.
     pub held: Arc<Data>,
+    /// The fits ended at their limit of work, not because nothing more was to be gained.
+    pub limited: bool,
     /// Free runs on the training recordings: nominal, calibrated.
     pub train_runs: (FreeRun, FreeRun),
     /// Free runs on the held-out recordings.
@@ -1200,6 +1231,7 @@ pub fn calibrate(
         (scores, (before, after))
     };
     let (train_scores, train_runs) = runs(&train);
+    follows([&train_runs.1], &train)?;
     let (holdout_scores, holdout_runs) = runs(&holdout);
     Ok(Calibration {
         model: calibrated,
@@ -1210,6 +1242,7 @@ pub fn calibrate(
         window,
         data: train,
         held: holdout,
+        limited: found.limited,
         train_runs,
         holdout_runs,
     })

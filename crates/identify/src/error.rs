@@ -65,6 +65,17 @@ pub enum IdentifyError {
         /// The states.
         states: String,
     },
+    /// Delays are looked for that no recording can show.
+    #[error(
+        "delays up to {longest} s are looked for, but the longest stretch without a gap lasts {recorded:.4} s: look for \
+         delays much shorter than that"
+    )]
+    LongestDelay {
+        /// Longest delay asked for, s.
+        longest: f64,
+        /// Longest stretch, s.
+        recorded: f64,
+    },
     /// The library is larger than the data can carry.
     #[error("{candidates} candidate terms on {samples} samples: too many; lower the order or record longer")]
     TooManyTerms {

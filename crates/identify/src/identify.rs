@@ -37,7 +37,12 @@ pub struct Options {
     pub replicates: usize,
     /// Seed of the bootstrap.
     pub seed: u64,
+    /// Work of the fits ([`greybox_calibrate::Work`]) after which nothing more is tried.
+    pub work: u64,
 }
+
+/// The usual limit of the work.
+pub const MOST_WORK: u64 = 80_000_000_000;
 
 impl Options {
     /// The usual request: second order, polynomials up to order 6 for one state, up to 4 for several.
@@ -55,6 +60,7 @@ impl Options {
             delay: None,
             replicates: 100,
             seed: 0,
+            work: MOST_WORK,
         }
     }
 }
@@ -212,6 +218,8 @@ pub struct Identification {
     pub segments: usize,
     /// How the recordings were read, where in blocks.
     pub blocks: Option<Blocks>,
+    /// The fits ended at their limit of work ([`Options::work`]).
+    pub limited: bool,
     /// Seed.
     pub seed: u64,
 }
@@ -281,12 +289,12 @@ pub(crate) fn search(
     let first = first_estimates(&structure, &whole, &data, &hats, options)?;
 
     observer.stage("output error");
-    let work = Arc::new(Work::default());
+    let work = Arc::new(Work::within(options.work));
     observer.begins(&work);
     let refined = best_refined(&structure, &data, &first, &work).ok_or(IdentifyError::NoFit)?;
     let (structure, refined) = match options.hold {
-        Some(_) => (structure, refined),
-        None => better_hold(structure, refined),
+        None if !work.is_spent() => better_hold(structure, refined),
+        _ => (structure, refined),
     };
     Ok(Search { structure, data, first, refined })
 }
@@ -358,6 +366,18 @@ pub(crate) fn structure(recordings: &[Recording], options: &Options) -> Result<S
         if !(delay.longest > 0.0 && delay.longest.is_finite()) {
             let found = delay.longest;
             return Err(IdentifyError::Range { what: "the longest delay", found, range: "(0, ∞) s" });
+        }
+        if let Some(found) = delay.gain.filter(|gain| !gain.is_finite()) {
+            return Err(IdentifyError::Range {
+                what: "the gain of the delayed feedback",
+                found,
+                range: "the finite numbers",
+            });
+        }
+        let lengths = recordings.iter().flat_map(|r| &r.pieces).map(|p| p.len as f64 * p.dt);
+        let recorded = lengths.fold(0.0, f64::max);
+        if delay.longest >= recorded {
+            return Err(IdentifyError::LongestDelay { longest: delay.longest, recorded });
         }
         extras.push(Extra {
             expression: format!("-kp*delay({}, tau)", delay.state),
@@ -722,6 +742,7 @@ pub(crate) fn conclude(
         rounds: refined.rounds,
         segments: refined.level.segments.len(),
         blocks: None,
+        limited: refined.setup.work.is_spent(),
         seed: options.seed,
         model,
         train,

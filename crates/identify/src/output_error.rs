@@ -91,6 +91,9 @@ fn read_back(structure: &Structure, state: &mut State, setup: &Setup, fit: &Fit)
     }
 }
 
+/// Most rounds of choice and refit on segments of one length.
+const ROUNDS: usize = 6;
+
 /// The regression of the output on all candidates around a fitted model.
 pub(crate) struct Linearised {
     /// The regression.
@@ -469,7 +472,11 @@ fn round(structure: &Structure, refined: &Refined, allowed: &[bool], seen: &[Vec
 /// records, or as long as a fit still follows.
 pub(crate) fn refine(structure: &Structure, begun: Refined, allowed: &[bool]) -> Refined {
     let mut refined = begun;
+    let spent = |refined: &Refined| refined.setup.work.is_spent();
     for &count in levels(structure) {
+        if spent(&refined) {
+            return refined;
+        }
         let level = refined.setup.level(count);
         if level.segments != refined.level.segments {
             let longer = fit_at(&refined, structure, level, Limits { iterations: 25, tolerance: 1e-5 });
@@ -479,7 +486,10 @@ pub(crate) fn refine(structure: &Structure, begun: Refined, allowed: &[bool]) ->
             refined = longer;
         }
         let mut seen = vec![refined.state.active.clone()];
-        for _ in 0..6 {
+        for _ in 0..ROUNDS {
+            if spent(&refined) {
+                return refined;
+            }
             let Some(next) = round(structure, &refined, allowed, &seen) else { break };
             seen.push(next.state.active.clone());
             refined = next;

@@ -11,6 +11,9 @@ use std::ops::Range;
 use toml::Spanned;
 use toml::de::{DeTable, DeValue};
 
+/// Most inputs, states and parameters of a model, each.
+const MOST_NAMES: usize = 500;
+
 const TABLES: [&str; 6] = ["name", "inputs", "states", "parameters", "equations", "measurements"];
 
 impl Model {
@@ -88,8 +91,7 @@ fn entries<'a, 'i>(table: &'a DeTable<'i>) -> impl Iterator<Item = Entry<'a, 'i>
 }
 
 fn load(text: &str) -> Result<Model, Located> {
-    let document = DeTable::parse(text)
-        .map_err(|e| (ModelError::new(Problem::Toml { message: e.message().to_owned() }), e.span()))?;
+    let document = DeTable::parse(text).map_err(|e| (toml_fault(e.message()), e.span()))?;
     let root = document.get_ref();
     check_keys(root, &TABLES, "the model")?;
 
@@ -128,6 +130,7 @@ fn load(text: &str) -> Result<Model, Located> {
         declare(name, &at, "parameter", &mut declared)?;
         model.parameters.push(read_parameter(name, value)?);
     }
+    check_size(&model, root)?;
     // Parameters come first in the elimination, states next, inputs last.
     unstated.reverse();
 
@@ -211,6 +214,33 @@ fn load(text: &str) -> Result<Model, Located> {
         .map_err(|(place, (error, wanted))| (error, find_source(&place, &wanted)))?;
     set_measurement_units(&mut resolved, &explicit)?;
     Ok(resolved)
+}
+
+fn toml_fault(message: &str) -> ModelError {
+    let help = if message.contains("duplicate") {
+        "a name stands once in its table: rename or delete one of the two"
+    } else if message.contains("recurs") {
+        "a model needs two levels: a table, and one line `name = { key = value }` per entry"
+    } else {
+        "tables are `[name]`, lines below them `key = value`, texts stand in quotes"
+    };
+    ModelError::new(Problem::Toml { message: message.to_owned() }).with_help(help)
+}
+
+/// A model is no larger than its fits can hold in memory.
+fn check_size(model: &Model, root: &DeTable<'_>) -> Result<(), Located> {
+    for (what, count) in [
+        ("inputs", model.inputs.len()),
+        ("states", model.states.len()),
+        ("parameters", model.parameters.len()),
+    ] {
+        if count > MOST_NAMES {
+            let message = format!("{count} {what}; at most {MOST_NAMES} can be computed with");
+            let help = "leave out what the equations do not use, or put numbers into them";
+            return Err(bad(&format!("[{what}]"), message, root_span(root, what), help));
+        }
+    }
+    Ok(())
 }
 
 fn model_index(equations: &[Equation], name: &str) -> Option<usize> {
@@ -316,6 +346,16 @@ fn number(value: &Spanned<DeValue<'_>>, key: &str, item: &str) -> Result<f64, Lo
             Err(bad(item, message, value.span(), "write a finite number"))
         }
     }
+}
+
+/// A number in SI.
+fn quantity(factor: f64, given: &Spanned<DeValue<'_>>, key: &str, item: &str) -> Result<f64, Located> {
+    let value = factor * number(given, key, item)?;
+    if value.is_finite() {
+        return Ok(value);
+    }
+    let message = format!("`{key}` is too large in SI units");
+    Err(bad(item, message, given.span(), "numbers reach 1.7e308"))
 }
 
 fn read_unit(table: &DeTable<'_>, item: &str) -> Result<Option<Unit>, Located> {
@@ -442,9 +482,9 @@ fn read_state(name: &str, value: &Spanned<DeValue<'_>>) -> Result<(State, bool),
         Some(value) => match value.get_ref() {
             DeValue::Array(list) => list
                 .iter()
-                .map(|v| Ok(unit.factor * number(v, "initial", &item)?))
+                .map(|v| quantity(unit.factor, v, "initial", &item))
                 .collect::<Result<Vec<f64>, Located>>()?,
-            _ => vec![unit.factor * number(value, "initial", &item)?],
+            _ => vec![quantity(unit.factor, value, "initial", &item)?],
         },
     };
     Ok((State { name: name.to_owned(), unit, order: 1, channel, initial }, stated))
@@ -474,11 +514,11 @@ fn read_parameter(name: &str, value: &Spanned<DeValue<'_>>) -> Result<Parameter,
                 let help = "write the 1-sigma uncertainty, or `fixed = true` if the value is exact";
                 return Err(bad(&item, message, v.span(), help));
             }
-            Some(std * factor)
+            Some(quantity(factor, v, "std", &item)?)
         }
     };
     let fixed = boolean(table, "fixed", &item)?.unwrap_or(false);
-    let value = factor * number(given, "value", &item)?;
+    let value = quantity(factor, given, "value", &item)?;
     Ok(Parameter { name: name.to_owned(), value, unit, std, fixed })
 }
 

@@ -453,7 +453,7 @@ impl<'a> Parser<'a> {
                 Err(error(
                     token.span.clone(),
                     format!("found {found}, expected a number, a name or `(`"),
-                    None,
+                    Some("write what is missing here, or remove the operator before it".into()),
                 ))
             }
         }

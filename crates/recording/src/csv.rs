@@ -566,7 +566,15 @@ fn cell_count(record: &ByteRecord, width: usize, place: Place) -> RecordingError
         let cells: Vec<_> = record.iter().take(6).map(String::from_utf8_lossy).collect();
         return RecordingError::DecimalComma { place, found: format!("the row `{}…`", cells.join(",")) };
     }
-    RecordingError::CellCount { place, found: record.len(), expected: width }
+    let first = record.get(0).unwrap_or_default();
+    let mend = if record.iter().any(|cell| cell.contains(&b'\n')) {
+        "a quotation mark opens in this row and does not close in its line: remove it"
+    } else if record.len() == 1 && first.iter().any(|b| matches!(b, b';' | b'\t' | b'|')) {
+        "separate its cells by commas, as those of the header"
+    } else {
+        "give every column its cell (an empty cell marks a missing sample) and no more"
+    };
+    RecordingError::CellCount { place, found: record.len(), expected: width, mend }
 }
 
 #[cfg(test)]

@@ -35,10 +35,16 @@ impl fmt::Display for Place {
             write!(f, ":{line}")?;
         }
         if let Some((number, name)) = &self.column {
-            write!(f, ":{name} (column {number})")?;
+            let colon = if name.is_empty() { "" } else { ":" };
+            write!(f, "{colon}{name} (column {number})")?;
         }
         Ok(())
     }
+}
+
+/// `1 row`, `2 rows`.
+fn counted(number: usize, what: &str) -> String {
+    format!("{number} {what}{}", if number == 1 { "" } else { "s" })
 }
 
 /// Why a recording could not be read or written. Each message is one paragraph: place, what was found, mend.
@@ -55,6 +61,12 @@ pub enum RecordingError {
     #[error("{place}: this is a folder, not a recording; name one CSV file inside it")]
     IsDirectory {
         /// The folder as named by the caller.
+        place: Place,
+    },
+    /// A device was given where a file is needed; some have no end.
+    #[error("{place}: this is a device, not a file; name a recording")]
+    IsDevice {
+        /// The device as named by the caller.
         place: Place,
     },
     /// The operating system refused to read or write.
@@ -162,8 +174,8 @@ pub enum RecordingError {
     },
     /// A row has more or fewer cells than the header.
     #[error(
-        "{place}: the row has {found} cells, the header has {expected}; give every column its cell (an empty \
-         cell marks a missing sample) and no more"
+        "{place}: the row has {}, the header has {expected}; {mend}",
+        counted(*found, "cell")
     )]
     CellCount {
         /// The row.
@@ -172,6 +184,8 @@ pub enum RecordingError {
         found: usize,
         /// Cells in the header.
         expected: usize,
+        /// How to mend it.
+        mend: &'static str,
     },
     /// A cell holds text where a number is needed.
     #[error("{place}: `{found}` is not a number; {mend}")]
@@ -190,6 +204,19 @@ pub enum RecordingError {
         place: Place,
         /// The cell as written.
         found: String,
+    },
+    /// Squares of the values, or the sampling's frequencies, would leave the range of numbers.
+    #[error(
+        "{place}: {what} of {found:e} is no size to compute with (1e-100 to 1e100 is); check the export, or write the \
+         column in another unit"
+    )]
+    Scale {
+        /// The file and the column.
+        place: Place,
+        /// `a value` or `a sampling step`.
+        what: &'static str,
+        /// Its size.
+        found: f64,
     },
     /// A row has no time.
     #[error("{place}: the time is missing; every row needs its time, delete the row or fill in the cell")]
@@ -212,7 +239,7 @@ pub enum RecordingError {
         mend: &'static str,
     },
     /// Too few rows to identify anything.
-    #[error("{place}: the recording has {rows} rows of samples, at least {needed} are needed; {mend}")]
+    #[error("{place}: the recording has {} of samples, at least {needed} are needed; {mend}", counted(*rows, "row"))]
     TooFewRows {
         /// The file.
         place: Place,
@@ -340,6 +367,7 @@ impl RecordingError {
         match self {
             Self::NotFound { place }
             | Self::IsDirectory { place }
+            | Self::IsDevice { place }
             | Self::Io { place, .. }
             | Self::NotUtf8 { place, .. }
             | Self::Empty { place }
@@ -353,6 +381,7 @@ impl RecordingError {
             | Self::CellCount { place, .. }
             | Self::NotANumber { place, .. }
             | Self::NotFinite { place, .. }
+            | Self::Scale { place, .. }
             | Self::MissingTime { place }
             | Self::TimeNotIncreasing { place, .. }
             | Self::TooFewRows { place, .. }

@@ -98,7 +98,7 @@ fn sampling(recording: &Recording) -> Finding {
 }
 
 fn unknown_channels(recording: &Recording, inputs: &[&str], outputs: &[&str]) -> Vec<Finding> {
-    let known: Vec<&str> = recording.channels.iter().map(|channel| channel.name.as_str()).collect();
+    let known = crate::told(recording.channels.iter().map(|channel| channel.name.clone()).collect());
     let absent = inputs.iter().chain(outputs).filter(|name| recording.channel(name).is_none());
     absent
         .map(|name| {
@@ -108,7 +108,7 @@ fn unknown_channels(recording: &Recording, inputs: &[&str], outputs: &[&str]) ->
                 format!("{} has no channel of this name.", recording.name),
             )
             .on(name)
-            .mend(format!("Its channels are {}.", known.join(", ")))
+            .mend(format!("Its channels are {known}."))
         })
         .collect()
 }
@@ -568,6 +568,9 @@ struct Offset {
     parts: [usize; 2],
 }
 
+/// Most pairs of channels whose clocks are compared.
+const MOST_PAIRS: usize = 2000;
+
 /// Channels that were recorded later than others by a constant number of samples, as by another logger.
 ///
 /// Asked is every pair of outputs, and every output that runs ahead of an input; with no roles stated, every pair. Of two
@@ -580,21 +583,32 @@ pub fn clock_offsets(recording: &Recording, inputs: &[&str], outputs: &[&str]) -
     let columns: Vec<Vec<f64>> = piece.columns.iter().map(|column| fill_missing(column)).collect();
     let is = |names: &[&str], c: usize| names.contains(&recording.channels[c].name.as_str());
     let roles = !inputs.is_empty() && !outputs.is_empty();
-    let mut offsets = Vec::new();
-    for a in 0..columns.len() {
-        for b in a + 1..columns.len() {
-            let known = [a, b].iter().all(|&c| is(inputs, c) || is(outputs, c));
-            if (roles && !known) || (is(inputs, a) && is(inputs, b)) {
-                continue;
-            }
-            let Some(offset) = offset(&columns, a, b) else { continue };
-            // That an output comes after its input is what outputs do.
-            if !(roles && is(inputs, offset.pair[0])) {
-                offsets.push(offset);
-            }
-        }
-    }
+    let (driven, measured): (Vec<bool>, Vec<bool>) =
+        (0..columns.len()).map(|c| (is(inputs, c), is(outputs, c))).unzip();
+    let asked = |&(a, b): &(usize, usize)| {
+        let known = [a, b].iter().all(|&c| driven[c] || measured[c]);
+        (!roles || known) && !(driven[a] && driven[b])
+    };
+    let pairs = (0..columns.len()).flat_map(|a| (a + 1..columns.len()).map(move |b| (a, b)));
+    let mut pairs = pairs.filter(asked);
+    // That an output comes after its input is what outputs do.
+    let mut offsets: Vec<Offset> = pairs
+        .by_ref()
+        .take(MOST_PAIRS)
+        .filter_map(|(a, b)| offset(&columns, a, b))
+        .filter(|offset| !(roles && driven[offset.pair[0]]))
+        .collect();
     let mut findings = Vec::new();
+    if pairs.next().is_some() {
+        findings.push(
+            Finding::new(
+                Severity::Info,
+                "clock_offset_limit",
+                format!("Only the first {MOST_PAIRS} pairs of channels were compared to find clocks that disagree."),
+            )
+            .mend("State the channels that count: by a model, or in a file with fewer columns."),
+        );
+    }
     while let Some(late) = odd_one(&offsets, columns.len()) {
         let against = offsets.iter().filter(|o| o.pair.contains(&late));
         let Some(strongest) =

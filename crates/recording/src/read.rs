@@ -21,12 +21,10 @@ pub(crate) const TIMES: [&str; 4] = ["t", "time", "Time", "tout"];
 pub(crate) const ROOM: u64 = 2 << 30;
 
 /// Most variables or columns that a sentence names.
-#[cfg(any(feature = "mat", feature = "parquet"))]
 const TOLD: usize = 8;
 
 /// A list for a sentence, cut where it gets long.
-#[cfg(any(feature = "mat", feature = "parquet"))]
-pub(crate) fn told(mut all: Vec<String>) -> String {
+pub fn told(mut all: Vec<String>) -> String {
     if all.len() > TOLD {
         let more = all.len() - TOLD;
         all.truncate(TOLD);
@@ -85,11 +83,29 @@ pub(crate) fn bytes(path: &Path) -> Result<(Vec<u8>, String, String), RecordingE
 /// What errors call the file at `path`, and its name; an error where there is no file.
 pub(crate) fn check_file(path: &Path) -> Result<(String, String), RecordingError> {
     let label = path.display().to_string();
-    if fs::metadata(path).map_err(|source| unread(&label, source))?.is_dir() {
+    let kind = fs::metadata(path).map_err(|source| unread(&label, source))?.file_type();
+    if kind.is_dir() {
         return Err(RecordingError::IsDirectory { place: Place::file(&label) });
+    }
+    if is_device(kind) {
+        return Err(RecordingError::IsDevice { place: Place::file(&label) });
     }
     let name = path.file_name().map_or_else(|| label.clone(), |name| name.to_string_lossy().into_owned());
     Ok((label, name))
+}
+
+/// Whether it is a device, of which some never end. (A pipe is none: `<(zcat run.csv.gz)` may be read.)
+pub fn is_device(kind: fs::FileType) -> bool {
+    #[cfg(unix)]
+    {
+        use std::os::unix::fs::FileTypeExt;
+        kind.is_char_device() || kind.is_block_device()
+    }
+    #[cfg(not(unix))]
+    {
+        let _ = kind;
+        false
+    }
 }
 
 pub(crate) fn unread(label: &str, source: std::io::Error) -> RecordingError {

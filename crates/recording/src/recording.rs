@@ -142,7 +142,12 @@ impl Recording {
                 mend: "record for longer or export all samples",
             });
         }
+        check_sizes(label, &channels)?;
         let grid = grid::find(&time, resolution);
+        if !SIZES.contains(&grid.dt) {
+            let place = Place::file(label).column(0, "t");
+            return Err(RecordingError::Scale { place, what: "a sampling step", found: grid.dt });
+        }
         let (pieces, warnings) = grid::pieces(&grid, &time, &channels);
         if pieces.is_empty() {
             return Err(RecordingError::NoUsablePiece {
@@ -181,4 +186,19 @@ impl Recording {
     pub fn longest_piece(&self) -> Option<&Piece> {
         self.pieces.iter().rev().max_by_key(|piece| piece.len)
     }
+}
+
+/// Sizes that values and sampling steps may have: their squares and sums of squares stay numbers.
+const SIZES: std::ops::RangeInclusive<f64> = 1e-100..=1e100;
+
+/// No channel is larger than can be computed with, nor so small that its squares are zero.
+fn check_sizes(label: &str, channels: &[Channel]) -> Result<(), RecordingError> {
+    for (c, channel) in channels.iter().enumerate() {
+        let largest = channel.values.iter().fold(0.0f64, |most, v| most.max(v.abs()));
+        if largest != 0.0 && !SIZES.contains(&largest) {
+            let place = Place::file(label).column(c + 1, &channel.name);
+            return Err(RecordingError::Scale { place, what: "a value", found: largest });
+        }
+    }
+    Ok(())
 }

@@ -37,7 +37,7 @@ pub enum RenameError {
         found: String,
     },
     /// The file has no such channel.
-    #[error("{file}: there is no channel `{channel}`; the file has `{}`", available.join("`, `"))]
+    #[error("{file}: there is no channel `{channel}`; the file has {}", crate::told(available.iter().map(|a| format!("`{a}`")).collect()))]
     Unknown {
         /// The recording.
         file: String,

@@ -65,7 +65,7 @@ fn bad_text_is_refused_with_place_and_mend() {
         (file("u,t,y", &[]), &["bad.csv:1: ", "found `u`", "move column 2"]),
         (file("time,u,y", &[]), &["found `time`", "rename the time column to `t`"]),
         (file("t [min],u,y", &[]), &["found `t [min]`", "convert the times from min to s"]),
-        (file("t,,y", &[]), &["bad.csv:1: (column 2)", "give the column a name"]),
+        (file("t,,y", &[]), &["bad.csv:1 (column 2)", "give the column a name"]),
         (file("t,u [V,y", &[]), &["bad.csv:1:u [V (column 2)", "close the unit's bracket"]),
         (file("t,u V],y", &[]), &["open the unit's bracket"]),
         (file("0.0,1,2", &[]), &["bad.csv:1: ", "header row is missing", "`t,u [V],y [m]`"]),

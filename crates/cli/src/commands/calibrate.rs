@@ -5,6 +5,7 @@ use greybox_commands::calibrate::{FILES, Results, has_free_parameter};
 
 use crate::answer::Answer;
 use crate::arguments::{ModelStudy, Recordings};
+use crate::case::Subject;
 use crate::failure::Failure;
 use crate::progress::Progress;
 
@@ -22,6 +23,12 @@ pub(crate) struct Arguments {
 }
 
 pub(crate) fn run(arguments: &Arguments) -> Result<Answer, Failure> {
+    let study = &arguments.inputs.study;
+    let subject = Subject { model: Some(&arguments.inputs.model), ..study.subject(&FILES) };
+    study.case.around(&subject, || work(arguments))
+}
+
+fn work(arguments: &Arguments) -> Result<Answer, Failure> {
     let (loaded, recordings) = arguments.inputs.read()?;
     has_free_parameter(&loaded)?;
     let out = arguments.inputs.folder(&FILES)?;

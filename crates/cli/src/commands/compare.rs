@@ -7,6 +7,7 @@ use greybox_report::{Comparison, Report, ReportError};
 
 use crate::answer::Answer;
 use crate::failure::Failure;
+use crate::loading;
 use crate::output::OutputFolder;
 
 /// The files of a comparison.
@@ -59,8 +60,16 @@ pub(crate) fn run(arguments: &Arguments) -> Result<Answer, Failure> {
 fn read(path: &Path) -> Result<Report, Failure> {
     let file = if path.is_dir() { path.join("report.json") } else { path.to_owned() };
     let mend = "name a folder that `greybox diagnose` wrote, or its report.json";
-    let text = std::fs::read_to_string(&file)
-        .map_err(|e| Failure::file(&file, format!("cannot be read: {e}")).mend(mend))?;
-    Report::from_json(&text)
-        .map_err(|e| Failure::file(&file, format!("this is no report of a diagnosis: {e}")).mend(mend))
+    let text = loading::text(&file).map_err(|failure| failure.mend(mend))?;
+    Report::from_json(&text).map_err(|e| {
+        Failure::file(&file, format!("this is no report of a diagnosis: {}", cause(&e))).mend(mend)
+    })
+}
+
+/// What the JSON lacks; the file has another name than the reader thinks.
+fn cause(error: &ReportError) -> String {
+    match error {
+        ReportError::Json(json) => json.to_string(),
+        other => other.to_string(),
+    }
 }

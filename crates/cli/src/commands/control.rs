@@ -1,11 +1,12 @@
 //! `greybox control`: from a model to a controller, its closed loop, and its law as code.
 
-use std::path::{Path, PathBuf};
+use std::path::PathBuf;
 
 use clap::{Args, ValueEnum};
 use greybox_commands::control::{self as commands, FILES, Request};
 
 use crate::answer::Answer;
+use crate::arguments::whole;
 use crate::failure::Failure;
 use crate::loading;
 use crate::output::OutputFolder;
@@ -47,35 +48,35 @@ pub(crate) struct Arguments {
     size: Vec<String>,
 
     /// Typical size of the command
-    #[arg(long, value_name = "VALUE", default_value_t = 1.0)]
+    #[arg(long, value_name = "VALUE", default_value_t = 1.0, allow_negative_numbers = true)]
     input_size: f64,
 
     /// The actuator gives ± this at most
-    #[arg(long, value_name = "VALUE")]
+    #[arg(long, value_name = "VALUE", allow_negative_numbers = true)]
     limit: Option<f64>,
 
     /// Sample time of the law, s
-    #[arg(long, value_name = "SECONDS", default_value_t = 1e-3)]
+    #[arg(long, value_name = "SECONDS", default_value_t = 1e-3, allow_negative_numbers = true)]
     dt: f64,
 
     /// Time for each set point of the simulated square wave, s
-    #[arg(long, value_name = "SECONDS", default_value_t = 2.0)]
+    #[arg(long, value_name = "SECONDS", default_value_t = 2.0, allow_negative_numbers = true)]
     hold: f64,
 
     /// Degree of the value function (hjb)
-    #[arg(long, value_name = "EVEN", default_value_t = 4)]
+    #[arg(long, value_name = "EVEN", value_parser = even, default_value_t = 4, allow_negative_numbers = true)]
     degree: u8,
 
     /// Poles on the sliding surface are at −λ, 1/s (smc)
-    #[arg(long, value_name = "RATE", default_value_t = 10.0)]
+    #[arg(long, value_name = "RATE", default_value_t = 10.0, allow_negative_numbers = true)]
     lambda: f64,
 
     /// Pole towards the sliding surface, 1/s (smc)
-    #[arg(long, value_name = "RATE", default_value_t = 50.0)]
+    #[arg(long, value_name = "RATE", default_value_t = 50.0, allow_negative_numbers = true)]
     rate: f64,
 
     /// Reaching rate η in units of the command; ten input sizes where none is given (smc)
-    #[arg(long, value_name = "VALUE")]
+    #[arg(long, value_name = "VALUE", allow_negative_numbers = true)]
     eta: Option<f64>,
 
     /// Drop disturbances that depend on the time from the design
@@ -91,16 +92,24 @@ pub(crate) struct Arguments {
     report: Option<PathBuf>,
 
     /// Perturbed plants on which the law is tried: parameters vary as the report says, else by the model's `std`
-    #[arg(long, value_name = "N", default_value_t = 50)]
+    #[arg(long, value_name = "N", default_value_t = 50, allow_negative_numbers = true)]
     members: usize,
 
     /// Seed of the perturbed plants
-    #[arg(long, value_name = "N", default_value_t = 0)]
+    #[arg(long, value_name = "N", value_parser = whole, default_value_t = 0, allow_negative_numbers = true)]
     seed: u64,
 
     /// Folder for the results; made where it is missing
     #[arg(long, value_name = "DIR")]
     out: PathBuf,
+}
+
+/// A degree of polynomials that may be positive everywhere.
+fn even(text: &str) -> Result<u8, String> {
+    match text.parse::<u8>() {
+        Ok(degree) if degree >= 2 && degree % 2 == 0 => Ok(degree),
+        _ => Err("a value function has an even degree of 2 or more".to_owned()),
+    }
 }
 
 /// The methods, as on the command line.
@@ -129,7 +138,7 @@ pub(crate) fn run(arguments: &Arguments) -> Result<Answer, Failure> {
     let out = OutputFolder::prepare(&arguments.out)?;
     out.spares(&FILES.map(|(name, _)| name), [&arguments.model])?;
     let request = request(arguments)?;
-    let report = arguments.report.as_deref().map(read_report).transpose()?;
+    let report = arguments.report.as_deref().map(loading::text).transpose()?;
     let report = arguments.report.as_deref().zip(report.as_deref());
     let progress = Progress::open();
     let results = commands::control(&loaded, &request, report, &|what| progress.stage(what))?;
@@ -139,11 +148,6 @@ pub(crate) fn run(arguments: &Arguments) -> Result<Answer, Failure> {
     let files: Vec<String> = FILES.iter().map(|(f, _)| format!("{place}/{f}")).collect();
     let text = format!("{}Written: {}\n", results.story, files.join(", "));
     Ok(Answer::new(text, results.json))
-}
-
-fn read_report(path: &Path) -> Result<String, Failure> {
-    std::fs::read_to_string(path)
-        .map_err(|e| Failure::file(path, format!("the report cannot be read: {e}")).mend("check the path"))
 }
 
 fn request(arguments: &Arguments) -> Result<Request, Failure> {

@@ -10,7 +10,8 @@ use greybox_diagnose::Options;
 use greybox_recording::Recording;
 
 use crate::answer::Answer;
-use crate::arguments::ModelStudy;
+use crate::arguments::{BILLION, ModelStudy, whole};
+use crate::case::Subject;
 use crate::failure::Failure;
 use crate::loading::{self, LoadedModel, Mechanisms};
 use crate::progress::Progress;
@@ -22,19 +23,23 @@ use crate::progress::Progress;
   greybox diagnose link.toml run1.csv --mechanisms mine --out result
   greybox diagnose link.toml run1.mat --map \"theta=sensor_3 [deg]\" --out result
   greybox diagnose link.toml recordings --out results
+  greybox diagnose link.toml run1.csv --out result --save-case case
 
 DIR receives report.json, report.html (self-contained, with plots) and improved.toml. With no --holdout, the
 last fifth of each recording is held out. The same seed and inputs give the same results.
 
 A folder in the place of TRAIN.csv stands alone: each of its recordings (*.csv, *.mat, *.parquet) that is not held out
 is diagnosed by itself, into a folder of its own in DIR, and summary.html and summary.json say what all say together. A
-run that was ended is gone on with by the same command: what is done is not done again.")]
+run that was ended is gone on with by the same command: what is done is not done again.
+
+Something wrong? --save-case packs what another needs to see why, without one value of the recordings; with --with-data
+they are in it, and it runs again by the command in its README.md.")]
 pub(crate) struct Arguments {
     #[command(flatten)]
     inputs: ModelStudy,
 
     /// Seed of every random choice
-    #[arg(long, value_name = "N", default_value_t = 0)]
+    #[arg(long, value_name = "N", value_parser = whole, default_value_t = 0, allow_negative_numbers = true)]
     seed: u64,
 
     /// Folder of mechanisms of your own (*.toml), tried beside the built-in ones
@@ -42,11 +47,9 @@ pub(crate) struct Arguments {
     mechanisms: Option<PathBuf>,
 
     /// Most work of the search, in billions of operations; the report says when it was not enough
-    #[arg(long, value_name = "N", default_value_t = Options::default().work / BILLION)]
+    #[arg(long, value_name = "N", value_parser = whole, default_value_t = Options::default().work / BILLION, allow_negative_numbers = true)]
     work: u64,
 }
-
-const BILLION: u64 = 1_000_000_000;
 
 impl Arguments {
     fn options(&self, own: Option<&Mechanisms>) -> Options {
@@ -59,6 +62,12 @@ impl Arguments {
 }
 
 pub(crate) fn run(arguments: &Arguments) -> Result<Answer, Failure> {
+    let (study, mechanisms) = (&arguments.inputs.study, arguments.mechanisms.as_deref());
+    let subject = Subject { model: Some(&arguments.inputs.model), mechanisms, ..study.subject(&FILES) };
+    study.case.around(&subject, || work(arguments))
+}
+
+fn work(arguments: &Arguments) -> Result<Answer, Failure> {
     let own = arguments.mechanisms.as_deref().map(loading::mechanisms).transpose()?;
     let train = &arguments.inputs.study.train;
     match (train.as_slice(), train.iter().find(|path| path.is_dir())) {

@@ -2,12 +2,13 @@
 
 use clap::{Args, ValueEnum};
 use greybox_commands::identify::{FILES, Results};
-use greybox_identify::{DelayedState, Library, Monomials, Options, Streamed};
+use greybox_identify::{DelayedState, Library, MOST_WORK, Monomials, Options, Streamed};
 use greybox_model::Hold;
 use greybox_report::convert::identification::{MODEL_FILE, Sources};
 
 use crate::answer::Answer;
-use crate::arguments::{Recordings, Study};
+use crate::arguments::{BILLION, Recordings, Study, whole};
+use crate::case::Subject;
 use crate::failure::Failure;
 use crate::loading;
 use crate::progress::Progress;
@@ -77,7 +78,7 @@ pub(crate) struct Arguments {
 
     /// Read the recordings in blocks of so many rows, in constant memory, whatever their length; without --holdout
     /// the last block is held out
-    #[arg(long, value_name = "ROWS", value_parser = clap::value_parser!(u32).range(1000..))]
+    #[arg(long, value_name = "ROWS", value_parser = clap::value_parser!(u32).range(1000..), conflicts_with = "save_case")]
     block: Option<u32>,
 
     /// Resampled data sets behind the inclusion probabilities
@@ -85,8 +86,12 @@ pub(crate) struct Arguments {
     replicates: u16,
 
     /// Seed of every random choice
-    #[arg(long, value_name = "N", default_value_t = 0)]
+    #[arg(long, value_name = "N", value_parser = whole, default_value_t = 0, allow_negative_numbers = true)]
     seed: u64,
+
+    /// Most work of the fits, in billions of operations; the report says when it was not enough
+    #[arg(long, value_name = "N", value_parser = whole, default_value_t = MOST_WORK / BILLION, allow_negative_numbers = true)]
+    work: u64,
 }
 
 /// A part of the library.
@@ -140,6 +145,12 @@ impl From<Between> for Hold {
 }
 
 pub(crate) fn run(arguments: &Arguments) -> Result<Answer, Failure> {
+    let study = &arguments.study;
+    let subject = Subject { channels: (&arguments.inputs, &arguments.states), ..study.subject(&FILES) };
+    study.case.around(&subject, || work(arguments))
+}
+
+fn work(arguments: &Arguments) -> Result<Answer, Failure> {
     let options = options(arguments)?;
     let (found, recordings, out, progress) = match arguments.block {
         None => {
@@ -194,6 +205,7 @@ fn options(arguments: &Arguments) -> Result<Options, Failure> {
         delay,
         replicates: usize::from(arguments.replicates),
         seed: arguments.seed,
+        work: arguments.work.saturating_mul(BILLION),
         ..usual
     })
 }

@@ -89,7 +89,7 @@ pub(super) fn recording(
             },
             None => RecordingError::NoTime {
                 place: place(),
-                found: left_out,
+                found: if left_out.is_empty() { "nothing".to_owned() } else { left_out },
                 mend: match found.objects {
                     true => {
                         "the content of MATLAB's objects (timeseries, tables, Simulink's data sets) is not kept in a form \

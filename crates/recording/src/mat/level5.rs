@@ -158,9 +158,12 @@ impl<'a> Source<'a> {
 
     fn take(&mut self, length: usize) -> Result<&'a [u8], Fault> {
         let rest = &self.bytes[self.at..];
-        let taken = rest
-            .get(..length)
-            .ok_or_else(|| damaged("the file ends within it", self.origin + self.bytes.len()))?;
+        let taken = rest.get(..length).ok_or_else(|| {
+            damaged(
+                "a variable claims more than the file holds, which ends too early",
+                self.origin + self.bytes.len(),
+            )
+        })?;
         self.at += length;
         Ok(taken)
     }

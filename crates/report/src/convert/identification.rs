@@ -84,8 +84,22 @@ pub fn report(found: &Identification, sources: &Sources<'_>) -> IdentifyReport {
         findings: health_findings(&found.model, sources.train.iter().chain(sources.holdout)),
     };
     report.findings.extend(report.blocks.iter().flat_map(blocks));
+    report.findings.extend(found.limited.then(limit));
     report.summary = sentence::identified::summary(&report);
     report
+}
+
+/// The search ended before its end.
+fn limit() -> Finding {
+    Finding {
+        severity: Severity::Warning,
+        code: "limit".to_owned(),
+        recording: None,
+        channel: None,
+        message: "the search ended at its limit of work: the terms were not all tried, and the fit may be unfinished"
+            .to_owned(),
+        mend: Some("give it more with `--work`, a smaller library, or the input that drives the machine".to_owned()),
+    }
 }
 
 /// What reading in blocks means for the report.
