@@ -5,9 +5,11 @@ pub mod noise_model;
 pub mod problem;
 pub mod qr;
 pub mod setup;
+mod student;
 
 pub use data::{Data, DataError, Hats, PieceData, spread};
 pub use free_run::{FreeRun, Score, window_length};
 pub use noise_model::Autoregression;
 pub use problem::{Ending, Fit, Free, Limits, Point, Problem, Segment, SegmentRows, StartPrior, Work};
 pub use setup::{Level, Setup, UnknownState, free_parameters};
+pub use student::student_quantile;

@@ -364,10 +364,12 @@ impl Problem<'_> {
             let y = &measured[c][segment.range.clone()];
             for k in 0..n {
                 let e = (y[k] - trajectory.y[c * n + k]) * inverse;
-                r[c * n + k] = match y[k].is_nan() {
-                    true => 0.0,
-                    false if e.is_finite() => e,
-                    false => UNDEFINED,
+                r[c * n + k] = if y[k].is_nan() {
+                    0.0
+                } else if e.is_finite() {
+                    e
+                } else {
+                    UNDEFINED
                 };
             }
         }

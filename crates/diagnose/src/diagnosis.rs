@@ -5,7 +5,8 @@ use std::ops::Deref;
 use std::sync::Arc;
 
 use greybox_calibrate::{
-    Data, DataError, FreeRun, Limits, Point, Score, Setup, Work, free_parameters, qr, window_length,
+    Data, DataError, FreeRun, Limits, Point, Score, Setup, Work, free_parameters, qr, student_quantile,
+    window_length,
 };
 use greybox_model::system::CompileError;
 use greybox_model::{Expr, Func, Hold, Model};
@@ -669,8 +670,7 @@ impl Uncertainty {
         let variance = rss / (count.saturating_sub(np)).max(1) as f64;
         let blocks = scores.len();
         let freedom = (blocks as f64 - np as f64).max(2.0);
-        use statrs::distribution::{ContinuousCDF, StudentsT};
-        let t = StudentsT::new(0.0, 1.0, freedom).map_or(2.0, |s| s.inverse_cdf(0.975));
+        let t = student_quantile(freedom);
         let moved: Vec<Vec<f64>> =
             scores.iter().map(|s| inverse.iter().map(|row| qr::dot(row, s)).collect()).collect();
         let inflate = blocks as f64 / freedom;

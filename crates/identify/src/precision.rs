@@ -1,6 +1,6 @@
 //! How precise the coefficients are, and how sure the choice of terms.
 
-use greybox_calibrate::qr;
+use greybox_calibrate::{qr, student_quantile};
 use rand::RngExt;
 use rand_pcg::Pcg64Mcg;
 use rayon::prelude::*;
@@ -117,17 +117,6 @@ pub(crate) fn assess(
     }
 }
 
-/// The 97.5 % quantile of Student's t. From 10⁶ degrees of freedom on it is the normal one, which differs by 2.4e-6;
-/// the search for the inverse of its distribution does not end where they are 10⁸.
-fn quantile(freedom: f64) -> f64 {
-    use statrs::distribution::{ContinuousCDF, StudentsT};
-    let normal = 1.959_963_984_540_054;
-    if freedom >= 1e6 {
-        return normal;
-    }
-    StudentsT::new(0.0, 1.0, freedom.max(1.0)).map_or(normal, |t| t.inverse_cdf(0.975))
-}
-
 /// Standard deviations by the cluster-robust sandwich (RᵀR)⁻¹ Σ g gᵀ (RᵀR)⁻¹, g the gradients summed over
 /// blocks of consecutive rows.
 fn sandwich(gradients: &[Vec<f64>], inverse: &[f64], np: usize) -> Vec<f64> {
@@ -184,10 +173,10 @@ impl Spread {
         let mut spread = Spread { inverse: qr::invert_triangle(triangle, np), variance, half: Vec::new() };
         let gauss = (0..np).map(|i| spread.covariance(i, i).sqrt());
         spread.half = if gradients.is_empty() {
-            gauss.map(|g| quantile(freedom) * g).collect()
+            gauss.map(|g| student_quantile(freedom) * g).collect()
         } else {
             let robust = sandwich(gradients, &spread.inverse, np);
-            gauss.zip(robust).map(|(g, s)| quantile(BLOCKS as f64 - 1.0) * s.max(g)).collect()
+            gauss.zip(robust).map(|(g, s)| student_quantile(BLOCKS as f64 - 1.0) * s.max(g)).collect()
         };
         spread
     }
@@ -239,17 +228,4 @@ pub(crate) fn inclusion(
             })
         })
         .collect()
-}
-
-#[cfg(test)]
-mod tests {
-    use super::*;
-
-    #[test]
-    fn the_quantile_ends_for_any_number_of_samples() {
-        assert!((quantile(10.0) - 2.228_138_852).abs() < 1e-8);
-        for freedom in [1e6, 1e8, 1e12] {
-            assert!((quantile(freedom) - 1.959_964).abs() < 3e-6, "{freedom}");
-        }
-    }
 }

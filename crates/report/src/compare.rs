@@ -75,15 +75,18 @@ pub struct Change {
 
 impl Change {
     fn of(before: Option<Estimate>, after: Option<Estimate>) -> Change {
-        let half = |e: &Option<Estimate>| e.as_ref()?.ci95.map(|c| c.half_width()).filter(|h| h.is_finite());
-        let value = |e: &Option<Estimate>| e.as_ref().map(|e| e.value).filter(|v| v.is_finite());
-        // Another unit, another quantity.
-        let same = matches!((&before, &after), (Some(a), Some(b)) if a.unit == b.unit);
-        let changed = match (value(&before), value(&after), half(&before), half(&after)) {
-            (Some(a), Some(b), Some(ha), Some(hb)) if same => Some((b - a).abs() > ha.hypot(hb)),
-            _ => None,
-        };
-        Change { before, after, changed }
+        let mut change = Change { before, after, changed: None };
+        change.changed = change.difference().map(|(by, half)| by.abs() > half);
+        change
+    }
+
+    /// After minus before, and the half-width of its 95 % interval; none where an interval is missing or the units
+    /// differ.
+    pub(crate) fn difference(&self) -> Option<(f64, f64)> {
+        let (a, b) = (self.before.as_ref()?, self.after.as_ref()?);
+        let half = a.ci95?.half_width().hypot(b.ci95?.half_width());
+        let by = b.value - a.value;
+        (a.unit == b.unit && by.is_finite() && half.is_finite()).then_some((by, half))
     }
 }
 

@@ -1221,15 +1221,20 @@ fn marked_tokens(old: &str, new: &str) -> String {
     out
 }
 
+/// A severity in a word, and its class on the page.
+fn severity(of: Severity) -> (&'static str, &'static str) {
+    match of {
+        Severity::Info => ("note", "info"),
+        Severity::Warning => ("warning", "warning"),
+        Severity::Error => ("error", "error"),
+    }
+}
+
 fn findings(found: &[Finding]) -> Vec<FindingView> {
     let mut sorted: Vec<&Finding> = found.iter().collect();
     sorted.sort_by_key(|finding| std::cmp::Reverse(finding.severity));
     let view = sorted.into_iter().map(|finding| {
-        let (severity, class) = match finding.severity {
-            Severity::Info => ("note", "info"),
-            Severity::Warning => ("warning", "warning"),
-            Severity::Error => ("error", "error"),
-        };
+        let (severity, class) = severity(finding.severity);
         let place: Vec<&str> =
             finding.recording.as_deref().into_iter().chain(finding.channel.as_deref()).collect();
         FindingView {

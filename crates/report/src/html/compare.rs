@@ -2,9 +2,9 @@
 
 use askama::Template;
 
-use super::{Assets, Common};
+use super::{Assets, Common, severity};
 use crate::compare::{Change, Comparison, Errors, MechanismChange, Run, Weight};
-use crate::contract::{Estimate, Finding, Interval, Severity};
+use crate::contract::{Estimate, Finding, Interval};
 use crate::sentence::comparison as words;
 use crate::sentence::recordings::place;
 use crate::{ReportError, expression, format, svg};
@@ -202,11 +202,9 @@ fn row(name: &str, change: &Change) -> RowView {
 
 /// `+0.030 ± 0.006, changed`; empty where nothing can be said.
 fn difference(change: &Change) -> String {
-    let (Some(changed), Some(a), Some(b)) = (change.changed, &change.before, &change.after) else {
+    let (Some(changed), Some((by, half))) = (change.changed, change.difference()) else {
         return String::new();
     };
-    let half = |e: &Estimate| e.ci95.map_or(f64::NAN, |c| c.half_width());
-    let (by, half) = (b.value - a.value, half(a).hypot(half(b)));
     let sign = if by > 0.0 { "+" } else { "" };
     let by = format::cell(by, Some(Interval::new(by - half, by + half)));
     format!("{sign}{by}, {}", if changed { "changed" } else { "within the intervals" })
@@ -221,11 +219,6 @@ fn errors(of: Option<Errors>) -> [String; 4] {
 
 fn finding(f: &Finding) -> String {
     let place: Vec<&str> = [f.recording.as_deref(), f.channel.as_deref()].into_iter().flatten().collect();
-    let severity = match f.severity {
-        Severity::Info => "note",
-        Severity::Warning => "warning",
-        Severity::Error => "error",
-    };
     let place = if place.is_empty() { String::new() } else { format!("{}: ", place.join(", ")) };
-    format!("{severity}: {place}{}", f.message)
+    format!("{}: {place}{}", severity(f.severity).0, f.message)
 }
