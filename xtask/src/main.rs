@@ -4,6 +4,8 @@
 #![allow(clippy::print_stdout, clippy::print_stderr)]
 
 mod bench;
+#[cfg(test)]
+mod corpus;
 mod demo;
 mod docs;
 mod package;
@@ -11,6 +13,8 @@ mod process;
 mod prove;
 mod readme;
 mod reproduce;
+#[cfg(test)]
+mod supply;
 #[cfg(test)]
 mod tidy;
 

@@ -69,14 +69,16 @@ fn calibrate() {
 #[test]
 fn identify() {
     let files = ["model.toml", "report.html", "report.json"];
-    let request = ["identify", "run1.csv", "run2.csv", "--states", "x", "--inputs", "f", "--seed", "4", "--out"];
+    let request =
+        ["identify", "run1.csv", "run2.csv", "--states", "x", "--inputs", "f", "--seed", "4", "--out"];
     the_same_whatever_the_threads(&bench(), &request, &files);
 }
 
 /// Row by row through a file, in as many blocks at a time as there are threads for.
 #[test]
 fn identify_in_blocks() {
-    let request = ["identify", "run1.csv", "run2.csv", "--states", "x", "--inputs", "f", "--block", "100", "--out"];
+    let request =
+        ["identify", "run1.csv", "run2.csv", "--states", "x", "--inputs", "f", "--block", "100", "--out"];
     the_same_whatever_the_threads(&bench(), &request, &["model.toml", "report.json"]);
 }
 
@@ -98,8 +100,25 @@ fn control() {
     );
     for method in ["lqr", "hjb", "smc"] {
         let request = [
-            "control", "arm.toml", "--method", method, "--to", "0.8", "--size", "theta=0.4", "--size", "theta'=4",
-            "--input-size", "5", "--limit", "10", "--dt", "0.002", "--members", "10", "--out",
+            "control",
+            "arm.toml",
+            "--method",
+            method,
+            "--to",
+            "0.8",
+            "--size",
+            "theta=0.4",
+            "--size",
+            "theta'=4",
+            "--input-size",
+            "5",
+            "--limit",
+            "10",
+            "--dt",
+            "0.002",
+            "--members",
+            "10",
+            "--out",
         ];
         let files = ["law.c", "law.rs", "report.html", "report.json", "vectors.csv"];
         the_same_whatever_the_threads(&bench, &request, &files);
