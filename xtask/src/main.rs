@@ -1,7 +1,7 @@
 //! Developer commands: `cargo xtask prove | reproduce | bench | docs | ci`.
 
-// This is a command: its answers go to standard output, its complaints to standard error.
-#![allow(clippy::print_stdout, clippy::print_stderr)]
+// This is a command that measures: its answers go to standard output, its complaints to standard error.
+#![allow(clippy::disallowed_methods, clippy::print_stdout, clippy::print_stderr)]
 
 mod bench;
 #[cfg(test)]
