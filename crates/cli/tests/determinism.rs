@@ -74,12 +74,13 @@ fn identify() {
     the_same_whatever_the_threads(&bench(), &request, &files);
 }
 
-/// Row by row through a file, in as many blocks at a time as there are threads for.
+/// Block by block through a file, in as many blocks at a time as there are threads for.
 #[test]
 fn identify_in_blocks() {
-    let request =
-        ["identify", "run1.csv", "run2.csv", "--states", "x", "--inputs", "f", "--block", "100", "--out"];
-    the_same_whatever_the_threads(&bench(), &request, &["model.toml", "report.json"]);
+    let bench = Bench::empty();
+    bench.write("long.csv", &recording(6500, 0.0));
+    let request = ["identify", "long.csv", "--states", "x", "--inputs", "f", "--block", "1000", "--out"];
+    the_same_whatever_the_threads(&bench, &request, &["model.toml", "report.json"]);
 }
 
 #[test]
