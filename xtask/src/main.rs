@@ -1,9 +1,11 @@
 //! Developer commands: `cargo xtask prove | reproduce | bench | docs | ci`.
 
-// This is a command: its answers go to standard output, its complaints to standard error.
-#![allow(clippy::print_stdout, clippy::print_stderr)]
+// This is a command that measures: its answers go to standard output, its complaints to standard error.
+#![allow(clippy::disallowed_methods, clippy::print_stdout, clippy::print_stderr)]
 
 mod bench;
+#[cfg(test)]
+mod corpus;
 mod demo;
 mod docs;
 mod package;
@@ -11,6 +13,8 @@ mod process;
 mod prove;
 mod readme;
 mod reproduce;
+#[cfg(test)]
+mod supply;
 #[cfg(test)]
 mod tidy;
 

@@ -114,8 +114,8 @@ pub(crate) fn run(root: &Path, arguments: &Arguments) -> Result<Ending> {
         return conclude(&outcomes, arguments.json.as_deref());
     }
     if arguments.statistics {
-        let found = statistics::run(arguments.seed, arguments.count, arguments.only.as_deref())?;
-        return conclude(&found.outcomes, arguments.json.as_deref());
+        let outcomes = statistics::run(arguments.seed, arguments.count, arguments.only.as_deref())?;
+        return conclude(&outcomes, arguments.json.as_deref());
     }
     let folder = match &arguments.recordings {
         Some(given) if given.is_dir() => given.clone(),

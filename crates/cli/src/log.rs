@@ -1,4 +1,5 @@
 //! `--log`: what is being done, on standard error, and what it cost.
+#![allow(clippy::disallowed_methods, reason = "it tells times, in no result")]
 
 use std::fmt::Write as _;
 use std::io::Write as _;

@@ -150,27 +150,6 @@ fn rows_outside_the_pieces_stay_empty() {
     assert_eq!(empty, [200, 201, 202, 203]);
 }
 
-#[test]
-fn results_do_not_depend_on_the_number_of_threads() {
-    let bench = bench();
-    let without_damping =
-        MODEL.replace("b*x' + ", "").replace("b = { value = 0.5, unit = \"N s/m\" } # a guess\n", "");
-    bench.write("model.toml", &without_damping);
-    for command in ["calibrate", "diagnose"] {
-        for (threads, out) in [("1", "a"), ("2", "b"), ("2", "c")] {
-            let out = format!("{command}/{out}");
-            let arguments = [command, "model.toml", "run1.csv", "run2.csv", "--out", &out];
-            let outcome = bench.greybox_with(&arguments, &[("RAYON_NUM_THREADS", threads)]);
-            assert_eq!(outcome.code, 0, "{}", outcome.stderr);
-        }
-        for file in names(&bench.path(&format!("{command}/a"))) {
-            let first = bench.read(&format!("{command}/a/{file}"));
-            assert_eq!(first, bench.read(&format!("{command}/b/{file}")), "{file}");
-            assert_eq!(first, bench.read(&format!("{command}/c/{file}")), "{file}");
-        }
-    }
-}
-
 // --- Refusals ----------------------------------------------------------------------------------------------
 
 /// Every command that reads a model and a recording.

@@ -246,19 +246,6 @@ fn a_delay_has_its_interval_and_its_bound() {
 }
 
 #[test]
-fn equal_requests_give_equal_files() {
-    let bench = bench();
-    for (threads, out) in [("1", "a"), ("2", "b")] {
-        let request = [&DUFFING as &[&str], &["--seed", "4", "--out", out]].concat();
-        let outcome = bench.greybox_with(&request, &[("RAYON_NUM_THREADS", threads)]);
-        assert_eq!(outcome.code, 0, "{}", outcome.stderr);
-    }
-    for file in names(&bench.path("a")) {
-        assert_eq!(bench.read(&format!("a/{file}")), bench.read(&format!("b/{file}")), "{file}");
-    }
-}
-
-#[test]
 fn requests_that_cannot_be_met() {
     let bench = Bench::empty();
     let motion = duffing(["f [N]", "x [m]"], 1.0, 10.0, 0.0);

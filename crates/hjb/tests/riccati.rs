@@ -1,5 +1,5 @@
 //! Riccati equations: the CAREX and DAREX collections, invariances, and input that has no answer.
-#![allow(missing_docs, clippy::unwrap_used)]
+#![allow(missing_docs, clippy::disallowed_methods, clippy::unwrap_used)]
 
 use std::path::PathBuf;
 

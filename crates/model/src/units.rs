@@ -122,7 +122,7 @@ const PREFIXES: &[(&str, f64)] = &[
 /// Deepest nesting of parentheses in a unit.
 const MAX_NESTING: usize = 16;
 
-/// Largest magnitude of an exponent as written.
+/// Largest magnitude of an exponent, as written and of a base unit in the whole.
 const MAX_EXPONENT: f64 = 100.0;
 
 impl Dimension {
@@ -226,6 +226,14 @@ impl Unit {
             return Err(unit_error(
                 0..text.len(),
                 "the unit's factor to SI overflows",
+                Some("use a smaller exponent"),
+            ));
+        }
+        // Within it, the unit can be written in SI and read again.
+        if dimension.0.iter().any(|e| e.abs() > MAX_EXPONENT) {
+            return Err(unit_error(
+                0..text.len(),
+                format!("a base unit stands to a power above {MAX_EXPONENT} in it"),
                 Some("use a smaller exponent"),
             ));
         }
@@ -503,6 +511,10 @@ fn si_text(dimension: Dimension) -> String {
                 factors.push((symbol, e));
             }
         }
+        // What [`Unit::parse`] would not read.
+        if !derived.is_empty() && factors.iter().any(|(_, e)| e.abs() > MAX_EXPONENT) {
+            continue;
+        }
         // A factor costs one, each further power half, and a text without numerator a little.
         let mut cost: f64 = factors
             .iter()
@@ -650,6 +662,25 @@ mod tests {
             if text != "V^(1/3)" {
                 assert_eq!(si.text, expected);
             }
+        }
+    }
+
+    /// Found by the fuzzer: the shortest text of a high power had exponents that are not read.
+    #[test]
+    fn a_unit_that_is_read_is_written_in_si_and_read_again() {
+        for symbol in ["\u{3a9}", "F", "V", "W", "H", "S"] {
+            for power in (-50..=50).filter(|p| *p != 0) {
+                let text = format!("{symbol}^{power}");
+                let Ok(unit) = Unit::parse(&text) else { continue };
+                let si = Unit::si(unit.dimension);
+                let again = Unit::parse(&si.text).unwrap_or_else(|e| panic!("{text} is {si}: {e}"));
+                assert!(again.dimension.same(&unit.dimension), "{text} is {si}");
+            }
+        }
+        for text in ["mg \u{3a9}^41", "m^99 m^2", "(m^11)^10"] {
+            let error = Unit::parse(text).unwrap_err();
+            assert_eq!(error.span, 0..text.len());
+            assert!(error.to_string().contains("power above 100"), "{error}");
         }
     }
 }

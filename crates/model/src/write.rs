@@ -6,6 +6,9 @@ use crate::parse::{parse, parse_equation};
 use crate::units::Unit;
 use toml_edit::{Array, DocumentMut, InlineTable, Item, Table, TableLike, Value};
 
+/// The byte order mark.
+const MARK: char = '\u{feff}';
+
 /// How [`Model::to_toml`] writes.
 #[derive(Debug, Clone, Default)]
 pub struct WriteOptions<'a> {
@@ -79,7 +82,13 @@ impl Model {
             space_sections(root);
         }
         let text = document.to_string();
-        if newline == "\r\n" { text.replace("\r\n", "\n").replace('\n', "\r\n") } else { text }
+        let text = if newline == "\r\n" { text.replace("\r\n", "\n").replace('\n', "\r\n") } else { text };
+        // Editors of Windows begin a file with a byte order mark.
+        if !fresh && options.original.is_some_and(|t| t.starts_with(MARK)) {
+            format!("{MARK}{text}")
+        } else {
+            text
+        }
     }
 
     /// Whether this measurement is the state's own channel and needs no entry.

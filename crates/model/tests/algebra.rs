@@ -83,6 +83,67 @@ fn at(e: &Expr, x: f64, v: f64) -> f64 {
     e.eval(&value).expect("only x and x' occur")
 }
 
+/// A value and its slope, by rules of its own; `near` keeps the smallest distance to a kink or a jump.
+fn dual(e: &Expr, of: &dyn Fn(&str, u8) -> (f64, f64), near: &mut f64) -> (f64, f64) {
+    match e {
+        Expr::Num(v) => (*v, 0.0),
+        Expr::Var { name, primes } => of(name, *primes),
+        Expr::Neg(a) => {
+            let (a, da) = dual(a, of, near);
+            (-a, -da)
+        }
+        Expr::Bin(op, a, b) => {
+            let ((a, da), (b, db)) = (dual(a, of, near), dual(b, of, near));
+            match op {
+                BinOp::Add => (a + b, da + db),
+                BinOp::Sub => (a - b, da - db),
+                BinOp::Mul => (a * b, da * b + a * db),
+                BinOp::Div => (a / b, (da * b - a * db) / (b * b)),
+                BinOp::Pow if db == 0.0 => (a.powf(b), b * a.powf(b - 1.0) * da),
+                BinOp::Pow => (a.powf(b), a.powf(b) * (db * a.ln() + b * da / a)),
+            }
+        }
+        Expr::Call(f, args) => {
+            let (a, da) = dual(&args[0], of, near);
+            let (b, db) = args.get(1).map_or((0.0, 0.0), |b| dual(b, of, near));
+            let mut kink = |at: f64| *near = near.min(at.abs());
+            match f {
+                Func::Sin => (a.sin(), a.cos() * da),
+                Func::Cos => (a.cos(), -a.sin() * da),
+                Func::Tan => (a.tan(), da / a.cos().powi(2)),
+                Func::Exp => (a.exp(), a.exp() * da),
+                Func::Ln => (a.ln(), da / a),
+                Func::Sqrt => (a.sqrt(), da / (2.0 * a.sqrt())),
+                Func::Tanh => (a.tanh(), da / a.cosh().powi(2)),
+                Func::Atan => (a.atan(), da / (1.0 + a * a)),
+                Func::Delay => (a, da),
+                Func::Abs | Func::Sign => {
+                    kink(a);
+                    if *f == Func::Abs { (a.abs(), a.signum() * da) } else { (a.signum(), 0.0) }
+                }
+                Func::Min | Func::Max => {
+                    kink(a - b);
+                    if (a < b) == (*f == Func::Min) { (a, da) } else { (b, db) }
+                }
+                Func::Deadzone | Func::Saturate => {
+                    kink(a.abs() - b);
+                    let (beyond, slope) = (a - a.signum() * b, da - a.signum() * db);
+                    match (a.abs() > b, *f == Func::Deadzone) {
+                        (true, true) => (beyond, slope),
+                        (true, false) => (a - beyond, da - slope),
+                        (false, true) => (0.0, 0.0),
+                        (false, false) => (a, da),
+                    }
+                }
+                Func::Step => {
+                    kink(a - b);
+                    (f64::from(u8::from(a >= b)), 0.0)
+                }
+            }
+        }
+    }
+}
+
 fn close(a: f64, b: f64) -> bool {
     (a - b).abs() <= 1e-9 * (1.0 + a.abs().max(b.abs()))
 }
@@ -123,6 +184,19 @@ proptest! {
         prop_assume!(scale < 1e4 && (left - right).abs() < 1e-3 * scale);
         let exact = at(&e.derivative("x", 0), x, v);
         prop_assert!((exact - (left + right) / 2.0).abs() < 2e-3 * scale, "d/dx {e} = {}: {exact}, {left}", e.derivative("x", 0));
+    }
+
+    #[test]
+    fn derivative_agrees_with_dual_numbers(e in smooth_expr(), x in -2.0..2.0f64, v in -2.0..2.0f64) {
+        for (primes, name) in [(0u8, "x"), (1, "x'")] {
+            let of = |_: &str, p: u8| if p == 0 { (x, f64::from(1 - primes)) } else { (v, f64::from(primes)) };
+            let mut near = f64::INFINITY;
+            let (value, slope) = dual(&e, &of, &mut near);
+            prop_assume!(near > 1e-9 && slope.is_finite() && slope.abs() < 1e9 && value.abs() < 1e9);
+            let exact = e.derivative("x", primes);
+            let found = at(&exact, x, v);
+            prop_assert!((found - slope).abs() <= 1e-7 * (1.0 + value.abs() + slope.abs()), "d/d{name} {e} = {exact}: {found} {slope}");
+        }
     }
 
     #[test]

@@ -48,6 +48,9 @@ fn an_unchanged_model_is_the_same_text() {
     assert_eq!(write(&model, &text), text);
     let windows = text.replace('\n', "\r\n");
     assert_eq!(write(&load(&windows), &windows), windows);
+    // As the editors of Windows begin a file; found by the fuzzer.
+    let marked = format!("\u{feff}{windows}");
+    assert_eq!(write(&load(&marked), &marked), marked);
 }
 
 #[test]

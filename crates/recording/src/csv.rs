@@ -500,12 +500,12 @@ pub(crate) fn header_cell(
 ) -> Result<(String, Option<String>), RecordingError> {
     let refuse = |mend| RecordingError::HeaderCell { place: place(), found: cell.to_owned(), mend };
     let (name, unit) = match cell.split_once('[') {
-        Some((name, rest)) => match rest.strip_suffix(']') {
+        Some((name, rest)) if !name.contains(']') => match rest.strip_suffix(']') {
             Some(unit) if !unit.contains(['[', ']']) => (name.trim(), Some(unit.trim())),
             _ => return Err(refuse("close the unit's bracket at the end of the cell")),
         },
-        None if cell.contains(']') => return Err(refuse("open the unit's bracket with `[`")),
-        None => (cell, None),
+        _ if cell.contains(']') => return Err(refuse("open the unit's bracket with `[`")),
+        _ => (cell, None),
     };
     if name.is_empty() {
         return Err(refuse("give the column a name, or delete it"));

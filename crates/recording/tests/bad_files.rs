@@ -68,6 +68,8 @@ fn bad_text_is_refused_with_place_and_mend() {
         (file("t,,y", &[]), &["bad.csv:1 (column 2)", "give the column a name"]),
         (file("t,u [V,y", &[]), &["bad.csv:1:u [V (column 2)", "close the unit's bracket"]),
         (file("t,u V],y", &[]), &["open the unit's bracket"]),
+        // Found by the fuzzer: it could be read, and not be read again.
+        (file("t,u] [],y", &[]), &["open the unit's bracket"]),
         (file("0.0,1,2", &[]), &["bad.csv:1: ", "header row is missing", "`t,u [V],y [m]`"]),
         ("t\n0\n1\n".into(), &["no column beside the time"]),
     ];

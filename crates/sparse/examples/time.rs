@@ -1,5 +1,5 @@
 //! The time of Algorithm 1 at full size: `cargo run --release -p greybox-sparse --example time`.
-#![allow(clippy::single_range_in_vec_init, clippy::print_stdout)]
+#![allow(clippy::disallowed_methods, clippy::single_range_in_vec_init, clippy::print_stdout)]
 
 use std::time::Instant;
 

@@ -95,8 +95,8 @@ fn draw(seed: u64, effect: Option<Effect>, noise: Noise, level: (f64, f64)) -> R
     let truth = [around(1.0), around(0.6), around(40.0)];
     let effect = effect.map(|e| (e, random.random_range(e.strength.0..e.strength.1)));
     let level = (random.random_range(level.0.ln()..=level.1.ln())).exp();
-    let train = record(&mut random, &truth, effect, noise, level, 2000)?;
-    let holdout = record(&mut random, &truth, effect, noise, level, 1000)?;
+    let train = record(&mut random, &truth, effect, noise, level, 1200)?;
+    let holdout = record(&mut random, &truth, effect, noise, level, 600)?;
     Ok(Drawn { truth, effect, train, holdout })
 }
 
@@ -196,13 +196,6 @@ fn named(drawn: &Drawn, (effect, strength): (Effect, f64), diagnosis: &Diagnosis
     }
     let first = diagnosis.mechanisms.first().map(|f| (f.confidence, f.kind == effect.kind));
     Named { first, covered }
-}
-
-/// All that is measured.
-pub(crate) struct Statistics {
-    seeds: usize,
-    pub(crate) outcomes: Vec<Outcome>,
-    bins: Vec<Bin>,
 }
 
 /// Answers whose confidence lies in one bin.
@@ -339,14 +332,14 @@ fn bin_figures(bins: &[Bin]) -> Vec<Figure> {
 }
 
 /// Runs everything on `count` seeds (400 otherwise).
-pub(crate) fn run(first: u64, count: Option<usize>, only: Option<&str>) -> Result<Statistics> {
+pub(crate) fn run(first: u64, count: Option<usize>, only: Option<&str>) -> Result<Vec<Outcome>> {
     let n = count.unwrap_or(SEEDS);
     let seeds: Vec<u64> = (0..n as u64).map(|i| first.wrapping_mul(7_368_787).wrapping_add(i)).collect();
-    let mut statistics = Statistics { seeds: n, outcomes: Vec::new(), bins: Vec::new() };
+    let mut outcomes = Vec::new();
     let mut case = |name: &str, work: &mut dyn FnMut() -> Result<Vec<Figure>>| -> Result<()> {
         if only.is_none_or(|o| name.contains(o)) {
             eprintln!("{name} ({n} seeds) …");
-            statistics.outcomes.push(Outcome { case: name.to_owned(), figures: work()? });
+            outcomes.push(Outcome { case: name.to_owned(), figures: work()? });
         }
         Ok(())
     };
@@ -367,10 +360,56 @@ pub(crate) fn run(first: u64, count: Option<usize>, only: Option<&str>) -> Resul
         note(&found);
         Ok(effect_figures(&found))
     })?;
-    let bins = bins(&answers);
     if !answers.is_empty() {
-        statistics.outcomes.push(Outcome { case: "confidence".into(), figures: bin_figures(&bins) });
+        outcomes.push(Outcome { case: "confidence".into(), figures: bin_figures(&bins(&answers)) });
     }
-    statistics.bins = bins;
-    Ok(statistics)
+    Ok(outcomes)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn confidence_is_honest_up_to_the_scatter_of_the_answers() {
+        let answers = |right: usize, wrong: usize, confidence: f64| -> Vec<(f64, bool)> {
+            let mut all = vec![(confidence, true); right];
+            all.extend(vec![(confidence, false); wrong]);
+            all
+        };
+        let bin = |answers: &[(f64, bool)]| bins(answers).into_iter().find(|b| b.answers > 0).unwrap();
+        let good = bin(&answers(80, 20, 0.8));
+        assert_eq!((good.low, good.high, good.answers, good.right), (0.7, 0.9, 100, 80));
+        // Wilson's interval of 80 of 100.
+        let (low, high) = good.interval();
+        assert!((low - 0.7112).abs() < 1e-4 && (high - 0.8666).abs() < 1e-4, "{low} {high}");
+        assert!(good.is_honest() && bin(&answers(95, 5, 0.8)).is_honest());
+        assert!(!bin(&answers(60, 40, 0.8)).is_honest());
+        assert_eq!(bin(&answers(3, 0, 1.0)).high, 1.0);
+    }
+
+    #[test]
+    fn an_interval_that_holds_its_truth_is_counted() {
+        let mut covered = Covered::default();
+        for interval in [Some((0.9, 1.1)), Some((1.05, 1.2)), None] {
+            covered.count(1.0, interval);
+        }
+        assert_eq!((covered.held, covered.all), (1, 2));
+    }
+
+    #[test]
+    fn the_machine_moves_as_its_equation_says() {
+        let mut random = Pcg64Mcg::seed_from_u64(1);
+        let truth = [1.0, 0.6, 40.0];
+        let recording = record(&mut random, &truth, None, Noise::White, 0.0, 400).unwrap();
+        let column = |name: &str| recording.channel(name).unwrap().values.clone();
+        let (f, x) = (column("f"), column("x"));
+        // Central differences, whose error is dt²/12 times the fourth derivative.
+        let (dt, size) = (0.01, f.iter().fold(0.0_f64, |a, b| a.max(b.abs())));
+        for i in 1..399 {
+            let (rate, bend) =
+                ((x[i + 1] - x[i - 1]) / (2.0 * dt), (x[i + 1] - 2.0 * x[i] + x[i - 1]) / (dt * dt));
+            assert!((bend + 0.6 * rate + 40.0 * x[i] - f[i]).abs() < 0.01 * size, "sample {i}");
+        }
+    }
 }
