@@ -1,5 +1,6 @@
 //! The corpus of the fuzz targets (`fuzz/corpus`), replayed on a stable compiler.
 
+#[allow(unreachable_pub, reason = "a library of its own elsewhere")]
 #[path = "../../fuzz/src/lib.rs"]
 mod targets;
 

@@ -425,6 +425,7 @@ mod tests {
             fs::create_dir(path).unwrap();
             fs::write(path.join("report.json"), "half").unwrap();
         }
+        #[allow(clippy::disallowed_methods, reason = "the age of a file")]
         let past = std::time::SystemTime::now() - 2 * FORGOTTEN;
         for path in [&left, &held] {
             File::open(path).unwrap().set_modified(past).unwrap();

@@ -6,7 +6,7 @@
 // The words of the operating system stand in the page.
 #![cfg(target_os = "linux")]
 // Helpers of a test file are tests too; the lint configuration knows only the annotated functions.
-#![allow(missing_docs, clippy::unwrap_used)]
+#![allow(clippy::disallowed_methods, missing_docs, clippy::unwrap_used)]
 
 use std::fmt::Write as _;
 use std::fs;

@@ -4,6 +4,7 @@
 use common::{Bench, names};
 use spring::{MODEL, recording};
 
+#[allow(dead_code)]
 mod common;
 #[path = "common/spring.rs"]
 mod spring;
