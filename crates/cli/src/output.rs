@@ -304,8 +304,11 @@ impl Kept {
 
 /// Sees that what stands at `path`, if anything, may be replaced: a folder or a device may not.
 fn ordinary(path: &Path) -> Result<(), Failure> {
-    if path.exists() && !path.is_file() {
-        let what = if path.is_dir() { "this is a folder" } else { "this is a device, not an ordinary file" };
+    // Asked once: another run may take the file away meanwhile.
+    if let Ok(found) = fs::metadata(path)
+        && !found.is_file()
+    {
+        let what = if found.is_dir() { "this is a folder" } else { "this is a device, not an ordinary file" };
         return Err(Failure::file(path, format!("{what}, but the result is one file"))
             .mend("name another place after `--out`, such as `simulated.csv`"));
     }
