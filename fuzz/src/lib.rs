@@ -229,7 +229,7 @@ struct Choices<'a>(&'a [u8]);
 const EQUATIONS: [&str; 6] = [
     "m*x'' + c*x' + k*x = u",
     "m*x'' + c*sign(x') + k*x = u",
-    "m*x'' + c*x' + k*sin(x) = delay(u, 0.03)",
+    "m*x'' + c*x' + k*sin(x) = delay(u, tau)",
     "m*x' + c*x + k*x^3 = saturate(u, 0.5)",
     "m*x'' + c*abs(x')*x' + k*deadzone(x, 0.1) = u",
     "m*x'' + c*x' + k*sqrt(x) = u",
@@ -259,6 +259,9 @@ impl Choices<'_> {
             let value = self.value();
             let fixed = if free >> k & 1 == 1 { ", fixed = true" } else { "" };
             parameters += &format!("{name} = {{ value = {value:?}{fixed} }}\n");
+        }
+        if equation.contains("tau") {
+            parameters += "tau = { value = 0.03, unit = \"s\", fixed = true }\n";
         }
         format!(
             "[inputs]\nu = {{ hold = \"{hold}\" }}\n[states]\nx = {{}}\n[parameters]\n{parameters}[equations]\n\
