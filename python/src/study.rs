@@ -56,7 +56,7 @@ pub(crate) fn diagnose<'py>(
             work: work.map_or(usual.work, |work| work.saturating_mul(BILLION)),
         };
         let found = greybox_diagnose::diagnose(&loaded.model, &train, &holdout, &options, watch)
-.map_err(|e| Failure::diagnosis(&loaded.path, e))?;
+            .map_err(|e| Failure::diagnosis(&loaded.path, e))?;
         watch.stage("writing the report");
         diagnosis::Results::of(&found, &loaded, &train, &holdout)
     })?;
@@ -188,7 +188,7 @@ pub(crate) fn calibrate<'py>(
         let Recordings { train, holdout } = fitting(sources, &loaded.model)?;
         calibration::has_free_parameter(&loaded)?;
         let found = greybox_diagnose::calibrate(&loaded.model, &train, &holdout, watch)
-.map_err(|e| Failure::diagnosis(&loaded.path, e))?;
+            .map_err(|e| Failure::diagnosis(&loaded.path, e))?;
         watch.stage("writing the report");
         calibration::Results::of(&found, &loaded, &train, &holdout)
     })?;
