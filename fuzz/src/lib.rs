@@ -179,9 +179,7 @@ const MOST_WORK: u64 = 400 * WORK;
 pub fn diagnose(bytes: &[u8]) {
     let mut choices = Choices(bytes);
     let text = choices.model();
-    let Ok(model) = Model::from_toml(&text, "fuzz.toml") else {
-        panic!("the template does not load:\n{text}")
-    };
+    let model = Model::from_toml(&text, "fuzz.toml").unwrap_or_else(|e| panic!("the template: {e}\n{text}"));
     let Some(train) = choices.recording("train.csv") else { return };
     let holdout: Vec<Recording> = choices.recording("held.csv").into_iter().collect();
     let options = Options { work: WORK, ..Options::default() };
@@ -229,7 +227,7 @@ struct Choices<'a>(&'a [u8]);
 const EQUATIONS: [&str; 6] = [
     "m*x'' + c*x' + k*x = u",
     "m*x'' + c*sign(x') + k*x = u",
-    "m*x'' + c*x' + k*sin(x) = delay(u, 0.03)",
+    "m*x'' + c*x' + k*sin(x) = delay(u, tau)",
     "m*x' + c*x + k*x^3 = saturate(u, 0.5)",
     "m*x'' + c*abs(x')*x' + k*deadzone(x, 0.1) = u",
     "m*x'' + c*x' + k*sqrt(x) = u",
@@ -259,6 +257,9 @@ impl Choices<'_> {
             let value = self.value();
             let fixed = if free >> k & 1 == 1 { ", fixed = true" } else { "" };
             parameters += &format!("{name} = {{ value = {value:?}{fixed} }}\n");
+        }
+        if equation.contains("tau") {
+            parameters += "tau = { value = 0.03, unit = \"s\", fixed = true }\n";
         }
         format!(
             "[inputs]\nu = {{ hold = \"{hold}\" }}\n[states]\nx = {{}}\n[parameters]\n{parameters}[equations]\n\

@@ -1,6 +1,7 @@
 //! The corpus of the fuzz targets (`fuzz/corpus`), replayed on a stable compiler.
 
 #[path = "../../fuzz/src/lib.rs"]
+#[allow(unreachable_pub, reason = "a library of its own in fuzz/")]
 mod targets;
 
 use std::path::PathBuf;
