@@ -4,6 +4,7 @@
 use common::{Bench, names};
 use spring::{MODEL, recording};
 
+#[allow(dead_code, reason = "other test files use the rest")]
 mod common;
 #[path = "common/spring.rs"]
 mod spring;
