@@ -63,10 +63,25 @@ pub enum DataError {
         /// Channel.
         channel: String,
     },
+    /// A channel whose squares are no numbers.
+    #[error(
+        "{file}: channel `{channel}` reaches {largest:e} in SI units, too much to compute with: check the column and its unit, and empty the cells that are no measurements"
+    )]
+    OutOfRange {
+        /// File.
+        file: String,
+        /// Channel.
+        channel: String,
+        /// Its largest magnitude, SI.
+        largest: f64,
+    },
     /// The model measures nothing.
     #[error("the model has no measured state: give one a channel, or add [measurements]")]
     NothingMeasured,
 }
+
+/// Magnitude beyond which sums of squares and of their products leave the numbers.
+const LARGEST: f64 = 1e100;
 
 /// A measured channel.
 #[derive(Debug, Clone, PartialEq)]
@@ -324,6 +339,10 @@ fn find_channel(
             header.factor
         }
     };
+    let largest = found.values.iter().map(|v| (v * factor).abs()).fold(0.0, f64::max);
+    if largest > LARGEST {
+        return Err(DataError::OutOfRange { file, channel: channel.to_string(), largest });
+    }
     Ok((index, factor))
 }
 

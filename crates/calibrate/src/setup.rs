@@ -175,6 +175,21 @@ impl Setup {
         Setup { data, hats, environments, noise: None, ..self.clone() }
     }
 
+    /// The same model for simulations of other recordings with these parameters: in the same steps, or in finer ones
+    /// where those recordings ask for them at this tolerance (SI, per channel). A law can be far faster in a motion that
+    /// the fits never saw.
+    pub fn for_simulations_of(&self, data: Arc<Data>, parameters: &[f64], tolerance: &[f64]) -> Setup {
+        let mut setup = self.with_data(data);
+        for (p, v) in setup.model.parameters.iter_mut().zip(parameters) {
+            p.value = *v;
+        }
+        setup.choose_method(tolerance, JUDGED);
+        if setup.method.evaluations() < self.method.evaluations() {
+            setup.method = self.method;
+        }
+        setup
+    }
+
     /// The same with the states of these names (all entries of their chains) carried from segment to
     /// segment instead of free in each: the memory of a mechanism, which no sensor sees.
     ///

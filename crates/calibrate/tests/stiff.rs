@@ -64,3 +64,47 @@ fn a_mode_too_fast_to_follow_is_refused_with_its_rate() {
     let told = laid_out(1e-9).unwrap_err().to_string();
     assert!(told.starts_with("the model is stiff: it has a mode of about 1.0e9 1/s"), "{told}");
 }
+
+/// Presliding friction (Dahl): its memory fades at a rate that grows with the speed.
+const DAHL: &str = r#"
+name = "Mass with presliding friction"
+[inputs]
+f = { unit = "N" }
+[states]
+x = { unit = "m" }
+z = { unit = "m", measured = false, initial = 0 }
+[parameters]
+m = { value = 1.0, unit = "kg" }
+c = { value = 1.5, unit = "N s/m" }
+k = { value = 20.0, unit = "N/m" }
+s = { value = 50.0, unit = "N/m" }
+r = { value = 60.0, unit = "1/m" }
+[equations]
+mass = "m*x'' + c*x' + k*x + s*z = f"
+memory = "z' = x' - r*abs(x')*z"
+"#;
+
+#[test]
+fn a_faster_motion_than_the_fits_saw_is_simulated_in_finer_steps() {
+    let model = Model::from_toml(DAHL, "model.toml").unwrap();
+    let (n, dt) = (800, 0.05);
+    let recorded = |seed: u64, size: f64| {
+        let f = force(seed, n, dt, 0.5, size);
+        let y = measure_in(&model, &f, dt, &[0.0; 3], 64);
+        setup(&model, &f, dt, &y)
+    };
+    let (slow, fast) = (recorded(1, 1.0), recorded(2, 60.0));
+    let values = slow.values();
+    let fine = [1e-3 * fast.data.spread[0]];
+    let score = |setup: &Setup| {
+        let run = setup.free_run(&values, &fast.data.spread);
+        setup.scores(&run, &values, 1.0, None)[0].nrmse
+    };
+    let error = score(&slow.for_simulations_of(fast.data.clone(), &values, &fine));
+    assert!(error < 1e-2, "{error}");
+    let before = score(&slow.with_data(fast.data.clone()));
+    assert!(before.is_nan() || before > 10.0 * error, "{before} and {error}: the steps of the fits would do");
+    // And never in coarser ones.
+    let back = fast.for_simulations_of(slow.data.clone(), &values, &fine);
+    assert_eq!(back.method, fast.method);
+}

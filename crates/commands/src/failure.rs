@@ -327,7 +327,8 @@ impl From<DataError> for Failure {
             DataError::MissingChannel { file, channel, .. }
             | DataError::Unit { file, channel, .. }
             | DataError::UnreadableUnit { file, channel, .. }
-            | DataError::EmptyChannel { file, channel } => failure.at("file", file).at("channel", channel),
+            | DataError::EmptyChannel { file, channel }
+            | DataError::OutOfRange { file, channel, .. } => failure.at("file", file).at("channel", channel),
             _ => failure,
         }
     }

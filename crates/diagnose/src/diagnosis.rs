@@ -407,7 +407,11 @@ fn conclude(
     // Free runs.
     let role = |data: &Arc<Data>, held: bool| -> Role {
         let run = |f: &Setup, parameters: &[f64], scale: &[f64]| -> Run {
-            let setup = if held { f.with_data(data.clone()) } else { f.clone() };
+            let fine: Vec<f64> = scale.iter().map(|s| 0.02 * s).collect();
+            let setup = match held {
+                true => f.for_simulations_of(data.clone(), parameters, &fine),
+                false => f.clone(),
+            };
             let run = setup.free_run(parameters, scale);
             let scores = setup.scores(&run, parameters, window, None);
             let by_recording =
@@ -1221,7 +1225,8 @@ pub fn calibrate(
         .collect();
     let spread: Vec<f64> = train.spread.iter().map(|s| s.max(1e-300)).collect();
     let runs = |data: &Arc<Data>| -> Both {
-        let setup = fitted.setup.with_data(data.clone());
+        let fine: Vec<f64> = scale.iter().map(|s| 0.02 * s).collect();
+        let setup = fitted.setup.for_simulations_of(data.clone(), values, &fine);
         let before = setup.free_run(&nominal.values(), &spread);
         let after = setup.free_run(values, &scale);
         let scores = (

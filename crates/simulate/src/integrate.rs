@@ -78,6 +78,18 @@ pub enum Method {
     },
 }
 
+impl Method {
+    /// Evaluations of the right-hand side between two samples; none are known beforehand with error control.
+    pub fn evaluations(&self) -> usize {
+        match self {
+            Method::Rk4 { substeps } => RK4.b.len() * substeps,
+            Method::Dp5 { substeps } => DP5.b.len() * substeps,
+            Method::Dop853 { substeps } => DOP853.b.len() * substeps,
+            Method::Adaptive { .. } => 0,
+        }
+    }
+}
+
 /// Everything from outside that acts on the system during one uniformly sampled piece.
 #[derive(Debug, Clone)]
 pub struct Environment {

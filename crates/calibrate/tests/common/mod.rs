@@ -48,6 +48,11 @@ pub fn force(seed: u64, n: usize, dt: f64, corner: f64, size: f64) -> Vec<f64> {
 
 /// What a finely integrated simulation measures without noise, `[channel][sample]`.
 pub fn measure(model: &Model, f: &[f64], dt: f64, x0: &[f64]) -> Vec<Vec<f64>> {
+    measure_in(model, f, dt, x0, 8)
+}
+
+/// The same in so many steps from sample to sample.
+pub fn measure_in(model: &Model, f: &[f64], dt: f64, x0: &[f64], substeps: usize) -> Vec<Vec<f64>> {
     let system = System::compile(model).unwrap();
     let environment = Environment {
         start: 0.0,
@@ -57,7 +62,7 @@ pub fn measure(model: &Model, f: &[f64], dt: f64, x0: &[f64]) -> Vec<Vec<f64>> {
         forces: vec![],
     };
     let p: Vec<f64> = model.parameters.iter().map(|p| p.value).collect();
-    let method = Method::Dp5 { substeps: 8 };
+    let method = Method::Dp5 { substeps };
     let t = integrate(&system, &environment, &p, x0, 0..f.len(), method, &Seeds::default());
     assert_eq!(t.diverged, None);
     t.y.chunks(t.n).map(<[f64]>::to_vec).collect()
