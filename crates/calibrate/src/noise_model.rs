@@ -155,6 +155,34 @@ impl Autoregression {
         zeroed
     }
 
+    /// The quadratic form xᵀ Γ x of the noise's stationary covariance Γ over a stretch is `variance()` times the sum
+    /// of squares of what this leaves in `x`: with the whitening W of a stretch without missing samples,
+    /// Γ = v_p W⁻¹ W⁻ᵀ, and `x` becomes W⁻ᵀ x.
+    ///
+    /// ```
+    /// use greybox_calibrate::Autoregression;
+    /// // γ(h) = 2 · 0.8^|h|: the sum of two neighbours has the variance 2 (1 + 1 + 2 · 0.8).
+    /// let noise = Autoregression::from_reflections(&[0.8], 2.0);
+    /// let mut x = [0.0, 1.0, 1.0, 0.0];
+    /// noise.colour_transposed(&mut x);
+    /// let form = noise.variance() * x.iter().map(|v| v * v).sum::<f64>();
+    /// assert!((form - 7.2).abs() < 1e-12);
+    /// ```
+    pub fn colour_transposed(&self, x: &mut [f64]) {
+        let (p, v) = (self.order(), self.variance());
+        for k in (0..x.len()).rev() {
+            let j = k.min(p);
+            // What is known from `whiten`: row k of W is `factor` times (…, −a₂, −a₁, 1).
+            let row = x[k];
+            for (a, x) in self.predictors[j].iter().zip(x[..k].iter_mut().rev()) {
+                *x += a * row;
+            }
+            if j < p {
+                x[k] = row * (self.variances[j] / v).sqrt();
+            }
+        }
+    }
+
     /// How many rows [`whiten`](Self::whiten) makes zero.
     pub fn lost(&self, missing: &[bool]) -> usize {
         lost(missing, self.order())
@@ -288,6 +316,28 @@ mod tests {
                 let expected = if i == j { 1.0 } else { 0.0 };
                 assert!((m - expected).abs() < 0.04, "{i} {j} {m}");
             }
+        }
+    }
+
+    /// W⁻ᵀ against W itself, whose rows are the whitened unit vectors' transposes.
+    #[test]
+    fn colouring_transposed_undoes_whitening_transposed() {
+        let model = Autoregression::from_reflections(&[0.9, -0.6, 0.3], 2.5);
+        let n = 9;
+        let columns: Vec<Vec<f64>> = (0..n)
+            .map(|j| {
+                let mut e = vec![0.0; n];
+                e[j] = 1.0;
+                model.whiten(&mut e, &[false; 9]);
+                e
+            })
+            .collect();
+        let x: Vec<f64> = (0..n).map(|k| ((k * k) as f64).sin()).collect();
+        let mut g = x.clone();
+        model.colour_transposed(&mut g);
+        for (column, x) in columns.iter().zip(&x) {
+            let back: f64 = column.iter().zip(&g).map(|(w, g)| w * g).sum();
+            assert!((back - x).abs() < 1e-12, "{back} {x}");
         }
     }
 

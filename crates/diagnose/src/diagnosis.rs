@@ -5,7 +5,8 @@ use std::ops::Deref;
 use std::sync::Arc;
 
 use greybox_calibrate::{
-    Data, DataError, FreeRun, Limits, Point, Score, Setup, SetupError, Work, free_parameters, window_length,
+    Data, DataError, Fit, FreeRun, Level, Limits, Point, Score, Setup, SetupError, Work, free_parameters,
+    window_length,
 };
 use greybox_model::{Expr, Func, Hold, Model};
 use greybox_recording::Recording;
@@ -362,8 +363,8 @@ fn conclude(
     observer.stage(Stage::Simulating);
     let mut baseline = Baseline::of(&found, &nominal.values());
     let mut limited = found.limited;
-    let improved = if found.improved.parts.is_empty() {
-        baseline.fitted.clone()
+    let Polished { fitted: improved, origin } = if found.improved.parts.is_empty() {
+        baseline.polished.clone()
     } else {
         // The search fits the baseline with a scale that its mechanisms made small, and only where it goes on with
         // it. What is compared with is the best that the equations can do alone.
@@ -375,10 +376,11 @@ fn conclude(
         }
         polish(&found.improved, &found.scale, window)
     };
-    let Baseline { fitted: calibrated, scale: calibrated_scale, .. } = baseline;
     let scale = residual_scale(&improved, &found.scale);
-    let calibrated_widths = Uncertainty::of(&calibrated, &calibrated_scale).widths();
-    let uncertainty = Uncertainty::of(&improved, &scale);
+    let Baseline { polished: Polished { fitted: calibrated, origin: calibrated_origin }, .. } = baseline;
+    let calibrated_scale = baseline.scale;
+    let calibrated_widths = Uncertainty::of(&calibrated_origin, &calibrated_scale).widths();
+    let uncertainty = Uncertainty::of(&origin, &scale);
     let improved_widths = uncertainty.widths();
     let value_of = |f: &Fitted, widths: &[f64], index: usize| {
         let value = f.fit.point.parameters[index];
@@ -546,9 +548,34 @@ fn alone(nominal: &Setup, keep_holds: bool, observer: &dyn Observer) -> Found {
     search.run()
 }
 
+/// A fit in segments, at parameters that a fit of whole pieces may have found.
+#[derive(Debug, Clone)]
+struct Polished {
+    fitted: Fitted,
+    /// The fit that found the parameters. Their intervals are taken here: the free starts of segments know less of
+    /// the parameters than whole pieces do.
+    origin: Fitted,
+}
+
+impl Polished {
+    fn kept(fitted: Fitted) -> Polished {
+        Polished { origin: fitted.clone(), fitted }
+    }
+
+    /// `fitted` at the parameters of `whole`, its segments' starts refitted.
+    fn at(fitted: &Fitted, level: Level, whole: Fit, scale: &[f64]) -> Polished {
+        let free = Setup { free: Vec::new(), ..fitted.setup.clone() };
+        let point =
+            Point { parameters: whole.point.parameters.clone(), starts: fitted.fit.point.starts.clone() };
+        let fit = free.fit(&fitted.level, scale, &[point], Limits { iterations: 8, tolerance: 1e-6 });
+        let origin = Fitted { level, fit: whole, ..fitted.clone() };
+        Polished { fitted: Fitted { fit, ..fitted.clone() }, origin }
+    }
+}
+
 /// The equations as they are, with the parameters that simulate the training recordings best in free run.
 struct Baseline {
-    fitted: Fitted,
+    polished: Polished,
     /// Its residual.
     scale: Vec<f64>,
     /// Sum over the channels of the squares of its free run's NRMSE.
@@ -581,23 +608,26 @@ impl Baseline {
             let whole = setup.fit(&level, &own, &[start], Limits { iterations: 30, tolerance: 1e-6 });
             let quality = misfit(&whole.point.parameters, &own);
             if quality < best.0 {
-                best = (quality, Some(whole.point.parameters));
+                best = (quality, Some(whole));
             }
         }
-        let fitted = with_parameters(fitted, best.1, &found.scale);
-        let scale = residual_scale(&fitted, &found.scale);
-        let misfit = misfit(&fitted.fit.point.parameters, &scale);
-        Baseline { fitted, scale, misfit }
+        let polished = match best.1 {
+            Some(whole) => Polished::at(fitted, level, whole, &found.scale),
+            None => Polished::kept(fitted.clone()),
+        };
+        let scale = residual_scale(&polished.fitted, &found.scale);
+        let misfit = misfit(&polished.fitted.fit.point.parameters, &scale);
+        Baseline { polished, scale, misfit }
     }
 }
 
 /// The improved model refitted on whole pieces, kept where its free run gains and its restarted windows
 /// do not lose: an axis that integrates would otherwise bend its parameters to absorb drift.
-fn polish(fitted: &Fitted, scale: &[f64], window: f64) -> Fitted {
+fn polish(fitted: &Fitted, scale: &[f64], window: f64) -> Polished {
     let setup = &fitted.setup;
     let level = setup.level(1);
     if level.segments == fitted.level.segments {
-        return fitted.clone();
+        return Polished::kept(fitted.clone());
     }
     let own = residual_scale(fitted, scale);
     let stitched = setup.stitch(&fitted.level, &fitted.fit.point, &level, &own);
@@ -613,17 +643,11 @@ fn polish(fitted: &Fitted, scale: &[f64], window: f64) -> Fitted {
     };
     let before = quality(&fitted.fit.point.parameters);
     let after = quality(&whole.point.parameters);
-    let keep = after.0 < before.0 && after.1 < before.1 + 0.02;
-    with_parameters(fitted, keep.then_some(whole.point.parameters), scale)
-}
-
-/// The model at other parameters, its segments' starts refitted: for intervals and tests.
-fn with_parameters(fitted: &Fitted, parameters: Option<Vec<f64>>, scale: &[f64]) -> Fitted {
-    let Some(parameters) = parameters else { return fitted.clone() };
-    let free = Setup { free: Vec::new(), ..fitted.setup.clone() };
-    let point = Point { parameters, starts: fitted.fit.point.starts.clone() };
-    let fit = free.fit(&fitted.level, scale, &[point], Limits { iterations: 8, tolerance: 1e-6 });
-    Fitted { fit, ..fitted.clone() }
+    if after.0 < before.0 && after.1 < before.1 + 0.02 {
+        Polished::at(fitted, level, whole, scale)
+    } else {
+        Polished::kept(fitted.clone())
+    }
 }
 
 /// A figure that follows from a mechanism's parameters, with its interval by the delta method.
@@ -1209,8 +1233,9 @@ pub fn calibrate(
     let found = alone(&nominal, true, observer);
     let durations: Vec<f64> = train.pieces.iter().map(|p| (p.len.saturating_sub(1)) as f64 * p.dt).collect();
     let window = window_length(&durations, train.pieces.iter().map(|p| p.dt).fold(0.0, f64::max));
-    let Baseline { fitted, scale, .. } = Baseline::of(&found, &nominal.values());
-    let widths = Uncertainty::of(&fitted, &scale).widths();
+    let Baseline { polished: Polished { fitted, origin }, scale, .. } =
+        Baseline::of(&found, &nominal.values());
+    let widths = Uncertainty::of(&origin, &scale).widths();
     let values = &fitted.fit.point.parameters;
     let mut calibrated = model.clone();
     for (p, v) in calibrated.parameters.iter_mut().zip(values) {
