@@ -1,5 +1,7 @@
 //! Rows of optimal control, observers and control laws.
 
+use std::hint::black_box;
+
 use anyhow::Result;
 use greybox_eso::{Design, Observer, Scheme};
 use greybox_hjb::{AdamaxOptions, adamax, lqr};
@@ -104,8 +106,10 @@ fn law() -> Result<Case> {
     Ok(Case::alone(STEPS as f64, move || {
         let mut x = [0.0; 4];
         for _ in 0..STEPS {
-            // The next state depends on the command, so that steps do not overlap.
-            x[0] = 1e-3 * law.step(&x, &[0.3; 4], &link.b, &target)?.u;
+            // The next state depends on the command, so that steps do not overlap; what stays the same is hidden from
+            // the compiler, which would compute it once for all steps if it inlined the law.
+            let (law, f, g) = (black_box(&law), black_box(&[0.3; 4]), black_box(&link.b));
+            x[0] = 1e-3 * law.step(&x, f, g, &target)?.u;
         }
         Ok(Answer::from([("state".to_owned(), x.to_vec())]))
     }))
