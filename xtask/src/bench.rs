@@ -7,7 +7,7 @@
 mod case;
 mod control;
 mod instructions;
-mod page;
+pub(crate) mod page;
 mod peak;
 pub(crate) mod peer;
 mod scale;

@@ -6,7 +6,7 @@
 mod cases;
 mod concealed;
 mod identify;
-mod statistics;
+pub(crate) mod statistics;
 mod table;
 
 use std::path::{Path, PathBuf};
@@ -32,6 +32,9 @@ pub(crate) struct Arguments {
     /// Measure coverage, false alarms and the reliability of confidence over seeds instead
     #[arg(long, conflicts_with_all = ["recordings", "identify", "floors"])]
     statistics: bool,
+    /// Put what --statistics measured into the book
+    #[arg(long, requires = "statistics", conflicts_with = "only")]
+    write_docs: bool,
     /// Seed of the concealed suite; first seed of --identify and --statistics
     #[arg(long, value_name = "N", default_value_t = 1)]
     seed: u64,
@@ -114,8 +117,11 @@ pub(crate) fn run(root: &Path, arguments: &Arguments) -> Result<Ending> {
         return conclude(&outcomes, arguments.json.as_deref());
     }
     if arguments.statistics {
-        let outcomes = statistics::run(arguments.seed, arguments.count, arguments.only.as_deref())?;
-        return conclude(&outcomes, arguments.json.as_deref());
+        let found = statistics::run(arguments.seed, arguments.count, arguments.only.as_deref())?;
+        if arguments.write_docs {
+            statistics::write(root, &found)?;
+        }
+        return conclude(&found.outcomes, arguments.json.as_deref());
     }
     let folder = match &arguments.recordings {
         Some(given) if given.is_dir() => given.clone(),

@@ -3,39 +3,27 @@
 use std::fmt::Write as _;
 use std::path::Path;
 
-use anyhow::{Context, Result, bail};
+use anyhow::Result;
 
 use super::{Report, duration, scale};
+use crate::book;
 
-const BEGIN: &str = "<!-- Made by `cargo xtask bench --peers --write-docs`; do not edit. -->";
-const SCALE: &str = "<!-- Made by `cargo xtask bench --scale --write-docs`; do not edit. -->";
-const END: &str = "<!-- End of the table. -->";
+/// The page.
+pub(crate) const NAME: &str = "speed.md";
+/// Marker of the table.
+pub(crate) const BEGIN: &str = "<!-- Made by `cargo xtask bench --peers --write-docs`; do not edit. -->";
+/// Marker of the table of cost against length.
+pub(crate) const SCALE: &str = "<!-- Made by `cargo xtask bench --scale --write-docs`; do not edit. -->";
 
-/// Puts the table between the markers of `docs/src/speed.md`.
-pub(crate) fn write(root: &Path, report: &Report) -> Result<()> {
-    put(root, BEGIN, &table(report))
+/// Puts the table between the markers.
+pub(super) fn write(root: &Path, report: &Report) -> Result<()> {
+    book::put_table(root, NAME, BEGIN, &table(report))
 }
 
 /// The same of cost against length, with its plot.
 pub(crate) fn write_scale(root: &Path, lengths: &[scale::Length]) -> Result<()> {
-    put(root, SCALE, &scale::table(lengths))?;
-    let path = root.join("docs").join("src").join("speed-scale.svg");
-    std::fs::write(&path, scale::plot(lengths)?)
-        .with_context(|| format!("{} cannot be written", path.display()))
-}
-
-fn put(root: &Path, begin: &str, table: &str) -> Result<()> {
-    let path = root.join("docs").join("src").join("speed.md");
-    let page =
-        std::fs::read_to_string(&path).with_context(|| format!("{} cannot be read", path.display()))?;
-    let page = between(&page, begin, table).with_context(|| path.display().to_string())?;
-    std::fs::write(&path, page).with_context(|| format!("{} cannot be written", path.display()))
-}
-
-fn between(page: &str, begin: &str, table: &str) -> Result<String> {
-    let parts = page.split_once(begin).and_then(|(head, rest)| Some((head, rest.split_once(END)?.1)));
-    let Some((head, tail)) = parts else { bail!("the markers of the table are missing") };
-    Ok(format!("{head}{begin}\n\n{table}\n{END}{tail}"))
+    book::put_table(root, NAME, SCALE, &scale::table(lengths))?;
+    book::put_file(root, "speed-scale.svg", &scale::plot(lengths)?)
 }
 
 fn table(report: &Report) -> String {
@@ -62,24 +50,4 @@ fn table(report: &Report) -> String {
         }
     }
     text
-}
-
-#[cfg(test)]
-mod tests {
-    use super::*;
-
-    #[test]
-    fn the_table_stands_between_its_markers() {
-        let page = format!("# Speed\n{BEGIN}\nold\n{END}\nrest\n");
-        let new = between(&page, BEGIN, "| new |\n").unwrap();
-        assert!(new.contains("| new |") && !new.contains("old") && new.ends_with("rest\n"));
-        assert_eq!(between(&new, BEGIN, "| new |\n").unwrap(), new);
-        assert!(between("# Speed\n", BEGIN, "").is_err());
-    }
-
-    #[test]
-    fn the_page_has_its_markers() {
-        let page = std::fs::read_to_string(crate::root().join("docs").join("src").join("speed.md")).unwrap();
-        assert!(between(&page, BEGIN, "").is_ok() && between(&page, SCALE, "").is_ok());
-    }
 }

@@ -4,6 +4,8 @@
 //! is. *Reliability*: of the mechanisms that are named with a confidence, how many are right. The recordings come from
 //! an oscillator of this file's own, whose parameters, force and noise are drawn anew for each seed.
 
+use std::path::Path;
+
 use anyhow::{Context, Result};
 use greybox_diagnose::{Diagnosis, Options, Quiet, Verdict, calibrate, diagnose};
 use greybox_model::Model;
@@ -14,9 +16,15 @@ use rand_pcg::Pcg64Mcg;
 use rayon::prelude::*;
 
 use super::{Figure, Outcome, identify};
+use crate::book;
+use crate::reproduce::{Axis, Plot, Series, Style};
 
 /// Seeds of every figure.
 const SEEDS: usize = 400;
+/// The book's page.
+pub(crate) const PAGE: &str = "statistics.md";
+/// Marker of its table.
+pub(crate) const BEGIN: &str = "<!-- Made by `cargo xtask prove --statistics --write-docs`; do not edit. -->";
 /// Bounds of the bins of confidence.
 const BINS: [f64; 6] = [0.0, 0.5, 0.7, 0.9, 0.97, 1.0];
 
@@ -331,8 +339,57 @@ fn bin_figures(bins: &[Bin]) -> Vec<Figure> {
     bins.iter().filter(|b| b.answers > 0).map(told).collect()
 }
 
+/// What a run found.
+#[derive(Debug, Clone)]
+pub(crate) struct Found {
+    pub(crate) outcomes: Vec<Outcome>,
+    bins: Vec<Bin>,
+    /// Seeds of each case.
+    seeds: usize,
+}
+
+/// Puts the figures and the reliability diagram into the book.
+pub(crate) fn write(root: &Path, found: &Found) -> Result<()> {
+    book::put_table(root, PAGE, BEGIN, &table(found))?;
+    book::put_file(root, "statistics-reliability.svg", &diagram(&found.bins)?)
+}
+
+fn table(found: &Found) -> String {
+    let mut text = format!("{} seeds of every case.\n\n", found.seeds);
+    text += "| case | figure | measured | goal | |\n|---|---|---|---|---|\n";
+    for outcome in &found.outcomes {
+        for (i, f) in outcome.figures.iter().enumerate() {
+            let case = if i == 0 { outcome.case.as_str() } else { "" };
+            let met = f.met.map_or("", |met| if met { "met" } else { "**missed**" });
+            text += &format!("| {case} | {} | {} | {} | {met} |\n", f.name, f.measured, f.goal);
+        }
+    }
+    text + "\n![Answers that are right against the confidence told](statistics-reliability.svg)\n"
+}
+
+/// Answers that are right against the confidence told, with their intervals, and the line where both agree.
+fn diagram(bins: &[Bin]) -> Result<String> {
+    let told = || bins.iter().filter(|b| b.answers > 0);
+    let at = |b: &Bin, rate: f64| [100.0 * b.told, 100.0 * rate];
+    let mut series = vec![
+        Series::new("as told", Style::Dashed, vec![[0.0, 0.0], [100.0, 100.0]]),
+        Series::new("measured", Style::Points, told().map(|b| at(b, b.rate())).collect()),
+    ];
+    series.extend(told().map(|b| {
+        let (low, high) = b.interval();
+        Series::new("", Style::Line, vec![at(b, low), at(b, high)])
+    }));
+    let plot = Plot {
+        alt: "Answers that are right against the confidence told".into(),
+        x: Axis::linear("confidence told in %"),
+        y: Axis::linear("right in %"),
+        series,
+    };
+    plot.to_svg().context("no answer has a confidence")
+}
+
 /// Runs everything on `count` seeds (400 otherwise).
-pub(crate) fn run(first: u64, count: Option<usize>, only: Option<&str>) -> Result<Vec<Outcome>> {
+pub(crate) fn run(first: u64, count: Option<usize>, only: Option<&str>) -> Result<Found> {
     let n = count.unwrap_or(SEEDS);
     let seeds: Vec<u64> = (0..n as u64).map(|i| first.wrapping_mul(7_368_787).wrapping_add(i)).collect();
     let mut outcomes = Vec::new();
@@ -360,10 +417,11 @@ pub(crate) fn run(first: u64, count: Option<usize>, only: Option<&str>) -> Resul
         note(&found);
         Ok(effect_figures(&found))
     })?;
+    let bins = bins(&answers);
     if !answers.is_empty() {
-        outcomes.push(Outcome { case: "confidence".into(), figures: bin_figures(&bins(&answers)) });
+        outcomes.push(Outcome { case: "confidence".into(), figures: bin_figures(&bins) });
     }
-    Ok(outcomes)
+    Ok(Found { outcomes, bins, seeds: n })
 }
 
 #[cfg(test)]
