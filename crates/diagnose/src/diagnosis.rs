@@ -161,7 +161,7 @@ pub struct Finding {
     pub parameters: Vec<(String, usize, Estimate)>,
     /// Further figures that follow from the parameters (a resonance frequency, Hz): name, estimate.
     pub figures: Vec<(String, Estimate)>,
-    /// Share of the calibrated model's misfit that is lost without it.
+    /// Its part of the calibrated model's misfit; all parts add up to what all explain.
     pub share_explained: f64,
     /// Probability among the explanations tried.
     pub confidence: f64,
@@ -477,6 +477,7 @@ fn conclude(
     };
     let significant = left.significant(improved.parts.len()) || verdict == Verdict::Unexplained;
     let mut mechanisms = if verdict == Verdict::MissingPhysics {
+        let shares = divided(search, &improved, &found.scale, &shares, (base, full));
         findings(&improved, &found, &nominal.model, library, &scale, &shares, &train_role, &uncertainty)
     } else {
         Vec::new()
@@ -489,6 +490,7 @@ fn conclude(
             || is_crowded(&improved, &shares, i, &nominal.model)
         {
             m.confidence = m.confidence.min(DOUBTED);
+            m.alternatives.iter_mut().for_each(|a| a.confidence = a.confidence.min(DOUBTED));
         }
     }
     mechanisms.sort_by(|a, b| b.share_explained.total_cmp(&a.share_explained));
@@ -648,6 +650,30 @@ fn polish(fitted: &Fitted, scale: &[f64], window: f64) -> Polished {
     } else {
         Polished::kept(fitted.clone())
     }
+}
+
+/// What each part explains of the residual `base` of which all leave `full`: the mean of what it takes away alone and
+/// of what is missed without it (`lost`), which are two figures where parts take over from each other, scaled so that
+/// they add up to what all explain. Of two parts it is Shapley's value (L. S. Shapley, *A value for n-person games*, 1953).
+fn divided(
+    search: &Search<'_>,
+    improved: &Fitted,
+    scale: &[f64],
+    lost: &[f64],
+    (base, full): (f64, f64),
+) -> Vec<f64> {
+    if lost.len() < 2 {
+        return lost.to_vec();
+    }
+    let gained = |i: usize| {
+        let others: Vec<usize> = (0..lost.len()).rev().filter(|&j| j != i).collect();
+        let alone = search.rss_without(improved, &others, scale).unwrap_or(base);
+        ((base - alone) / base.max(1e-300)).clamp(0.0, 1.0)
+    };
+    let means: Vec<f64> = (0..lost.len()).into_par_iter().map(|i| 0.5 * (gained(i) + lost[i])).collect();
+    let all = ((base - full) / base.max(1e-300)).clamp(0.0, 1.0);
+    let sum: f64 = means.iter().sum();
+    means.into_iter().map(|m| if sum > 0.0 { m * all / sum } else { 0.0 }).collect()
 }
 
 /// A figure that follows from a mechanism's parameters, with its interval by the delta method.

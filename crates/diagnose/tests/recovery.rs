@@ -158,15 +158,20 @@ fn the_baseline_of_a_diagnosis_is_as_good_as_a_calibration() {
 }
 
 #[test]
-fn two_effects_at_once_are_both_named() {
+fn two_effects_at_once_are_both_named_and_share_what_they_explain() {
     let left = Left { coulomb: 0.8, cubic: 300.0, ..Left::default() };
-    let both = (0..4)
-        .filter(|s| {
-            let d = answer(*s, left);
-            kinds(&d).contains(&"coulomb_friction") && kinds(&d).contains(&"cubic_stiffness")
-        })
-        .count();
-    assert!(both >= 3, "{both} of 4");
+    let answers: Vec<Diagnosis> = (0..4).map(|seed| answer(seed, left)).collect();
+    let both =
+        |d: &&Diagnosis| kinds(d).contains(&"coulomb_friction") && kinds(d).contains(&"cubic_stiffness");
+    let named: Vec<&Diagnosis> = answers.iter().filter(both).collect();
+    assert!(named.len() >= 3, "{} of 4", named.len());
+    for d in named {
+        let shares: f64 = d.mechanisms.iter().map(|m| m.share_explained).sum();
+        let energy = |runs: &[greybox_calibrate::Score]| runs.iter().map(|s| s.rmse.powi(2)).sum::<f64>();
+        let explained = 1.0 - energy(&d.train.improved.scores) / energy(&d.train.calibrated.scores);
+        // Shares are of the residual in segments, whose starts are free.
+        assert!(shares <= 1.0 && (shares - explained).abs() < 0.1, "{shares} {explained}");
+    }
 }
 
 /// Seeds of four for which a mechanism is named with more than 0.8.

@@ -39,6 +39,7 @@
 //! # Ok::<(), greybox_recording::RecordingError>(())
 //! ```
 
+mod correlation;
 pub mod csv;
 mod error;
 mod finding;
@@ -56,6 +57,7 @@ mod rename;
 pub mod smooth;
 mod spectrum;
 
+pub use crate::correlation::Correlation;
 pub use crate::csv::{CsvBlocks, parse_csv, read_csv, write_csv, write_csv_file};
 pub use crate::error::{Place, RecordingError};
 pub use crate::finding::{Finding, Severity};

@@ -127,7 +127,8 @@ pub struct Mechanism {
     /// Identified parameters of the expression, and the figures that follow from them (a resonance: `f0` in
     /// Hz, `zeta`).
     pub parameters: Ordered<Estimate>,
-    /// Share of the calibrated model's residual variance (above noise) that it explains, 0 to 1.
+    /// Share of the calibrated model's residual that it explains, 0 to 1: of several, the mean of what it takes away
+    /// alone and of what is missed without it, scaled so that they add up to what all explain.
     #[serde(with = "number")]
     #[schemars(schema_with = "number_schema")]
     pub share_explained: f64,

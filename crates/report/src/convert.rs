@@ -9,10 +9,10 @@ use greybox_diagnose::diagnosis::{Estimate as Estimated, Finding as Found, Role 
 use greybox_diagnose::locate::{Location as Located, spectrum};
 use greybox_diagnose::{Calibration, Diagnosis, Verdict as Answer};
 use greybox_model::{Model, Unit, WriteOptions};
-use greybox_recording::{Recording, Severity as Level, health};
+use greybox_recording::{Correlation, Recording, Severity as Level, health};
 
 use crate::contract::*;
-use crate::page::{self, MechanismPlot, ModelTexts, Page, Residual, Spectrum, StateMap};
+use crate::page::{self, Lagged, MechanismPlot, ModelTexts, Page, Residual, Spectrum, StateMap};
 use crate::suggest::{self, Basis, InputRange, Subject};
 
 /// What the conversion needs beside the diagnosis.
@@ -545,6 +545,7 @@ fn residuals(d: &Diagnosis) -> Vec<Residual> {
                 windows,
                 spectrum: spectra(data, r, &before, &after, sigma),
                 map: state_map(&d.nominal, data, [calibrated, improved], r, c),
+                correlations: correlations(&d.nominal, data, [Some(calibrated), Some(improved)], r, c),
                 before,
                 after,
             });
@@ -573,6 +574,46 @@ fn spectra(data: &Data, recording: usize, before: &[f64], after: &[f64], sigma: 
     }
     let level = 2.0 * sigma * sigma * piece.dt;
     Some(Spectrum { noise: vec![level; freq.len()], freq, before: b, after: a })
+}
+
+/// Most lags of a correlation, to either side.
+const REACH: usize = 100;
+
+/// Correlations of the residuals of channel `c` over the longest piece of a recording, before and after.
+fn correlations(
+    model: &Model,
+    data: &Data,
+    runs: [Option<&FreeRun>; 2],
+    recording: usize,
+    c: usize,
+) -> Vec<Lagged> {
+    let own = data.pieces.iter().enumerate().filter(|(_, p)| p.recording == recording);
+    let Some((i, piece)) = own.max_by_key(|(_, p)| p.len) else { return Vec::new() };
+    let n = piece.len;
+    let reach = (n / 10).min(REACH);
+    let residuals = runs.map(|run| {
+        run.map_or_else(Vec::new, |run| -> Vec<f64> {
+            piece.measured[c].iter().zip(&run.y[i][c * n..(c + 1) * n]).map(|(m, y)| m - y).collect()
+        })
+    });
+    let inputs = model.inputs.iter().zip(&piece.inputs).map(|(input, u)| (Some(input.name.clone()), Some(u)));
+    std::iter::once((None, None))
+        .chain(inputs)
+        .filter_map(|(with, input)| {
+            let found = residuals.each_ref().map(|e| match input {
+                None => Correlation::of(e, reach),
+                Some(u) => Correlation::between(u, e, reach),
+            });
+            let [before, after] = found;
+            let after = after?;
+            // Of itself the residual says the same at both sides.
+            let from = if with.is_some() { 0 } else { reach };
+            let lag = (from..=2 * reach).map(|k| (k as f64 - reach as f64) * piece.dt).collect();
+            let part = |c: Correlation| c.values[from..].to_vec();
+            let bound = after.bound;
+            Some(Lagged { with, lag, before: before.map_or_else(Vec::new, part), after: part(after), bound })
+        })
+        .collect()
 }
 
 /// Size of the residual of the first run over the state plane of the first coordinate, whose place at each

@@ -23,7 +23,7 @@ use crate::contract::{
 use crate::decimate::{Buckets, MAX_POINTS, round_to_range};
 use crate::diff::{Edit, diff};
 use crate::expression::{self, escape};
-use crate::page::{Channel, MechanismPlot, Page, Recording, Residual, Role};
+use crate::page::{Channel, Lagged, MechanismPlot, Page, Recording, Residual, Role};
 use crate::{ReportError, format, sentence, svg};
 
 const UPLOT_JS: &str = include_str!("../assets/uPlot.iife.min.js");
@@ -309,6 +309,14 @@ struct ResidualView {
     time: PlotView,
     map_svg: Option<String>,
     spectrum: Option<PlotView>,
+    correlations: Vec<CorrelationView>,
+}
+
+/// A correlation: caption, note and drawing.
+struct CorrelationView {
+    title_html: String,
+    note: String,
+    svg: String,
 }
 
 struct MechanismView {
@@ -926,7 +934,37 @@ fn residual_view(scene: &Scene<'_>, residual: &Residual, island: &mut Island) ->
         time,
         map_svg,
         spectrum,
+        correlations: residual
+            .correlations
+            .iter()
+            .filter_map(|c| correlation_view(&shown, after, c))
+            .collect(),
     }
+}
+
+fn correlation_view(shown: &str, after: &str, found: &Lagged) -> Option<CorrelationView> {
+    let outside = |values: &[f64]| {
+        let told = found.lag.iter().zip(values).filter(|(h, _)| found.with.is_some() || **h > 0.0);
+        let told: Vec<bool> = told.map(|(_, v)| v.abs() > found.bound).collect();
+        format!("{} of {} lags", told.iter().filter(|out| **out).count(), told.len())
+    };
+    let sizes: Vec<String> = [("calibrated", &found.before), (after, &found.after)]
+        .into_iter()
+        .filter(|(_, values)| !values.is_empty())
+        .map(|(name, values)| format!("{} {name}", outside(values)))
+        .collect();
+    let sizes = sizes.join(", ");
+    let (title_html, with) = match &found.with {
+        None => ("With itself, by lag".to_owned(), "itself".to_owned()),
+        Some(input) => {
+            (format!("With the input {}, by lag", expression::html(input)), expression::text(input))
+        }
+    };
+    let alt = format!(
+        "Correlation of the residual of {shown} with {with} by lag; outside of what chance gives: {sizes}"
+    );
+    let svg = svg::correlation_plot(found, &alt)?;
+    Some(CorrelationView { title_html, note: format::tie(&format!("beyond chance (99 %): {sizes}")), svg })
 }
 
 fn island_time(

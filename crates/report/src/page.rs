@@ -117,6 +117,23 @@ pub struct Residual {
     pub spectrum: Option<Spectrum>,
     /// Magnitude of the residual over two coordinates of the state space.
     pub map: Option<StateMap>,
+    /// Correlation of the residual with itself and with the inputs.
+    pub correlations: Vec<Lagged>,
+}
+
+/// Correlation of a residual with itself or with an input, over the lag.
+#[derive(Debug, Clone, PartialEq)]
+pub struct Lagged {
+    /// Name of the input; `None` for the residual itself.
+    pub with: Option<String>,
+    /// Lags in s, ascending.
+    pub lag: Vec<f64>,
+    /// Residual of the calibrated model, −1 … 1; empty where there is none.
+    pub before: Vec<f64>,
+    /// Residual of the improved model.
+    pub after: Vec<f64>,
+    /// Magnitude that one value of a hundred exceeds by chance, of the improved model's.
+    pub bound: f64,
 }
 
 /// One-sided amplitude spectral densities.

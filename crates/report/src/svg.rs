@@ -8,7 +8,7 @@ use std::fmt::Write as _;
 use crate::contract::Interval;
 use crate::expression::{escape, label};
 use crate::format;
-use crate::page::{MechanismPlot, StateMap};
+use crate::page::{Lagged, MechanismPlot, StateMap};
 use crate::summary::Pooled;
 
 const WIDTH: f64 = 520.0;
@@ -323,6 +323,48 @@ pub fn law_plot(plot: &MechanismPlot, alt: &str) -> Option<LawPlot> {
     Some(LawPlot { svg: out, outside, every })
 }
 
+/// A correlation over its lag, the calibrated model's dashed, and the band that chance stays in. `None` when no value
+/// is finite.
+pub fn correlation_plot(found: &Lagged, alt: &str) -> Option<String> {
+    let values = || found.before.iter().chain(&found.after).copied();
+    let of_itself = found.with.is_none();
+    // The residual with itself is one at lag zero, which says nothing and would flatten all others.
+    let told = |values: &[f64]| -> Vec<[f64; 2]> {
+        let pairs = found.lag.iter().zip(values).skip(usize::from(of_itself));
+        pairs.filter(|(_, v)| v.is_finite()).map(|(h, v)| [*h, *v]).collect()
+    };
+    values().find(|v| v.is_finite())?;
+    let (before, after) = (told(&found.before), told(&found.after));
+    let heights = before.iter().chain(&after).map(|p| p[1]).chain([found.bound, -found.bound]);
+    let frame =
+        Frame { x: range(found.lag.iter().copied(), 0.0)?, y: range(heights, 0.08)?, right: WIDTH - 12.0 };
+    let mut out = open(alt);
+    frame.axes(&mut out, "lag in s", "correlation");
+    let (top, bottom) = (frame.py(found.bound), frame.py(-found.bound));
+    let _ = write!(
+        out,
+        "<path class=\"chance\" d=\"M{LEFT} {top:.1}H{r:.1}V{bottom:.1}H{LEFT}Z\"/>\
+         <path class=\"zero\" d=\"M{LEFT} {:.1}H{r:.1}\"/>",
+        frame.py(0.0),
+        r = frame.right
+    );
+    if !of_itself {
+        let _ = write!(out, "<path class=\"zero\" d=\"M{:.1} {TOP}V{}\"/>", frame.px(0.0), HEIGHT - BOTTOM);
+    }
+    for (class, points) in [("before", &before), ("law", &after)] {
+        let line = points.iter().enumerate().fold(String::new(), |mut line, (i, [x, y])| {
+            let _ = write!(line, "{}{:.1} {:.1}", if i == 0 { 'M' } else { 'L' }, frame.px(*x), frame.py(*y));
+            line
+        });
+        if !line.is_empty() {
+            let _ = write!(out, "<path class=\"{class}\" d=\"{line}\"/>");
+        }
+    }
+    frame.border(&mut out);
+    out.push_str("</svg>");
+    Some(out)
+}
+
 /// Two estimates of one number on one scale, before above after, with their intervals. A picture of what the row beside
 /// it says in numbers: nothing for a screen reader. `None` where a value or an interval is missing.
 pub fn change_plot(before: (f64, Option<Interval>), after: (f64, Option<Interval>)) -> Option<String> {
@@ -536,6 +578,26 @@ fn name(out: &mut String, left: f64, y: f64, full: &str) {
 #[cfg(test)]
 mod tests {
     use super::*;
+
+    #[test]
+    fn a_correlation_leaves_out_that_with_itself_at_lag_zero() {
+        let mut found = Lagged {
+            with: None,
+            lag: vec![0.0, 0.1, 0.2],
+            before: vec![1.0, 0.5, 0.2],
+            after: vec![1.0, 0.05, -0.02],
+            bound: 0.06,
+        };
+        let svg = correlation_plot(&found, "a < b").unwrap();
+        assert!(
+            svg.contains("a &lt; b") && svg.contains("class=\"chance\"") && svg.contains("class=\"law\"")
+        );
+        assert_eq!(svg.matches('L').count(), 2, "two lines of two points each");
+        found.with = Some("u".into());
+        assert_eq!(correlation_plot(&found, "").unwrap().matches('L').count(), 4);
+        let empty = Lagged { before: Vec::new(), after: vec![f64::NAN; 3], ..found };
+        assert_eq!(correlation_plot(&empty, ""), None);
+    }
 
     #[test]
     fn ticks_are_round() {

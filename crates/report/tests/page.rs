@@ -195,6 +195,7 @@ fn long_recordings_keep_their_peaks_and_the_page_stays_small() {
                 windows: Vec::new(),
                 spectrum: None,
                 map: None,
+                correlations: Vec::new(),
             });
         }
         page.recordings.push(Recording {

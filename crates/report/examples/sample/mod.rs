@@ -3,13 +3,14 @@
 
 use std::f64::consts::TAU;
 
+use greybox_recording::Correlation;
 use greybox_report::contract::{
     Alternative, Estimate, Experiment, Finding, Fit, FitSet, InputHold, Interval, Location, Mechanism,
     ModelId, Ordered, Parameter, Producer, RecordingFit, Remainder, Report, Samples, Score, Severity,
     Verdict,
 };
 use greybox_report::page::{
-    Channel, Input, MechanismPlot, ModelTexts, Page, Recording, Residual, Role, Spectrum, StateMap,
+    Channel, Input, Lagged, MechanismPlot, ModelTexts, Page, Recording, Residual, Role, Spectrum, StateMap,
 };
 
 const STEP: f64 = 0.002;
@@ -249,8 +250,21 @@ fn residual(run: &Run, state: usize, windows: &[Interval]) -> Residual {
             y: run.truth.iter().map(|x| x[2]).collect(),
             value: run.truth.iter().map(lacking).collect(),
         }),
+        correlations: vec![correlation(&before, &after)],
         before,
         after,
+    }
+}
+
+fn correlation(before: &[f64], after: &[f64]) -> Lagged {
+    let reach = 100;
+    let [before, after] = [before, after].map(|e| Correlation::of(e, reach).expect("a residual that varies"));
+    Lagged {
+        with: None,
+        lag: (0..=reach).map(|k| k as f64 * STEP).collect(),
+        before: before.values[reach..].to_vec(),
+        after: after.values[reach..].to_vec(),
+        bound: after.bound,
     }
 }
 

@@ -8,7 +8,8 @@ use greybox_model::{Hold, Model, Unit, WriteOptions};
 use greybox_recording::Recording;
 
 use super::{
-    coherent, health_findings, interval, names, recordings, residual, scores, spectra, state_map, times,
+    coherent, correlations, health_findings, interval, names, recordings, residual, scores, spectra,
+    state_map, times,
 };
 use crate::contract::{Finding, Fit, FitSet, InputHold, ModelId, Ordered, Producer, RecordingFit, Severity};
 use crate::format;
@@ -307,6 +308,7 @@ fn residuals(found: &Identification) -> Vec<Residual> {
                 t: times(data, r),
                 spectrum: spectra(data, r, &[], &after, noise_sigma),
                 map: state_map(&found.model, data, [run, run], r, c),
+                correlations: correlations(&found.model, data, [None, Some(run)], r, c),
                 before: Vec::new(),
                 after,
                 noise_sigma,
