@@ -576,8 +576,8 @@ fn spectra(data: &Data, recording: usize, before: &[f64], after: &[f64], sigma: 
     Some(Spectrum { noise: vec![level; freq.len()], freq, before: b, after: a })
 }
 
-/// Most lags of a correlation, to either side.
-const REACH: usize = 100;
+/// Most lags of a correlation that are told, to either side.
+const LAGS: usize = 100;
 
 /// Correlations of the residuals of channel `c` over the longest piece of a recording, before and after.
 fn correlations(
@@ -590,7 +590,9 @@ fn correlations(
     let own = data.pieces.iter().enumerate().filter(|(_, p)| p.recording == recording);
     let Some((i, piece)) = own.max_by_key(|(_, p)| p.len) else { return Vec::new() };
     let n = piece.len;
-    let reach = (n / 10).min(REACH);
+    // A tenth of the recording, in steps that leave so many lags.
+    let stride = (n / 10).div_ceil(LAGS).max(1);
+    let reach = n / 10 / stride * stride;
     let residuals = runs.map(|run| {
         run.map_or_else(Vec::new, |run| -> Vec<f64> {
             piece.measured[c].iter().zip(&run.y[i][c * n..(c + 1) * n]).map(|(m, y)| m - y).collect()
@@ -608,8 +610,9 @@ fn correlations(
             let after = after?;
             // Of itself the residual says the same at both sides.
             let from = if with.is_some() { 0 } else { reach };
-            let lag = (from..=2 * reach).map(|k| (k as f64 - reach as f64) * piece.dt).collect();
-            let part = |c: Correlation| c.values[from..].to_vec();
+            let told = || (from..=2 * reach).step_by(stride);
+            let lag = told().map(|k| (k as f64 - reach as f64) * piece.dt).collect();
+            let part = |c: Correlation| told().map(|k| c.values[k]).collect::<Vec<f64>>();
             let bound = after.bound;
             Some(Lagged { with, lag, before: before.map_or_else(Vec::new, part), after: part(after), bound })
         })

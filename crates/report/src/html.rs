@@ -955,9 +955,9 @@ fn correlation_view(shown: &str, after: &str, found: &Lagged) -> Option<Correlat
         .collect();
     let sizes = sizes.join(", ");
     let (title_html, with) = match &found.with {
-        None => ("With itself, by lag".to_owned(), "itself".to_owned()),
+        None => ("Correlation with itself".to_owned(), "itself".to_owned()),
         Some(input) => {
-            (format!("With the input {}, by lag", expression::html(input)), expression::text(input))
+            (format!("Correlation with the input {}", expression::html(input)), expression::text(input))
         }
     };
     let alt = format!(

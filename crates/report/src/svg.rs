@@ -337,7 +337,7 @@ pub fn correlation_plot(found: &Lagged, alt: &str) -> Option<String> {
     let (before, after) = (told(&found.before), told(&found.after));
     let heights = before.iter().chain(&after).map(|p| p[1]).chain([found.bound, -found.bound]);
     let frame =
-        Frame { x: range(found.lag.iter().copied(), 0.0)?, y: range(heights, 0.08)?, right: WIDTH - 12.0 };
+        Frame { x: range(found.lag.iter().copied(), 0.03)?, y: range(heights, 0.08)?, right: WIDTH - 12.0 };
     let mut out = open(alt);
     frame.axes(&mut out, "lag in s", "correlation");
     let (top, bottom) = (frame.py(found.bound), frame.py(-found.bound));
