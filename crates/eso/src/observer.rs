@@ -193,7 +193,7 @@ impl<const N: usize> Observer<N> {
     /// let design = Design::<3>::from_bandwidth(100.0, [Fal::LINEAR; 3])?;
     /// let observer = Observer::new(design, 1e-3, Scheme::Trapezoidal)?;
     /// let speed = 1e-4 * observer.noise_gain(1)?;
-    /// assert!((speed - 3.6e-3).abs() < 0.1e-3); // 3.6 mrad/s.
+    /// assert!((speed - 3.93e-3).abs() < 0.01e-3); // 3.93 mrad/s.
     /// # Ok::<(), greybox_eso::EsoError>(())
     /// ```
     ///
