@@ -7,6 +7,7 @@ mod bench;
 mod book;
 #[cfg(test)]
 mod corpus;
+mod crates;
 mod demo;
 mod docs;
 mod package;
@@ -50,6 +51,8 @@ enum Task {
     Python,
     /// Build the wheel of the Python package, install it in an environment of its own, and run its tests and notebooks
     PythonPackage,
+    /// Package every crate as it would be published, in the order of their dependencies, and build it from its package
+    Crates(crates::Arguments),
     /// Run what the continuous integration runs (.ci/run)
     Ci,
     /// Print the commands of the README's block behind `<!-- MARKER -->`
@@ -77,6 +80,7 @@ fn main() -> ExitCode {
         Task::Bench(arguments) => bench::run(&root(), &arguments),
         Task::Docs { check } => docs::run(&root(), check),
         Task::Python => python(&root()),
+        Task::Crates(arguments) => crates::run(&root(), &arguments),
         Task::PythonPackage => package::run(&root()),
         Task::Ci => ci(&root()),
         Task::ReadmeCommand { marker } => print_command(&root(), &marker),

@@ -19,8 +19,10 @@ fn manifest(path: &Path) -> Table {
 /// The manifests of all packages of the workspace.
 fn packages() -> Vec<(PathBuf, Table)> {
     let mut paths = vec![root().join("xtask").join("Cargo.toml")];
-    for entry in std::fs::read_dir(root().join("crates")).unwrap() {
-        paths.push(entry.unwrap().path().join("Cargo.toml"));
+    for folder in ["crates", "examples"] {
+        for entry in std::fs::read_dir(root().join(folder)).unwrap() {
+            paths.push(entry.unwrap().path().join("Cargo.toml"));
+        }
     }
     paths.sort();
     paths.into_iter().map(|p| (p.clone(), manifest(&p))).collect()
@@ -75,6 +77,156 @@ fn every_package_is_described_and_linted() {
         }
         let lints = manifest.get("lints").and_then(|l| l.get("workspace")).and_then(Value::as_bool);
         assert_eq!(lints, Some(true), "{place}: write `[lints] workspace = true`");
+    }
+}
+
+/// The packages that are for others: all that do not say `publish = false`.
+fn published() -> Vec<(PathBuf, Table)> {
+    let mut packages = packages();
+    packages.retain(|(_, manifest)| manifest["package"].get("publish").is_none());
+    for (path, _) in &mut packages {
+        path.pop();
+    }
+    packages
+}
+
+/// The categories of the registry that are in use here; others are refused when they are published.
+const CATEGORIES: [&str; 9] = [
+    "command-line-utilities",
+    "embedded",
+    "mathematics",
+    "no-std",
+    "no-std::no-alloc",
+    "parser-implementations",
+    "science",
+    "simulation",
+    "visualization",
+];
+
+/// Words of a list of the manifest.
+fn words<'a>(package: &'a Table, key: &str) -> Vec<&'a str> {
+    let list = package.get(key).and_then(Value::as_array);
+    list.map(|l| l.iter().filter_map(Value::as_str).collect()).unwrap_or_default()
+}
+
+#[test]
+fn every_crate_says_what_a_registry_asks() {
+    let workspace = manifest(&root().join("Cargo.toml"));
+    let common = workspace["workspace"]["package"].as_table().unwrap();
+    let published = published();
+    assert!(published.len() >= 17, "only {} crates are published", published.len());
+    for (folder, manifest) in published {
+        let (place, package) = (folder.display(), manifest["package"].as_table().unwrap());
+        for key in common.keys() {
+            let inherited = package.get(key).and_then(|v| v.get("workspace")).and_then(Value::as_bool);
+            assert_eq!(inherited, Some(true), "{place}: write `{key}.workspace = true`");
+        }
+        let keywords = words(package, "keywords");
+        assert!((1..=5).contains(&keywords.len()), "{place}: one to five keywords");
+        for word in keywords {
+            let plain = word.chars().all(|c| c.is_ascii_lowercase() || c.is_ascii_digit() || c == '-');
+            assert!(plain && word.len() <= 20, "{place}: the keyword {word:?} is too long or not plain");
+        }
+        let categories = words(package, "categories");
+        assert!((1..=5).contains(&categories.len()), "{place}: one to five categories");
+        for category in categories {
+            assert!(CATEGORIES.contains(&category), "{place}: {category:?} is not in CATEGORIES");
+        }
+        assert_eq!(package.get("readme").and_then(Value::as_str), Some("README.md"), "{place}: `readme`");
+        assert_eq!(read(&folder.join("LICENSE")), read(&root().join("LICENSE")), "{place}: LICENSE");
+    }
+}
+
+#[test]
+fn every_crate_has_a_readme_whose_example_is_run() {
+    for (folder, manifest) in published() {
+        let (place, text) = (folder.display(), read(&folder.join("README.md")));
+        let name = manifest["package"]["name"].as_str().unwrap();
+        assert!(text.starts_with(&format!("# {name}\n")), "{place}: the README's title is not {name}");
+        for needed in ["## What it does not do\n", "Licence: MIT"] {
+            assert!(text.contains(needed), "{place}: the README lacks {needed:?}");
+        }
+        let library = folder.join("src").join("lib.rs");
+        if !library.is_file() {
+            assert!(!blocks(&text, "sh").is_empty(), "{place}: the README shows no command");
+            continue;
+        }
+        let code = read(&library);
+        assert!(!blocks(&text, "rust").is_empty(), "{place}: the README has no example that is run");
+        assert!(
+            code.contains("doc = include_str!(\"../README.md\")"),
+            "{place}: nothing runs the README's example"
+        );
+        let promised = if code.contains("#![no_std]") { "`no_std` without features" } else { "needs `std`" };
+        assert!(text.contains(promised), "{place}: the README does not say {promised:?}");
+        let categories = words(manifest["package"].as_table().unwrap(), "categories");
+        let said = categories.contains(&"no-std");
+        assert_eq!(said, code.contains("#![no_std]"), "{place}: the category `no-std`");
+    }
+}
+
+/// Files of a package as it would be published, by their names in it.
+fn packaged(name: &str) -> Vec<String> {
+    let cargo = std::env::var_os("CARGO").unwrap_or_else(|| "cargo".into());
+    let listed = Command::new(cargo)
+        .args(["package", "--list", "--locked", "--offline", "--allow-dirty", "--package", name])
+        .current_dir(root())
+        .output()
+        .unwrap();
+    assert!(listed.status.success(), "{}", String::from_utf8_lossy(&listed.stderr));
+    String::from_utf8(listed.stdout).unwrap().lines().map(|line| line.replace('\\', "/")).collect()
+}
+
+/// Texts in a line of code that lead out of the package, from a file `depth` folders below its root. Those that are
+/// joined to the root start there. Recordings and reference data beside the repository (`../shared`) may be missing.
+fn leads_out(line: &str, depth: usize) -> bool {
+    let depth = if line.contains(".join(") { 0 } else { depth };
+    let texts = line.split('"').skip(1).step_by(2);
+    texts.filter(|t| !t.contains("../shared/")).any(|text| {
+        let ups = text.split('/').take_while(|part| *part == "..").count();
+        ups > depth
+    })
+}
+
+#[test]
+fn a_path_out_of_a_package_is_told_from_one_inside() {
+    assert!(leads_out("include_str!(\"../../../docs/src/page.md\")", 1));
+    assert!(leads_out("Path::new(env!(\"CARGO_MANIFEST_DIR\")).join(\"../cli\")", 2));
+    assert!(leads_out("    .join(\"../../docs\")", 2));
+    assert!(!leads_out("#![doc = include_str!(\"../README.md\")]", 1));
+    assert!(!leads_out("include_str!(\"../../demo/cart.toml\")", 2));
+    assert!(!leads_out("Path::new(env!(\"CARGO_MANIFEST_DIR\")).join(\"../../../shared/trust\")", 1));
+}
+
+#[test]
+fn a_published_crate_needs_no_file_outside_of_it() {
+    let mut found = Vec::new();
+    for (folder, manifest) in published() {
+        let name = manifest["package"]["name"].as_str().unwrap();
+        let files = packaged(name);
+        for needed in ["Cargo.toml", "LICENSE", "README.md"] {
+            assert!(files.iter().any(|f| f == needed), "{name}: the package lacks {needed}");
+        }
+        for file in files.iter().filter(|f| f.ends_with(".rs")) {
+            let depth = file.matches('/').count();
+            for (k, line) in read(&folder.join(file)).lines().enumerate() {
+                if leads_out(line, depth) {
+                    found.push(format!("{name}: {file}:{}: {}", k + 1, line.trim()));
+                }
+            }
+        }
+    }
+    assert!(found.is_empty(), "these leave their package; move or exclude them:\n{}", found.join("\n"));
+}
+
+#[test]
+fn our_crates_are_asked_for_in_the_version_they_have() {
+    let workspace = manifest(&root().join("Cargo.toml"));
+    let version = &workspace["workspace"]["package"]["version"];
+    for (name, value) in workspace["workspace"]["dependencies"].as_table().unwrap() {
+        if value.get("path").is_some() {
+            assert_eq!(value.get("version"), Some(version), "Cargo.toml: {name}");
+        }
     }
 }
 

@@ -1,4 +1,10 @@
 //! Parameter estimation by multiple shooting and output error.
+
+/// The examples of the README are compiled and run with the documentation.
+#[cfg(doctest)]
+#[doc = include_str!("../README.md")]
+struct Readme;
+
 pub mod data;
 pub mod free_run;
 pub mod noise_model;

@@ -4,6 +4,11 @@
 //! and recordings, [`Failure`] is the one error, [`story`] tells reports in plain language. Nothing here prints, knows a
 //! command line or writes a file, so that the command and the Python package give the same answer.
 
+/// The examples of the README are compiled and run with the documentation.
+#[cfg(doctest)]
+#[doc = include_str!("../README.md")]
+struct Readme;
+
 pub mod calibrate;
 pub mod case;
 pub mod check;

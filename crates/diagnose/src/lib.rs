@@ -1,4 +1,10 @@
 //! Finds the physics a simulation leaves out.
+
+/// The examples of the README are compiled and run with the documentation.
+#[cfg(doctest)]
+#[doc = include_str!("../README.md")]
+struct Readme;
+
 pub mod along;
 pub mod candidate;
 pub mod diagnosis;

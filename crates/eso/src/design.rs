@@ -77,6 +77,11 @@ impl<const N: usize> Design<N> {
         self.linear
     }
 
+    /// The linear observer with the gains of the linear regime.
+    pub(crate) fn linearised(&self) -> Self {
+        Self { gains: self.linear, laws: [Fal::LINEAR; N], linear: self.linear }
+    }
+
     /// The step, in s, from which explicit Euler is unstable in the linear regime; zero where it is unstable
     /// with any.
     ///

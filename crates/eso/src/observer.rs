@@ -51,7 +51,8 @@ pub struct Observer<const N: usize> {
 }
 
 impl<const N: usize> Observer<N> {
-    /// The observer for samples `step` seconds apart. It starts at the first sample, at rest.
+    /// The observer for samples `step` seconds apart. It starts at the first sample, at rest: a rate that y has then is
+    /// taken for a disturbance, until the start is forgotten. [`Observer::start_at`] says what is known instead.
     ///
     /// # Errors
     /// [`EsoError::Step`]; with [`Scheme::Euler`], [`EsoError::StepTooLong`]; with the others,
@@ -68,13 +69,7 @@ impl<const N: usize> Observer<N> {
         } else if design.laws().iter().any(|law| law.jumps()) {
             return Err(EsoError::PrintedBranch);
         }
-        let part = scheme.implicit_part() * step;
-        let mut weights = design.gains();
-        let mut power = 1.0;
-        for weight in &mut weights {
-            power *= part;
-            *weight *= power;
-        }
+        let weights = weights(&design, scheme.implicit_part() * step);
         Ok(Self { design, step, scheme, input: None, weights, z: [0.0; N], error: None, started: false })
     }
 
@@ -187,6 +182,53 @@ impl<const N: usize> Observer<N> {
         Ok(self.design.lag(state)? + skew * state as f64)
     }
 
+    /// The noise of an estimate: its standard deviation over that of white noise on the samples of y, once the start is
+    /// forgotten, in the linear regime. In 1/sⁱ for the state i (counted from 0).
+    ///
+    /// It is what [`Design::from_bandwidth`] pays for a short [`lag`](Observer::lag).
+    ///
+    /// ```
+    /// use greybox_eso::{Design, Fal, Observer, Scheme};
+    /// // An encoder with noise of 0.1 mrad, read every millisecond: the speed is then noisy by
+    /// let design = Design::<3>::from_bandwidth(100.0, [Fal::LINEAR; 3])?;
+    /// let observer = Observer::new(design, 1e-3, Scheme::Trapezoidal)?;
+    /// let speed = 1e-4 * observer.noise_gain(1)?;
+    /// assert!((speed - 3.93e-3).abs() < 0.01e-3); // 3.93 mrad/s.
+    /// # Ok::<(), greybox_eso::EsoError>(())
+    /// ```
+    ///
+    /// # Errors
+    /// [`EsoError::State`] where there is no such state.
+    pub fn noise_gain(&self, state: usize) -> Result<f64, EsoError> {
+        if state >= N {
+            return Err(EsoError::State { state, order: N });
+        }
+        // z_{k+1} = A z_k + b y_k + c y_{k+1}. Then w = z − c y follows w_{k+1} = A w_k + (A c + b) y_k, and w_k knows
+        // nothing of y_k: cov z = cov w + c cᵀ.
+        let probe = self.linearised();
+        let responded = |z: [f64; N], now: f64, next: f64| {
+            let mut probe = probe;
+            probe.start_at(z, now);
+            probe.update(next, 0.0)
+        };
+        let b = responded([0.0; N], 1.0, 0.0);
+        let c = responded([0.0; N], 0.0, 1.0);
+        // By columns.
+        let a: [[f64; N]; N] = core::array::from_fn(|j| {
+            responded(core::array::from_fn(|i| if i == j { 1.0 } else { 0.0 }), 0.0, 0.0)
+        });
+        let carried = times(&a, &c);
+        let drive: [f64; N] = core::array::from_fn(|i| carried[i] + b[i]);
+        let variance = stationary(a, drive, state) + c[state] * c[state];
+        Ok(if variance.is_finite() { libm::sqrt(variance) } else { f64::INFINITY })
+    }
+
+    /// The observer of the linear regime, without its input.
+    fn linearised(&self) -> Self {
+        let linear = Self { design: self.design.linearised(), input: None, ..*self };
+        Self { weights: weights(&linear.design, self.scheme.implicit_part() * self.step), ..linear }
+    }
+
     /// The same observer for a record that is run backward in time: yʳ(τ) = y(−τ), where odd derivatives and
     /// the input to an odd one change their sign.
     pub(crate) fn backward(&self) -> Self {
@@ -250,6 +292,47 @@ impl<const N: usize> Observer<N> {
         }
         libm::copysign(e, free - y)
     }
+}
+
+/// hⁱ βᵢ.
+fn weights<const N: usize>(design: &Design<N>, h: f64) -> [f64; N] {
+    let mut weights = design.gains();
+    let mut power = 1.0;
+    for weight in &mut weights {
+        power *= h;
+        *weight *= power;
+    }
+    weights
+}
+
+/// A v, the matrix by columns.
+fn times<const N: usize>(a: &[[f64; N]; N], v: &[f64; N]) -> [f64; N] {
+    core::array::from_fn(|i| (0..N).map(|j| a[j][i] * v[j]).sum())
+}
+
+/// Doublings of the time that a covariance has had to settle; 2⁶⁴ steps are enough for a pole of 1 − 10⁻¹⁵.
+const DOUBLINGS: usize = 64;
+
+/// Entry (state, state) of the covariance P = Σ Aᵏ d dᵀ Aᵏᵀ of w_{k+1} = A w_k + d y_k with white y of variance 1, by
+/// doubling: P ← P + A P Aᵀ, A ← A².
+fn stationary<const N: usize>(mut a: [[f64; N]; N], d: [f64; N], state: usize) -> f64 {
+    let mut p: [[f64; N]; N] = core::array::from_fn(|j| core::array::from_fn(|i| d[i] * d[j]));
+    for _ in 0..DOUBLINGS {
+        // Columns of A P, and then of (A (A P)ᵀ)ᵀ = A P Aᵀ by symmetry.
+        let ap: [[f64; N]; N] = core::array::from_fn(|j| times(&a, &p[j]));
+        let transposed: [[f64; N]; N] = core::array::from_fn(|j| core::array::from_fn(|i| ap[i][j]));
+        let before = p;
+        for (column, added) in p.iter_mut().zip(&transposed) {
+            for (entry, more) in column.iter_mut().zip(times(&a, added)) {
+                *entry += more;
+            }
+        }
+        if p == before {
+            break;
+        }
+        a = core::array::from_fn(|j| times(&a, &a[j]));
+    }
+    p[state][state]
 }
 
 /// Convergence is quadratic; a handful suffices, this many only guard the loop.

@@ -210,3 +210,49 @@ proptest! {
         }
     }
 }
+
+#[test]
+fn the_noise_gain_is_the_sum_of_squares_of_the_impulse_response() {
+    let laws = [Fal::LINEAR, root(0.5, 0.05), root(0.25, 0.01)];
+    let design = Design::<3>::from_bandwidth(60.0, laws).unwrap();
+    for scheme in SCHEMES {
+        let observer = Observer::new(design, 2e-3, scheme).unwrap().with_extended_state(3.0).unwrap();
+        let mut running = observer;
+        running.start_at([0.0; 3], 0.0);
+        // Small, so that it stays within the linear zones.
+        let size = 1e-9;
+        let mut sums = [0.0; 3];
+        for k in 0..5000 {
+            let z = running.update(if k == 0 { size } else { 0.0 }, 0.0);
+            for (sum, z) in sums.iter_mut().zip(z) {
+                *sum += (z / size) * (z / size);
+            }
+        }
+        for (state, sum) in sums.iter().enumerate() {
+            let gain = observer.noise_gain(state).unwrap();
+            assert!(
+                (gain / sum.sqrt() - 1.0).abs() < 1e-9,
+                "{scheme:?}, state {state}: {gain} {}",
+                sum.sqrt()
+            );
+        }
+    }
+}
+
+#[test]
+fn the_noise_gain_of_one_state_is_as_by_hand() {
+    // Implicit Euler: z ← (z + hβ y)/(1 + hβ), whose variance is hβ/(2 + hβ). Explicit: hβ/(2 − hβ).
+    for (h, beta) in [(1e-3, 50.0), (1e-6, 1e-3), (10.0, 1e3)] {
+        let design = Design::new([beta], [Fal::LINEAR]).unwrap();
+        let implicit = Observer::new(design, h, Scheme::Implicit).unwrap().noise_gain(0).unwrap();
+        let exact = (h * beta / (2.0 + h * beta)).sqrt();
+        assert!((implicit / exact - 1.0).abs() < 1e-6, "{implicit} {exact}");
+        if h * beta < 1.0 {
+            let euler = Observer::new(design, h, Scheme::Euler).unwrap().noise_gain(0).unwrap();
+            let exact = (h * beta / (2.0 - h * beta)).sqrt();
+            assert!((euler / exact - 1.0).abs() < 1e-6, "{euler} {exact}");
+        }
+    }
+    let observer = Observer::new(Design::thesis(), 1e-3, Scheme::Euler).unwrap();
+    assert_eq!(observer.noise_gain(2), Err(EsoError::State { state: 2, order: 2 }));
+}

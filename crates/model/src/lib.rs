@@ -66,6 +66,11 @@
 //! See [`parse`](mod@parse) for the grammar, [`Func`] for the functions, [`units`] for units. `t` is
 //! the time since the start of the recording, `pi` the constant.
 
+/// The examples of the README are compiled and run with the documentation.
+#[cfg(doctest)]
+#[doc = include_str!("../README.md")]
+struct Readme;
+
 pub mod algebra;
 mod dimension;
 mod display;

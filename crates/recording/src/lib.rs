@@ -39,6 +39,11 @@
 //! # Ok::<(), greybox_recording::RecordingError>(())
 //! ```
 
+/// The examples of the README are compiled and run with the documentation.
+#[cfg(doctest)]
+#[doc = include_str!("../README.md")]
+struct Readme;
+
 mod correlation;
 pub mod csv;
 mod error;

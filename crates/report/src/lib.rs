@@ -32,6 +32,11 @@
 //!
 //! [`convert`] fills these types from a finished diagnosis; nothing here decides, reads a file or prints.
 
+/// The examples of the README are compiled and run with the documentation.
+#[cfg(doctest)]
+#[doc = include_str!("../README.md")]
+struct Readme;
+
 pub mod compare;
 pub mod contract;
 pub mod control;

@@ -55,11 +55,6 @@ use crate::summary::{
 };
 use crate::{ReportError, sentence};
 
-/// The page of the book, whose example is compiled and run with the documentation.
-#[cfg(doctest)]
-#[doc = include_str!("../../../docs/src/folders.md")]
-struct Book;
-
 /// The statistics of one recording; `page` is where its `report.html` is, from the summary.
 pub fn map(recording: &str, page: Option<&str>, report: &Report) -> Statistics {
     let result = RecordingResult {

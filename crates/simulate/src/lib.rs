@@ -1,4 +1,10 @@
 //! Simulation of greybox models: events, true stick–slip, delays, forward sensitivities.
+
+/// The examples of the README are compiled and run with the documentation.
+#[cfg(doctest)]
+#[doc = include_str!("../README.md")]
+struct Readme;
+
 mod aligned;
 mod integrate;
 pub mod rigs;

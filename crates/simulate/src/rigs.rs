@@ -1,4 +1,4 @@
-//! Virtual rigs: the plants of M. Leylaz's thesis (University of California, Merced, 2021) written out in Rust.
+//! Virtual rigs: the plants of G. Leylaz's thesis (University of California, Merced, 2021) written out in Rust.
 //!
 //! A rig makes recordings whose physics is known. It is written without the model language and without this
 //! crate's integrator, so that nothing which later explains a recording can share an error with what made it.

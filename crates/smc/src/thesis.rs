@@ -1,4 +1,4 @@
-//! The law of M. Leylaz's thesis (University of California, Merced, 2021), section 4.2, as it stands there: for the
+//! The law of G. Leylaz's thesis (University of California, Merced, 2021), section 4.2, as it stands there: for the
 //! rotary flexible link only, to reproduce its figures.
 //!
 //! Two things keep it from being the law of this crate. Its flat output belongs to a link without stiffness and

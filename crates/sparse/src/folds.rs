@@ -23,6 +23,27 @@ pub struct Split {
     pub test: Vec<Range<usize>>,
 }
 
+impl Split {
+    /// Rows of one recording: the first `ratio` of them for training and the rest for the test, with `gap` rows dropped
+    /// between. [`train_test`] is the same for several pieces.
+    ///
+    /// # Errors
+    /// As [`train_test`]; [`SparseError::Empty`] without rows.
+    ///
+    /// ```
+    /// use greybox_sparse::Split;
+    /// let split = Split::of_rows(100, 0.5, 5)?;
+    /// assert_eq!((&split.train[..], &split.test[..]), (&[0..50][..], &[55..100][..]));
+    /// # Ok::<(), greybox_sparse::SparseError>(())
+    /// ```
+    pub fn of_rows(rows: usize, ratio: f64, gap: usize) -> Result<Self, SparseError> {
+        if rows == 0 {
+            return Err(SparseError::Empty { what: "rows" });
+        }
+        train_test(std::slice::from_ref(&(0..rows)), ratio, gap)
+    }
+}
+
 /// Cross-validation folds over disjoint parts of the rows.
 ///
 /// The parts are what is factorised once; a fold is trained on some and judged on others.

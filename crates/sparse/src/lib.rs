@@ -20,9 +20,11 @@ pub mod triangle;
 
 pub use bootstrap::{Bootstrap, BootstrapOptions, Penalty, Resample, bootstrap, stability};
 pub use covariance::{Covariance, covariance};
+pub use criteria::Criterion;
 pub use error::SparseError;
+pub use folds::Split;
 pub use gram::{BlockGram, Gram};
 pub use library::{Function, Library, Term};
 pub use rows::Rows;
-pub use select::{Options, OrderModel, Problem, Rule, Search, Selector, search};
+pub use select::{FoldKind, Options, OrderModel, Problem, Rule, SampleSize, Search, Selector, search};
 pub use triangle::{Fit, Triangle};

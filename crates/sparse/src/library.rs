@@ -315,7 +315,24 @@ impl Library {
         self.terms.iter().map(|t| t.label(&self.variables)).collect()
     }
 
-    /// Values of every term, one column each, from the variables' samples and those of the named expressions.
+    /// The terms whose coefficient is not zero, as text, each with it: a found model to be read. `coefficients` are those
+    /// of the library's terms in their order; what lies beyond them is left out.
+    ///
+    /// ```
+    /// use greybox_sparse::Library;
+    /// let library = Library::total_degree(&["x", "v"], 2, false);
+    /// assert_eq!(library.labels(), ["x", "v", "x^2", "x*v", "v^2"]);
+    /// let model = library.named(&[-75.0, 0.0, 0.0, 0.5, 0.0]);
+    /// assert_eq!(model, [("x".to_string(), -75.0), ("x*v".to_string(), 0.5)]);
+    /// ```
+    #[must_use]
+    pub fn named(&self, coefficients: &[f64]) -> Vec<(String, f64)> {
+        let present = self.terms.iter().zip(coefficients).filter(|(_, c)| **c != 0.0);
+        present.map(|(term, &c)| (term.label(&self.variables), c)).collect()
+    }
+
+    /// Values of every term, one column each, from the variables' samples and those of the named expressions (an empty
+    /// slice where the library has no [`Function::Expression`]).
     /// A monomial costs one multiplication per sample wherever the library holds its factor of one degree less.
     ///
     /// # Errors

@@ -86,9 +86,20 @@ pub struct Options {
     pub sample_size: SampleSize,
 }
 
+impl Default for Options {
+    /// [`Options::normalised`]: the choice of terms does not depend on the units of the columns.
+    fn default() -> Self {
+        Self::normalised()
+    }
+}
+
 impl Options {
     /// Thresholds on raw coefficients, 40 values in 10⁻²..1, minimum of 5 contiguous folds, AIC: what recovers
     /// the thesis' Duffing oscillator (coefficients of one size).
+    ///
+    /// **The choice depends on the units.** The same oscillator in millimetres has a stiffness and a cubic term below
+    /// every threshold of the grid that would part them from nothing. Where the coefficients are not known to be of
+    /// one size near 1, take [`Options::normalised`].
     #[must_use]
     pub fn raw() -> Self {
         Self {
