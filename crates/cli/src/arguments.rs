@@ -244,3 +244,42 @@ impl Cli {
         }
     }
 }
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use clap::CommandFactory;
+
+    #[test]
+    fn the_book_lists_every_command_and_option() {
+        let page = include_str!("../../../docs/src/commands.md");
+        for command in Cli::command().get_subcommands() {
+            let name = command.get_name();
+            assert!(page.contains(&format!("| `{name}` |")), "{name} is not in the table of commands");
+            let mut sections = page.split("\n## ").filter(|s| s.starts_with('`'));
+            let section =
+                sections.find(|s| s.lines().next().is_some_and(|l| l.contains(&format!("`{name}`"))));
+            let options = command.get_arguments().filter(|a| !a.is_global_set() && !a.is_positional());
+            for option in options.filter_map(|a| a.get_long()).filter(|o| *o != "help") {
+                let listed = section.is_some_and(|s| s.contains(&format!("--{option}")));
+                assert!(listed, "`{name} --{option}` is not in docs/src/commands.md");
+            }
+        }
+    }
+
+    #[test]
+    fn the_book_lists_no_option_that_is_not_there() {
+        let page = include_str!("../../../docs/src/commands.md");
+        let command = Cli::command();
+        let known: Vec<&str> = std::iter::once(&command)
+            .chain(command.get_subcommands())
+            .flat_map(|c| c.get_arguments().filter_map(|a| a.get_long()))
+            .chain(["help"])
+            .collect();
+        for rest in page.split("--").skip(1) {
+            let name: String = rest.chars().take_while(|c| c.is_ascii_lowercase() || *c == '-').collect();
+            let name = name.trim_end_matches('-');
+            assert!(name.is_empty() || known.contains(&name), "--{name} is no option");
+        }
+    }
+}
