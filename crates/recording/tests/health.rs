@@ -137,8 +137,8 @@ fn coarse_quantisation_is_a_warning_and_fine_one_is_not_mentioned() {
 
 #[test]
 fn levels_that_were_commanded_are_no_quantisation() {
-    // Every half second another of seven levels, in tenths of a volt; as a sensor's reading it would be coarse.
-    let levels = [0.4, -1.1, 3.2, 1.8, -2.5, 0.9, -0.6];
+    // Every half second another of whole volts; as a sensor's reading it would be coarse.
+    let levels = [1.0, -2.0, 3.0, 2.0, -3.0, 1.0, -1.0];
     let steps: Vec<f64> = (0..N).map(|k| levels[(k / 50) % levels.len()]).collect();
     let both = recording(&[("u", steps.clone())]);
     assert_eq!(find(&check(&both, &["u"], &[]), "quantisation"), None);

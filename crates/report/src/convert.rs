@@ -187,14 +187,13 @@ fn converted(expression: &str, model: &Model) -> Option<String> {
     if unit.factor == 1.0 || expression.contains(['*', '/', '^']) {
         return None;
     }
-    let rate = (first.len() - name.len()) as f64;
+    let rate = first.len() - name.len();
     let angle = unit.dimension.is_none() && unit.text != "%";
-    let si = if angle { "rad".to_owned() } else { Unit::si(unit.dimension).text };
     Some(match rate {
-        0.0 => si,
-        1.0 if angle => "rad/s".to_owned(),
+        0 if angle => "rad".to_owned(),
+        1 if angle => "rad/s".to_owned(),
         _ if angle => format!("rad/s^{rate}"),
-        _ => Unit::si(unit.dimension / Dimension::TIME.pow(rate)).text,
+        _ => Unit::si(unit.dimension / Dimension::TIME.pow(rate as f64)).text,
     })
 }
 

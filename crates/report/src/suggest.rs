@@ -228,11 +228,10 @@ fn words(way: Way, e: &Experiment, input: Option<&InputRange>, unit: &str, separ
         }
         if let (Some(variable), Some(range)) = (&e.variable, e.range)
             && !matches!(way, Way::Silent | Way::Ramp(_) | Way::Beyond(_))
+            && let Some(condition) = crate::sentence::condition(variable, range, unit)
         {
-            if let Some(condition) = crate::sentence::condition(variable, range, unit) {
-                let through = if way == Way::Wide { "beyond" } else { "through" };
-                text.push_str(&format!(", {through} {condition}"));
-            }
+            let through = if way == Way::Wide { "beyond" } else { "through" };
+            text.push_str(&format!(", {through} {condition}"));
         }
     }
     match (text.is_empty(), separate.is_empty()) {
