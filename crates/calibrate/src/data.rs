@@ -3,7 +3,7 @@
 use std::ops::Range;
 use std::sync::OnceLock;
 
-use greybox_model::{Hold, Model};
+use greybox_model::{Hold, Model, nearest};
 use greybox_recording::{Recording, smooth::Smoothed};
 use greybox_simulate::{Environment, FINE, Signal};
 
@@ -13,7 +13,7 @@ use greybox_simulate::{Environment, FINE, Signal};
 pub enum DataError {
     /// A channel that the model needs is not in the file.
     #[error(
-        "{file}: there is no channel `{channel}`, which the model's {role} needs; the file has {available}. Rename the column, or state the channel in the model: `{name} = {{ channel = \"…\" }}`"
+        "{file}: there is no channel `{channel}`, which the model's {role} needs; the file has {available}. {mend}"
     )]
     MissingChannel {
         /// File.
@@ -22,10 +22,10 @@ pub enum DataError {
         channel: String,
         /// Input, state or measurement of the model.
         role: String,
-        /// Name in the model.
-        name: String,
         /// What there is instead.
         available: String,
+        /// How to give the model a channel of the file.
+        mend: String,
     },
     /// The header's unit and the model's do not measure the same thing.
     #[error(
@@ -143,7 +143,7 @@ impl Data {
         let mut pieces = Vec::new();
         let mut sigmas: Vec<Vec<f64>> = vec![Vec::new(); model.measurements.len()];
         for (index, recording) in recordings.iter().enumerate() {
-            let find = |channel: &str, role: String, name: &str, unit: &greybox_model::Unit| {
+            let find = |channel: &str, role: String, name: Option<&str>, unit: &greybox_model::Unit| {
                 find_channel(recording, channel, role, name, unit)
             };
             let mut inputs = Vec::new();
@@ -151,13 +151,15 @@ impl Data {
                 inputs.push(find(
                     &input.channel,
                     format!("input `{}`", input.name),
-                    &input.name,
+                    Some(&input.name),
                     &input.unit,
                 )?);
             }
             let mut measured = Vec::new();
             for m in &model.measurements {
-                measured.push(find(&m.channel, format!("measurement `{}`", m.expr), &m.channel, &m.unit)?);
+                let state = model.states.iter().find(|s| s.channel.as_ref() == Some(&m.channel));
+                let name = state.map(|s| s.name.as_str());
+                measured.push(find(&m.channel, format!("measurement `{}`", m.expr), name, &m.unit)?);
             }
             let scaled = |(channel, factor): (usize, f64), piece: &greybox_recording::Piece| -> Vec<f64> {
                 piece.columns[channel].iter().map(|v| v * factor).collect()
@@ -297,11 +299,30 @@ impl Data {
     }
 }
 
+/// How to give the model, which looks for `channel`, one that the recording has.
+fn mend(channel: &str, name: Option<&str>, recording: &Recording) -> String {
+    let there = recording.channels.iter().map(|c| c.name.as_str());
+    // Of a name of one or two letters, any other is a slip away.
+    let near = nearest(channel, there).filter(|_| channel.chars().count() > 2);
+    let (slip, column) = match near {
+        Some(near) => (format!("Did you mean `{near}`? "), near),
+        None => (String::new(), "…"),
+    };
+    let in_model = match name {
+        Some(name) => format!("`{name} = {{ channel = \"{column}\" }}`"),
+        None => format!("`{column}` in the place of `{channel}` under `[measurements]`"),
+    };
+    format!(
+        "{slip}Name the column on the command line, `--map {channel}={column}`, or in the model, {in_model}"
+    )
+}
+
+/// Column and factor to SI of a channel. `name` is that of the input or the state which it feeds alone.
 fn find_channel(
     recording: &Recording,
     channel: &str,
     role: String,
-    name: &str,
+    name: Option<&str>,
     unit: &greybox_model::Unit,
 ) -> Result<(usize, f64), DataError> {
     let file = recording.name.clone();
@@ -311,8 +332,8 @@ fn find_channel(
             file,
             channel: channel.to_string(),
             role,
-            name: name.to_string(),
             available: greybox_recording::told(available),
+            mend: mend(channel, name, recording),
         });
     };
     let found = &recording.channels[index];

@@ -11,6 +11,7 @@ use serde::Serialize;
 use serde_json::json;
 
 use crate::failure::Failure;
+use crate::plausible;
 
 /// What is said of one recording.
 #[derive(Debug, Serialize)]
@@ -54,7 +55,9 @@ pub fn check(
             Some(model) => {
                 let feeds = |name: &str, unit: Option<&str>| feeds(model, name, unit);
                 let (inputs, outputs) = roles(model);
-                describe(recording, findings(recording, &inputs, &outputs), feeds)
+                let mut findings = findings(recording, &inputs, &outputs);
+                findings.extend(plausible::findings(model, recording));
+                describe(recording, findings, feeds)
             }
             None => {
                 let findings = check_with_inputs(recording, inputs);

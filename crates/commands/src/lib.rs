@@ -17,6 +17,7 @@ pub mod diagnose;
 mod failure;
 pub mod identify;
 pub mod loading;
+mod plausible;
 pub mod simulate;
 pub mod story;
 

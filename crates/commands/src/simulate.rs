@@ -91,7 +91,7 @@ fn window(data: &Data) -> f64 {
 
 /// A free run whose initial states weigh the residuals by the model's own error, so that a model that
 /// leaves something out does not bend its start to hide it.
-fn settled_run(setup: &Setup, parameters: &[f64]) -> FreeRun {
+pub(crate) fn settled_run(setup: &Setup, parameters: &[f64]) -> FreeRun {
     let data = &setup.data;
     let rough: Vec<f64> = data.spread.iter().map(|s| s.max(f64::MIN_POSITIVE)).collect();
     let run = setup.free_run(parameters, &rough);

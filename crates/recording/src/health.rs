@@ -60,7 +60,9 @@ fn check_channel(recording: &Recording, c: usize, role: Role) -> Vec<Finding> {
     let pieces: Vec<&[f64]> = recording.pieces.iter().map(|piece| piece.columns[c].as_slice()).collect();
     let longest = pieces.iter().copied().max_by_key(|y| y.len()).unwrap_or(&[]);
     findings.extend(clipping(channel, longest));
-    findings.extend(quantisation(channel, longest));
+    if role == Role::Output || !is_set_level_by_level(longest) {
+        findings.extend(quantisation(channel, longest));
+    }
     findings.extend(outliers(recording, c));
     let full = fill_missing(longest);
     if full.len() < 16 || finite_range(&full).is_none_or(|(low, high)| low == high) {
@@ -227,6 +229,14 @@ fn clipping(channel: &Channel, y: &[f64]) -> Vec<Finding> {
         }
     }
     findings
+}
+
+/// Whether a signal stands still most of the time and then jumps, mostly over several of its steps: levels that
+/// somebody set, no rounded motion, which goes from one step to the next.
+fn is_set_level_by_level(y: &[f64]) -> bool {
+    let Some(q) = quantisation_step(y) else { return false };
+    let moves: Vec<f64> = y.windows(2).map(|w| (w[1] - w[0]).abs()).filter(|d| *d > 0.5 * q).collect();
+    5 * moves.len() < y.len() && median(&moves) > 1.5 * q
 }
 
 fn quantisation(channel: &Channel, y: &[f64]) -> Option<Finding> {

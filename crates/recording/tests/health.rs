@@ -136,6 +136,22 @@ fn coarse_quantisation_is_a_warning_and_fine_one_is_not_mentioned() {
 }
 
 #[test]
+fn levels_that_were_commanded_are_no_quantisation() {
+    // Every half second another of whole volts; as a sensor's reading it would be coarse.
+    let levels = [1.0, -2.0, 3.0, 2.0, -3.0, 1.0, -1.0];
+    let steps: Vec<f64> = (0..N).map(|k| levels[(k / 50) % levels.len()]).collect();
+    let both = recording(&[("u", steps.clone())]);
+    assert_eq!(find(&check(&both, &["u"], &[]), "quantisation"), None);
+    assert_eq!(find(&check(&both, &[], &[]), "quantisation"), None);
+    assert!(of_output(steps, "quantisation").is_some());
+    // A slow command through a coarse converter goes from one step to the next.
+    let coarse: Vec<f64> =
+        (0..N).map(|k| ((2.0 * PI * 0.05 * DT * k as f64).sin() / 0.1).round() * 0.1).collect();
+    let input = check(&recording(&[("u", coarse)]), &["u"], &[]);
+    assert_eq!(find(&input, "quantisation").unwrap().severity, Severity::Warning);
+}
+
+#[test]
 fn spikes_are_counted_and_steps_are_not() {
     let mut y = noisy_multisine();
     y[1234] += 0.5;

@@ -290,6 +290,9 @@ pub struct Location {
     /// Ranges of expressions of the model language (`theta'`, `abs(v)`); an open end is `null`.
     #[serde(default)]
     pub region: Ordered<[Option<f64>; 2]>,
+    /// SI unit of those expressions of `region` whose variables have another unit in the model (`rad` for `deg`).
+    #[serde(default, skip_serializing_if = "Ordered::is_empty")]
+    pub region_units: Ordered<String>,
     /// Frequency band in Hz.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub band_hz: Option<Interval>,

@@ -8,7 +8,7 @@ use greybox_calibrate::{Data, FreeRun};
 use greybox_diagnose::diagnosis::{Estimate as Estimated, Finding as Found, Role as RoleRuns, Run};
 use greybox_diagnose::locate::{Location as Located, spectrum};
 use greybox_diagnose::{Calibration, Diagnosis, Verdict as Answer};
-use greybox_model::{Model, Unit, WriteOptions};
+use greybox_model::{Dimension, Model, Unit, WriteOptions};
 use greybox_recording::{Correlation, Recording, Severity as Level, health};
 
 use crate::contract::*;
@@ -45,7 +45,7 @@ pub fn report(diagnosis: &Diagnosis, sources: &Sources<'_>) -> Report {
         mechanisms: d.mechanisms.iter().map(|m| mechanism(m, &d.improved, &basis)).collect(),
         remainder: Remainder {
             significant: d.remainder.significant,
-            location: location(&d.remainder.location),
+            location: location(&d.remainder.location, &d.nominal),
             share_of_residual: d.remainder.share_of_residual,
             experiment: plan.as_ref().map(|plan| plan.text.clone()),
             experiment_plan: plan,
@@ -129,7 +129,7 @@ fn reaching<'a>(model: &'a Model, equations: &[String]) -> Option<&'a str> {
 fn remainder_plan(d: &Diagnosis, basis: &Basis) -> Option<Experiment> {
     let shape = d.remainder.shape.as_ref()?;
     let input = reaching(&d.nominal, &d.remainder.location.equations);
-    Some(suggest::for_remainder(&location(&d.remainder.location), input, basis, shape))
+    Some(suggest::for_remainder(&location(&d.remainder.location, &d.nominal), input, basis, shape))
 }
 
 /// The experiment that separates a mechanism from its alternatives, if it has any.
@@ -150,7 +150,7 @@ fn plan(found: &Found, improved: &Model, basis: &Basis) -> Option<Experiment> {
         found.input.as_ref().and_then(|n| improved.input(n)).map_or(1.0, |i| improved.inputs[i].unit.factor);
     let scaled =
         |name: &str| value(name).map(|v| if matches!(name, "udz" | "usat") { v / factor } else { v });
-    let location = location(&found.location);
+    let location = location(&found.location, improved);
     Some(suggest::experiment(
         &Subject {
             kind: &found.kind,
@@ -174,6 +174,27 @@ fn coherent(unit: &Unit) -> String {
         return "rad".to_owned();
     }
     Unit::si(unit.dimension).text
+}
+
+/// The SI unit of a state, an input or a sum of them where the model states its variable in another unit, which a
+/// reader would take the number for.
+fn converted(expression: &str, model: &Model) -> Option<String> {
+    let plain = |token: &&str| token.starts_with(|c: char| c.is_alphabetic()) && *token != "abs";
+    let first = crate::expression::tokens(expression).into_iter().find(plain)?;
+    let name = first.trim_end_matches('\'');
+    let state = model.states.iter().find(|s| s.name == name).map(|s| &s.unit);
+    let unit = state.or_else(|| model.inputs.iter().find(|i| i.name == name).map(|i| &i.unit))?;
+    if unit.factor == 1.0 || expression.contains(['*', '/', '^']) {
+        return None;
+    }
+    let rate = first.len() - name.len();
+    let angle = unit.dimension.is_none() && unit.text != "%";
+    Some(match rate {
+        0 if angle => "rad".to_owned(),
+        1 if angle => "rad/s".to_owned(),
+        _ if angle => format!("rad/s^{rate}"),
+        _ => Unit::si(unit.dimension / Dimension::TIME.pow(rate as f64)).text,
+    })
 }
 
 /// The unit of a figure that follows from the parameters: frequencies in Hz, damping ratios are pure.
@@ -227,7 +248,7 @@ fn mechanism(found: &Found, improved: &Model, basis: &Basis) -> Mechanism {
             })
             .collect(),
         experiment: plan(found, improved, basis),
-        location: location(&found.location),
+        location: location(&found.location, improved),
     }
 }
 
@@ -235,7 +256,7 @@ fn estimate(e: &Estimated, unit: String) -> Estimate {
     Estimate { value: e.value, ci95: interval(e.ci95, 1.0), unit }
 }
 
-fn location(l: &Located) -> Location {
+fn location(l: &Located, model: &Model) -> Location {
     Location {
         equation: (!l.equations.is_empty()).then(|| equation_names(&l.equations)),
         windows_s: l
@@ -244,6 +265,11 @@ fn location(l: &Located) -> Location {
             .map(|(file, w)| (file.clone(), w.iter().map(|(a, b)| Interval { low: *a, high: *b }).collect()))
             .collect(),
         region: l.region.iter().map(|(e, lo, hi)| (e.clone(), [*lo, *hi])).collect(),
+        region_units: l
+            .region
+            .iter()
+            .filter_map(|(e, ..)| converted(e, model).map(|unit| (e.clone(), unit)))
+            .collect(),
         band_hz: l.band.map(|(a, b)| Interval { low: a, high: b }),
     }
 }
@@ -732,5 +758,34 @@ mod tests {
         assert_eq!(experiment.input.as_deref(), Some("u"), "the input of the equation");
         let band = experiment.band_hz.unwrap();
         assert!(band.low < 4.0 && 4.0 < band.high, "around f0: {band:?}");
+    }
+
+    #[test]
+    fn numbers_in_si_are_told_where_the_model_has_other_units() {
+        let text = r#"
+            [inputs]
+            q = { unit = "L/min" }
+            [states]
+            phi = { unit = "deg" }
+            psi = { unit = "rad" }
+            h = { unit = "cm" }
+            [parameters]
+            J = { value = 1.0, unit = "s^2" }
+            A = { value = 1.0, unit = "m^2" }
+            [equations]
+            a = "J*phi'' + phi = 0"
+            b = "J*psi'' + psi = 0"
+            c = "A*h' = q"
+        "#;
+        let model = Model::from_toml(text, "m.toml").unwrap();
+        let told = |e: &str| converted(e, &model);
+        assert_eq!(told("phi").as_deref(), Some("rad"));
+        assert_eq!(told("phi'").as_deref(), Some("rad/s"));
+        assert_eq!(told("abs(h')").as_deref(), Some("m/s"));
+        assert_eq!(told("q").as_deref(), Some("m^3/s"));
+        assert_eq!(told("phi - psi").as_deref(), Some("rad"));
+        for plain in ["psi'", "t", "z", "h*q"] {
+            assert_eq!(told(plain), None, "{plain}");
+        }
     }
 }

@@ -1096,7 +1096,7 @@ fn location(location: &Location, page: &Page) -> Vec<(&'static str, String)> {
     if !names.is_empty() {
         out.push(("Equation", names.join(", ")));
     }
-    let when = sentence::region(&location.region);
+    let when = sentence::region(location);
     if !when.is_empty() {
         out.push(("Acts when", sentence::joined(&when, "and")));
     }

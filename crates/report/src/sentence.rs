@@ -6,8 +6,11 @@ pub mod control;
 pub mod identified;
 pub mod recordings;
 
-use crate::contract::{Fit, FitSet, Interval, Location, Mechanism, Names, Ordered, Report, Verdict};
+use crate::contract::{Fit, FitSet, Interval, Location, Mechanism, Names, Report, Verdict};
 use crate::{expression, format};
+
+/// Forces of free shape that explain less of the residual than this explain nothing.
+const SHAPELESS: f64 = 0.05;
 
 /// A held-out error that is larger by less than this is the same.
 const LOSS: f64 = 1.02;
@@ -35,10 +38,18 @@ pub fn summary(report: &Report) -> Vec<String> {
         Verdict::Unexplained => {
             let place = place(&report.remainder.location);
             let share = format::probability(report.remainder.share_of_residual);
-            out.push(format!(
-                "Something is missing from the model{place}, and no mechanism in the library explains it; it \
-                 makes up {share} of the residual."
-            ));
+            out.push(if report.remainder.share_of_residual < SHAPELESS {
+                format!(
+                    "Something is missing from the model{place}, and neither a mechanism of the library nor a force of \
+                     any other shape explains it ({share} of the residual). Look at the model before its physics: \
+                     the signs, the units, and what each channel measures (`greybox check --model` tells)."
+                )
+            } else {
+                format!(
+                    "Something is missing from the model{place}, and no mechanism in the library explains it; it \
+                     makes up {share} of the residual."
+                )
+            });
             out.extend(
                 report
                     .remainder
@@ -135,7 +146,7 @@ pub fn mechanism_sentence(mechanism: &Mechanism) -> String {
     if !values.is_empty() {
         text.push_str(&format!("; {}", values.join(", ")));
     }
-    let when = region(&mechanism.location.region);
+    let when = region(&mechanism.location);
     if !when.is_empty() {
         text.push_str(&format!("; it acts when {}", joined(&when, "and")));
     }
@@ -152,27 +163,30 @@ pub fn equations(names: &Names) -> String {
 }
 
 /// The ranges of a region as conditions: `|θ′| < 0.2`, `x > 0.1`, `−0.1 < v < 0.4`.
-pub fn region(ranges: &Ordered<[Option<f64>; 2]>) -> Vec<String> {
+pub fn region(location: &Location) -> Vec<String> {
     let mut out = Vec::new();
-    for (source, &[low, high]) in ranges {
-        let shown = expression::text(source);
-        let (low, high) = (low.filter(|v| v.is_finite()), high.filter(|v| v.is_finite()));
-        match (low, high) {
-            (Some(low), Some(high)) if low < 0.0 && (low + high).abs() <= 0.02 * (high - low) => {
-                out.push(format!("|{shown}| < {}", format::plain(0.5 * (high - low))));
-            }
-            (Some(0.0), Some(high)) if source.starts_with("abs(") => {
-                out.push(format!("{shown} < {}", format::plain(high)));
-            }
-            (Some(low), Some(high)) => {
-                out.push(format!("{} < {shown} < {}", format::plain(low), format::plain(high)));
-            }
-            (Some(low), None) => out.push(format!("{shown} > {}", format::plain(low))),
-            (None, Some(high)) => out.push(format!("{shown} < {}", format::plain(high))),
-            (None, None) => {}
-        }
+    for (source, &range) in &location.region {
+        let unit = location.region_units.get(source);
+        out.extend(condition(source, range, unit.map_or("", String::as_str)));
     }
     out
+}
+
+/// A range as a condition, with `unit` where it is not empty; `None` for a range without ends.
+pub fn condition(source: &str, [low, high]: [Option<f64>; 2], unit: &str) -> Option<String> {
+    let shown = expression::text(source);
+    let (low, high) = (low.filter(|v| v.is_finite()), high.filter(|v| v.is_finite()));
+    let number = |value| format::with_unit(&format::plain(value), unit);
+    Some(match (low, high) {
+        (Some(low), Some(high)) if low < 0.0 && (low + high).abs() <= 0.02 * (high - low) => {
+            format!("|{shown}| < {}", number(0.5 * (high - low)))
+        }
+        (Some(0.0), Some(high)) if source.starts_with("abs(") => format!("{shown} < {}", number(high)),
+        (Some(low), Some(high)) => format!("{} < {shown} < {}", format::plain(low), number(high)),
+        (Some(low), None) => format!("{shown} > {}", number(low)),
+        (None, Some(high)) => format!("{shown} < {}", number(high)),
+        (None, None) => return None,
+    })
 }
 
 /// A frequency band as text, `0.1 … 2 Hz`, or `None` where unknown.
@@ -188,7 +202,7 @@ pub fn band(band_hz: Option<Interval>) -> Option<String> {
 
 fn place(location: &Location) -> String {
     let mut text = location.equation.as_ref().map(equations).unwrap_or_default();
-    let when = region(&location.region);
+    let when = region(location);
     if !when.is_empty() {
         text.push_str(&format!(", when {}", joined(&when, "and")));
     }
@@ -276,13 +290,23 @@ mod tests {
 
     #[test]
     fn regions_read_as_conditions() {
-        let one = |name: &str, range| region(&Ordered::from_iter([(name.to_owned(), range)])).join(";");
+        let one = |name: &str, range| condition(name, range, "").unwrap_or_default();
         assert_eq!(one("theta'", [Some(-0.2), Some(0.2)]), "|θ′| < 0.2");
         assert_eq!(one("x1 - x2", [Some(-1.0), Some(1.0)]), "|x₁ − x₂| < 1");
         assert_eq!(one("x", [Some(-0.1), Some(0.4)]), "−0.1 < x < 0.4");
         assert_eq!(one("v", [Some(2.0), None]), "v > 2");
         assert_eq!(one("abs(v)", [Some(0.0), Some(1.0)]), "|v| < 1");
         assert_eq!(one("v", [None, Some(f64::INFINITY)]), "");
+    }
+
+    #[test]
+    fn a_number_that_is_not_in_the_unit_of_the_model_has_its_unit() {
+        let location = Location {
+            region: [("theta".to_owned(), [Some(1.0), None]), ("v".to_owned(), [None, Some(2.0)])].into(),
+            region_units: [("theta".to_owned(), "rad".to_owned())].into(),
+            ..Location::default()
+        };
+        assert_eq!(region(&location), ["θ > 1 rad", "v < 2"]);
     }
 
     #[test]

@@ -154,7 +154,8 @@ pub fn experiment(subject: &Subject<'_>, basis: &Basis) -> Experiment {
         variable: region.map(|(name, _)| name.clone()),
         range: region.map(|(_, range)| *range),
     };
-    found.text = words(way, &found, input, subject.separate);
+    let unit = region.and_then(|(name, _)| subject.location.region_units.get(name));
+    found.text = words(way, &found, input, unit.map_or("", String::as_str), subject.separate);
     found
 }
 
@@ -167,7 +168,7 @@ pub fn for_remainder(location: &Location, input: Option<&str>, basis: &Basis, sh
     let input = basis.input(subject.input);
     let mut found = experiment(&subject, basis);
     found.amplitude = input.and_then(|i| interval([i.largest, LOUDER * i.largest]));
-    found.text = words(Way::Loud, &found, input, &separate);
+    found.text = words(Way::Loud, &found, input, "", &separate);
     found
 }
 
@@ -197,7 +198,7 @@ fn decade(frequency: f64, basis: &Basis) -> Option<[f64; 2]> {
 }
 
 /// `Drive u slowly, 0.05 … 0.3 Hz, up to 2 V, with θ′ from −0.2 to 0.2; then …`.
-fn words(way: Way, e: &Experiment, input: Option<&InputRange>, separate: &str) -> String {
+fn words(way: Way, e: &Experiment, input: Option<&InputRange>, unit: &str, separate: &str) -> String {
     let mut text = String::new();
     if let (Some(input), Some(amplitude)) = (input, e.amplitude) {
         let name = expression::text(&input.name);
@@ -227,12 +228,10 @@ fn words(way: Way, e: &Experiment, input: Option<&InputRange>, separate: &str) -
         }
         if let (Some(variable), Some(range)) = (&e.variable, e.range)
             && !matches!(way, Way::Silent | Way::Ramp(_) | Way::Beyond(_))
+            && let Some(condition) = crate::sentence::condition(variable, range, unit)
         {
-            let one = Ordered::from_iter([(variable.clone(), range)]);
-            for condition in crate::sentence::region(&one) {
-                let through = if way == Way::Wide { "beyond" } else { "through" };
-                text.push_str(&format!(", {through} {condition}"));
-            }
+            let through = if way == Way::Wide { "beyond" } else { "through" };
+            text.push_str(&format!(", {through} {condition}"));
         }
     }
     match (text.is_empty(), separate.is_empty()) {

@@ -335,6 +335,7 @@ fn mechanism(windows: Vec<Interval>) -> Mechanism {
             windows_s: map([("train.csv", windows)]),
             region: map([("theta'", [Some(-0.6), Some(0.6)])]),
             band_hz: Some(Interval::new(0.1, 2.0)),
+            ..Location::default()
         },
     }
 }
