@@ -195,7 +195,7 @@ fn a_bad_recording_is_named_with_line_and_column() {
         (with_cell("NaN"), &["bad.csv:4:x (column 3)", "`NaN`", "leave the cell empty"]),
         (with_cell("broken"), &["bad.csv:4:x (column 3)", "`broken` is not a number"]),
         (String::new(), &["bad.csv", "the file is empty", "header row"]),
-        (good.replacen("x [mm]", "y [mm]", 1), &["bad.csv", "no channel `x`", "`f`, `y`", "Rename"]),
+        (good.replacen("x [mm]", "y [mm]", 1), &["bad.csv", "no channel `x`", "`f`, `y`", "--map x="]),
         (good.replacen("x [mm]", "x [kg]", 1), &["bad.csv", "`x` is in [kg]", "`m`"]),
         (good.lines().take(4).collect::<Vec<_>>().join("\n"), &["bad.csv", "3 rows", "8 are needed"]),
     ];

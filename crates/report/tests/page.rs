@@ -234,11 +234,13 @@ fn an_empty_page_is_a_page() {
     page.report.fit = Default::default();
     page.report.findings.clear();
     page.report.inputs.clear();
-    for (verdict, says) in [
-        (Verdict::Consistent, "nothing beyond measurement noise is missing"),
-        (Verdict::Unexplained, "no mechanism in the library explains it"),
+    for (verdict, remainder, says) in [
+        (Verdict::Consistent, 0.0, "nothing beyond measurement noise is missing"),
+        (Verdict::Unexplained, 0.3, "no mechanism in the library explains it"),
+        (Verdict::Unexplained, 0.001, "greybox check --model"),
     ] {
         page.report.verdict = verdict;
+        page.report.remainder.share_of_residual = remainder;
         page.report.summary.clear();
         let html = page.to_html().unwrap();
         assert!(html.contains(says), "{verdict:?}");
