@@ -81,7 +81,11 @@ impl Model {
         if fresh {
             space_sections(root);
         }
-        let text = document.to_string();
+        let mut text = document.to_string();
+        // The last line gets an end even where the original's has none.
+        if !fresh && text.ends_with('\n') && options.original.is_some_and(|t| !t.ends_with('\n')) {
+            text.pop();
+        }
         let text = if newline == "\r\n" { text.replace("\r\n", "\n").replace('\n', "\r\n") } else { text };
         // Editors of Windows begin a file with a byte order mark.
         if !fresh && options.original.is_some_and(|t| t.starts_with(MARK)) {

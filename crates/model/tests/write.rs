@@ -48,6 +48,10 @@ fn an_unchanged_model_is_the_same_text() {
     assert_eq!(write(&model, &text), text);
     let windows = text.replace('\n', "\r\n");
     assert_eq!(write(&load(&windows), &windows), windows);
+    // Without an end of the last line; found by the fuzzer.
+    for open in [text.trim_end(), windows.trim_end()] {
+        assert_eq!(write(&load(open), open), open);
+    }
     // As the editors of Windows begin a file; found by the fuzzer.
     let marked = format!("\u{feff}{windows}");
     assert_eq!(write(&load(&marked), &marked), marked);
