@@ -25,7 +25,7 @@ use std::sync::Arc;
 /// smallest thread stack at this depth. Nested parentheses count, and so do the terms of one sum.
 pub const MAX_DEPTH: usize = 400;
 
-/// Deepest nesting of parentheses, function calls, signs and powers.
+/// Deepest nesting of parentheses, function calls, signs and powers, as written and as printed.
 const MAX_NESTING: usize = 100;
 
 /// A parsed expression with the places of its parts in the text.
@@ -146,6 +146,14 @@ pub fn parse_equation(text: &str) -> Result<ParsedEquation, SyntaxError> {
         lhs: Parser::new(text, &left).whole()?,
         rhs: Parser::new(text, &tokens[at + 1..]).whole()?,
     })
+}
+
+fn too_nested(span: Range<usize>) -> SyntaxError {
+    error(
+        span,
+        format!("the expression is nested deeper than {MAX_NESTING} levels"),
+        Some("drop needless parentheses and signs, or split it".into()),
+    )
 }
 
 fn error(span: Range<usize>, message: impl Into<String>, help: Option<String>) -> SyntaxError {
@@ -326,6 +334,8 @@ struct Parser<'a> {
     tokens: &'a [Token],
     position: usize,
     nesting: usize,
+    /// The most that it was.
+    deepest: usize,
     names: Vec<(Arc<str>, u8, Range<usize>)>,
     spans: Vec<Range<usize>>,
 }
@@ -340,16 +350,29 @@ struct Node {
 impl<'a> Parser<'a> {
     /// `tokens` ends with [`Kind::End`].
     fn new(text: &'a str, tokens: &'a [Token]) -> Self {
-        Parser { text, tokens, position: 0, nesting: 0, names: Vec::new(), spans: Vec::new() }
+        Parser { text, tokens, position: 0, nesting: 0, deepest: 0, names: Vec::new(), spans: Vec::new() }
     }
 
+    /// Everything there is, which can be printed and read again: what is printed has a parenthesis around every sign
+    /// that stands behind an operator or another sign.
     fn whole(mut self) -> Result<Parsed, SyntaxError> {
+        let node = self.read()?;
+        // A level of the text is printed as three at most.
+        if self.deepest > MAX_NESTING / 3 {
+            let printed = node.expr.to_string();
+            let again = lex(&printed).and_then(|tokens| Parser::new(&printed, &tokens).read().map(drop));
+            again.map_err(|_| too_nested(node.span))?;
+        }
+        Ok(Parsed { expr: node.expr, names: self.names, spans: self.spans })
+    }
+
+    fn read(&mut self) -> Result<Node, SyntaxError> {
         let node = self.expression(0)?;
         let token = self.peek();
         if token.kind != Kind::End {
             return Err(self.unexpected_after(&node));
         }
-        Ok(Parsed { expr: node.expr, names: self.names, spans: self.spans })
+        Ok(node)
     }
 
     fn peek(&self) -> &'a Token {
@@ -388,13 +411,10 @@ impl<'a> Parser<'a> {
     /// An expression whose operators all bind at least as tight as `minimum`.
     fn expression(&mut self, minimum: u8) -> Result<Node, SyntaxError> {
         if self.nesting >= MAX_NESTING {
-            return Err(error(
-                self.peek().span.clone(),
-                format!("the expression is nested deeper than {MAX_NESTING} levels"),
-                Some("drop needless parentheses, or split it".into()),
-            ));
+            return Err(too_nested(self.peek().span.clone()));
         }
         self.nesting += 1;
+        self.deepest = self.deepest.max(self.nesting);
         let mut left = self.operand(minimum)?;
         while let Kind::Op(op) = self.peek().kind {
             let (own, right) = match op {

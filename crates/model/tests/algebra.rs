@@ -316,6 +316,30 @@ fn deep_input_is_an_error_not_a_crash() {
     parse(&format!("{}x{}", "(".repeat(60), ")".repeat(60))).unwrap();
 }
 
+/// What is printed has parentheses that the text did without, and is read again all the same.
+#[test]
+fn what_is_read_can_be_printed_and_read_again() {
+    let signs = |n: usize| format!("{}x", "-".repeat(n));
+    let powers = |n: usize| format!("{}x", "2^-".repeat(n));
+    let factors = |n: usize| format!("{}x", "a*-sin(".repeat(n)) + &")".repeat(n);
+    for text in [&signs as &dyn Fn(usize) -> String, &powers, &factors] {
+        let mut longest = 0;
+        for n in 1..200 {
+            match parse(&text(n)) {
+                Ok(parsed) => {
+                    let printed = parsed.expr.to_string();
+                    let again = parse(&printed).unwrap_or_else(|e| panic!("{printed}: {}", e.message));
+                    assert_eq!(again.expr, parsed.expr);
+                    longest = n;
+                }
+                Err(error) => assert!(error.message.contains("nested deeper"), "{}", error.message),
+            }
+        }
+        // Far beyond what people write.
+        assert!((20..100).contains(&longest), "{} {longest}", text(3));
+    }
+}
+
 /// text → place of the error, then fragments of its message.
 #[test]
 fn syntax_errors_name_the_mend() {
