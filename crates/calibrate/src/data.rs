@@ -4,7 +4,7 @@ use std::ops::Range;
 use std::sync::OnceLock;
 
 use greybox_model::{Hold, Model, nearest};
-use greybox_recording::{Recording, smooth::Smoothed};
+use greybox_recording::{Recording, SIZES, smooth::Smoothed};
 use greybox_simulate::{Environment, FINE, Signal};
 
 /// A recording that does not fit the model.
@@ -79,9 +79,6 @@ pub enum DataError {
     #[error("the model has no measured state: give one a channel, or add [measurements]")]
     NothingMeasured,
 }
-
-/// Magnitude beyond which sums of squares and of their products leave the numbers.
-const LARGEST: f64 = 1e100;
 
 /// A measured channel.
 #[derive(Debug, Clone, PartialEq)]
@@ -361,7 +358,7 @@ fn find_channel(
         }
     };
     let largest = found.values.iter().map(|v| (v * factor).abs()).fold(0.0, f64::max);
-    if largest > LARGEST {
+    if largest > *SIZES.end() {
         return Err(DataError::OutOfRange { file, channel: channel.to_string(), largest });
     }
     Ok((index, factor))

@@ -106,6 +106,8 @@ pub struct Work {
     given_up: AtomicBool,
     /// Most of it; 0: no limit.
     most: u64,
+    /// Most of one fit; 0: no limit.
+    most_of_fit: u64,
 }
 
 impl Work {
@@ -113,6 +115,12 @@ impl Work {
     /// other; of several at once it would depend on chance which one ends.
     pub fn within(most: u64) -> Work {
         Work { most: most.max(1), ..Work::default() }
+    }
+
+    /// Work of which each fit does at most so much: it then ends with the step that it is at, which is the same
+    /// whatever other fits do.
+    pub fn of_fits_within(most: u64) -> Work {
+        Work { most_of_fit: most.max(1), ..Work::default() }
     }
 
     /// Whether it met its limit.
@@ -136,9 +144,16 @@ impl Work {
         self.given_up.load(Ordering::Relaxed)
     }
 
-    fn add(&self, trajectory: &Trajectory, lanes: usize, system: &System) {
-        let work = trajectory.evaluations * (1 + lanes) * system.rhs.registers();
-        self.done.fetch_add(work as u64, Ordering::Relaxed);
+    /// Whether a fit that did so much has to end.
+    fn ends(&self, fit: u64) -> bool {
+        self.is_given_up() || self.is_spent() || (self.most_of_fit > 0 && fit > self.most_of_fit)
+    }
+
+    /// Adds a simulation, and says how much it was.
+    fn add(&self, trajectory: &Trajectory, lanes: usize, system: &System) -> u64 {
+        let work = (trajectory.evaluations * (1 + lanes) * system.rhs.registers()) as u64;
+        self.done.fetch_add(work, Ordering::Relaxed);
+        work
     }
 }
 
@@ -183,6 +198,8 @@ pub struct SegmentRows {
     pub signals: Vec<f64>,
     /// The trajectory behind it (its sensitivities moved out).
     pub trajectory: Trajectory,
+    /// What it cost, in units of [`Work`].
+    pub work: u64,
 }
 
 /// How a fit ended.
@@ -367,7 +384,7 @@ impl Problem<'_> {
             let (trajectory, carry) = simulation.run_on(start, range, before, carried);
             (trajectory, Some(carry))
         };
-        self.work.add(&trajectory, seeds.lanes(), self.system);
+        let work = self.work.add(&trajectory, seeds.lanes(), self.system);
         let missing: Vec<Vec<bool>> = match self.noise {
             Some(_) => (0..ny).map(|c| self.missing(segment, c)).collect(),
             None => Vec::new(),
@@ -441,7 +458,7 @@ impl Problem<'_> {
             }
             trajectory.dy = Vec::new();
         }
-        (SegmentRows { rows, r, jx, jp, signals: columns, trajectory }, carry)
+        (SegmentRows { rows, r, jx, jp, signals: columns, trajectory, work }, carry)
     }
 
     fn prior_cost(&self, parameters: &[f64]) -> f64 {
@@ -508,9 +525,11 @@ impl Problem<'_> {
         let mut iterations = 0;
         let mut rows = self.rows(&point, true, None);
         let mut cost = self.cost_of(&rows, &point);
+        let work_of = |rows: &[SegmentRows]| rows.iter().map(|s| s.work).sum::<u64>();
+        let mut work = work_of(&rows);
         let mut small = 0;
         let mut sizes = vec![0.0; np];
-        while iterations < limits.iterations && !self.work.is_given_up() && !self.work.is_spent() {
+        while iterations < limits.iterations && !self.work.ends(work) {
             iterations += 1;
             let reduced: Vec<Reduced> = rows
                 .par_iter()
@@ -585,7 +604,9 @@ impl Problem<'_> {
                         }
                     }
                 }
-                let value = self.cost(&trial);
+                let simulated = self.rows(&trial, false, None);
+                let value = self.cost_of(&simulated, &trial);
+                work += work_of(&simulated);
                 // How much of the decrease that the linear model promised came true says how far it reaches.
                 let gained = if value.is_finite() { (cost - value) / promised } else { f64::NEG_INFINITY };
                 if gained <= 0.25 {
@@ -620,6 +641,7 @@ impl Problem<'_> {
             }
             if iterations < limits.iterations {
                 rows = self.rows(&point, true, None);
+                work += work_of(&rows);
             }
         }
         let rows = self.rows(&point, false, None);

@@ -71,5 +71,5 @@ pub use crate::mat::parse_mat;
 #[cfg(feature = "parquet")]
 pub use crate::parquet::parse_parquet;
 pub use crate::read::{EXTENSIONS, is_device, read, told};
-pub use crate::recording::{Channel, MIN_SAMPLES, Piece, Recording};
+pub use crate::recording::{Channel, MIN_SAMPLES, Piece, Recording, SIZES};
 pub use crate::rename::{Rename, RenameError};

@@ -189,7 +189,7 @@ impl Recording {
 }
 
 /// Sizes that values and sampling steps may have: their squares and sums of squares stay numbers.
-const SIZES: std::ops::RangeInclusive<f64> = 1e-100..=1e100;
+pub const SIZES: std::ops::RangeInclusive<f64> = 1e-100..=1e100;
 
 /// No channel is larger than can be computed with, nor so small that its squares are zero.
 fn check_sizes(label: &str, channels: &[Channel]) -> Result<(), RecordingError> {

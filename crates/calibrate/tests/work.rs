@@ -1,0 +1,44 @@
+//! What a fit may cost.
+#![allow(missing_docs, clippy::unwrap_used)]
+
+mod common;
+use std::sync::Arc;
+
+use common::*;
+use greybox_calibrate::{Ending, Fit, Limits, Point, Setup, Work};
+use greybox_model::Model;
+use rayon::prelude::*;
+
+/// A fit with little work ends early with the step that it is at, and with the same one whatever other fits do.
+#[test]
+fn a_fit_ends_at_its_own_limit() {
+    let (n, dt) = (600, 0.01);
+    let f = force(7, n, dt, 1.0, 5.0);
+    let model = Model::from_toml(OSCILLATOR, "oscillator.toml").unwrap();
+    let measured = measure(&model, &f, dt, &[0.0, 0.0]);
+    let free = setup(&model, &f, dt, &measured);
+    let level = free.level(4);
+    let fit = |most: Option<u64>| -> (Fit, u64) {
+        let work = Arc::new(most.map_or_else(Work::default, Work::of_fits_within));
+        let setup = Setup { work: work.clone(), ..free.clone() };
+        let parameters: Vec<f64> = setup.values().iter().map(|v| 3.0 * v).collect();
+        let point = Point { starts: setup.starts(&level, &parameters), parameters };
+        let limits = Limits { iterations: 50, tolerance: 1e-12 };
+        let fits: Vec<Fit> = (0..4)
+            .into_par_iter()
+            .map(|_| setup.fit(&level, &free.data.sigma, std::slice::from_ref(&point), limits))
+            .collect();
+        for other in &fits {
+            assert_eq!(other.point, fits[0].point);
+        }
+        (fits[0].clone(), work.done() / 4)
+    };
+    let (whole, cost) = fit(None);
+    assert_eq!(whole.ending, Ending::Converged);
+    let (half, spent) = fit(Some(cost / 2));
+    assert_eq!(half.ending, Ending::Limit);
+    assert!(half.iterations < whole.iterations && half.iterations > 1, "{}", half.iterations);
+    assert!((cost / 2..cost).contains(&spent), "{spent} of {cost}");
+    let (same, _) = fit(Some(2 * cost));
+    assert_eq!(same.point, whole.point);
+}
