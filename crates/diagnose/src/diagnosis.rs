@@ -18,7 +18,7 @@ use crate::library::{Mechanism, MechanismError, built_in};
 use crate::locate::{Location, force, locate};
 use crate::place::{Motion, Place};
 use crate::search::{
-    Fitted, Found, Part, Rival, Search, UNDECIDED, log_likelihood_gain, raw_rms, raw_rss, rms,
+    Fitted, Found, MOST_WORK, Part, Rival, Search, UNDECIDED, log_likelihood_gain, raw_rms, raw_rss, rms,
 };
 use crate::surface::{Surface, Variable, held_out};
 use crate::uncertainty::Uncertainty;
@@ -40,7 +40,7 @@ pub struct Options {
 
 impl Default for Options {
     fn default() -> Options {
-        Options { seed: 0, library: None, work: crate::search::MOST_WORK }
+        Options { seed: 0, library: None, work: MOST_WORK }
     }
 }
 
@@ -225,6 +225,15 @@ pub struct Role {
     pub improved: Run,
 }
 
+/// Some of the mechanisms, and what the model with these alone leaves.
+#[derive(Debug, Clone, PartialEq)]
+pub struct Subset {
+    /// Indices into [`Diagnosis::mechanisms`], rising.
+    pub mechanisms: Vec<usize>,
+    /// Residual sum of squares, noise included, over that of the calibrated model; its parameters refitted.
+    pub left: f64,
+}
+
 /// Everything a report needs.
 #[derive(Debug)]
 pub struct Diagnosis {
@@ -238,6 +247,8 @@ pub struct Diagnosis {
     pub improved: Model,
     /// Mechanisms, largest share first.
     pub mechanisms: Vec<Finding>,
+    /// What fewer of several mechanisms would leave: none, each alone, all but one, all. Empty where there is one, or none.
+    pub subsets: Vec<Subset>,
     /// Remainder.
     pub remainder: Remainder,
     /// Parameters of the nominal model.
@@ -278,7 +289,8 @@ pub fn diagnose(
         None => built_in()?,
     };
     let Layout { train, holdout, source } = layout(model, train, holdout)?;
-    let nominal = Setup::new(model, train.clone(), free_parameters(model))?;
+    let laid_out = Setup::new(model, train.clone(), free_parameters(model))?;
+    let nominal = Setup { work: Arc::new(Work::of_fits_within(options.work)), ..laid_out };
     observer.begins(&nominal.work);
     let mut search = Search::new(nominal.clone(), &library, observer);
     search.most_work = options.work;
@@ -368,7 +380,7 @@ fn conclude(
     } else {
         // The search fits the baseline with a scale that its mechanisms made small, and only where it goes on with
         // it. What is compared with is the best that the equations can do alone.
-        let alone = alone(nominal, false, &Untold(observer));
+        let alone = alone(nominal, false, options.work, &Untold(observer));
         limited |= alone.limited;
         let alone = Baseline::of(&alone, &nominal.values());
         if alone.misfit.total_cmp(&baseline.misfit).is_lt() {
@@ -377,9 +389,9 @@ fn conclude(
         polish(&found.improved, &found.scale, window)
     };
     let scale = residual_scale(&improved, &found.scale);
-    let Baseline { polished: Polished { fitted: calibrated, origin: calibrated_origin }, .. } = baseline;
-    let calibrated_scale = baseline.scale;
-    let calibrated_widths = Uncertainty::of(&calibrated_origin, &calibrated_scale).widths();
+    let Baseline { polished: Polished { fitted: calibrated, origin: own }, scale: calibrated_scale, .. } =
+        baseline;
+    let calibrated_widths = Uncertainty::of(&own, &calibrated_scale).widths();
     let uncertainty = Uncertainty::of(&origin, &scale);
     let improved_widths = uncertainty.widths();
     let value_of = |f: &Fitted, widths: &[f64], index: usize| {
@@ -444,17 +456,20 @@ fn conclude(
     let full: f64 = raw_rss(&improved, &found.scale).iter().sum();
     let base = search.rss_at(&calibrated, &improved, &found.scale);
     let left = Left::of(&improved, &found, &comparable, surface.as_ref(), base);
-    let shares: Vec<f64> = (0..improved.parts.len())
+    let without: Vec<f64> = (0..improved.parts.len())
         .into_par_iter()
-        .map(|i| {
-            let without = search.rss_without(&improved, &[i], &found.scale).unwrap_or(base);
-            ((without - full) / base.max(1e-300)).clamp(0.0, 1.0)
-        })
+        .map(|i| search.rss_without(&improved, &[i], &calibrated, &found.scale).unwrap_or(base))
         .collect();
+    let share = |rss: f64| (rss / base.max(1e-300)).clamp(0.0, 1.0);
+    let alone = rss_alone(search, (&calibrated, &improved), &found.scale, &without, base);
+    let lost: Vec<f64> = without.iter().map(|rss| share(rss - full)).collect();
+    let gained: Vec<f64> = alone.iter().map(|rss| share(base - rss)).collect();
+    let shares = divided(&lost, &gained, share(base - full));
     // Two laws that share one work lose little each when the other takes over, and all together.
     let redundant = |a: usize, b: usize| {
-        let both = search.rss_without(&improved, &[a.max(b), a.min(b)], &found.scale).unwrap_or(base);
-        (both - full) / base.max(1e-300) > REDUNDANT * (shares[a] + shares[b])
+        let both = search.rss_without(&improved, &[a.max(b), a.min(b)], &calibrated, &found.scale);
+        let both = both.unwrap_or(base);
+        (both - full) / base.max(1e-300) > REDUNDANT * (lost[a] + lost[b])
     };
     // A law that another one, which the library has no name for, stands in for.
     let doubts: Vec<Option<f64>> = (0..improved.parts.len())
@@ -462,9 +477,8 @@ fn conclude(
         .map(|i| search.doubt(&found.improved, i, &found.scale))
         .collect();
     let beaten = |i: usize| doubts[i].is_some_and(|d| d > UNDECIDED);
-    let is_imitation = (0..doubts.len()).any(|i| {
-        beaten(i) && (shares[i] > CORRECTION || (0..doubts.len()).any(|j| i != j && redundant(i, j)))
-    });
+    let is_imitation = (0..doubts.len())
+        .any(|i| beaten(i) && (lost[i] > CORRECTION || (0..doubts.len()).any(|j| i != j && redundant(i, j))));
     let verdict = match left.verdict(improved.parts.len()) {
         Verdict::MissingPhysics if is_imitation => Verdict::Unexplained,
         Verdict::MissingPhysics
@@ -476,12 +490,16 @@ fn conclude(
         verdict => verdict,
     };
     let significant = left.significant(improved.parts.len()) || verdict == Verdict::Unexplained;
-    let mut mechanisms = if verdict == Verdict::MissingPhysics {
-        let shares = divided(search, &improved, &found.scale, &shares, (base, full));
-        findings(&improved, &found, &nominal.model, library, &scale, &shares, &train_role, &uncertainty)
-    } else {
-        Vec::new()
-    };
+    let (mut mechanisms, mut subsets) = (Vec::new(), Vec::new());
+    if verdict == Verdict::MissingPhysics {
+        mechanisms =
+            findings(&improved, &found, &nominal.model, library, &scale, &shares, &train_role, &uncertainty);
+        subsets = subsets_of(
+            &shares,
+            [&alone, &without].map(|rss| rss.iter().copied().map(share).collect()),
+            share(full),
+        );
+    }
     for (i, m) in mechanisms.iter_mut().enumerate() {
         // What is still missing may be what was taken for this.
         if significant
@@ -494,10 +512,20 @@ fn conclude(
         }
     }
     mechanisms.sort_by(|a, b| b.share_explained.total_cmp(&a.share_explained));
-    let remainder = remainder(&improved, surface, significant, full / base.max(1e-300));
+    let unexplained = verdict != Verdict::MissingPhysics && !improved.parts.is_empty();
+    // What is not believed explains nothing: all that the equations lack is what is missing. (Where too little is
+    // known of the noise for that, what those mechanisms leave over shows the place.)
+    let lacks = if unexplained { self::surface(&calibrated, &calibrated_scale) } else { None };
+    let remainder = match lacks {
+        Some(lacks) => remainder(&calibrated, Some(lacks), significant, 1.0),
+        None => {
+            let all = if unexplained { share(base - full) } else { 0.0 };
+            let left = remainder(&improved, surface, significant, share(full));
+            Remainder { share_of_residual: (all + left.share_of_residual).min(1.0), ..left }
+        }
+    };
     let noise_floor = train.sigma.iter().zip(&train.spread).map(|(s, d)| s / d.max(1e-300)).collect();
     let holds = nominal.holds.iter().copied().zip(improved.setup.holds.iter().copied()).collect();
-    let unexplained = verdict != Verdict::MissingPhysics && !improved.parts.is_empty();
     if unexplained {
         // What is not believed improves nothing.
         train_role.improved = train_role.calibrated.clone();
@@ -510,6 +538,7 @@ fn conclude(
         improved: if unexplained { calibrated_model.clone() } else { improved_model },
         calibrated: calibrated_model,
         mechanisms,
+        subsets,
         remainder,
         parameters,
         train: train_role,
@@ -541,12 +570,13 @@ impl Observer for Untold<'_> {
 }
 
 /// A search that changes parameters, and the holds of inputs if it may, and nothing else.
-fn alone(nominal: &Setup, keep_holds: bool, observer: &dyn Observer) -> Found {
+fn alone(nominal: &Setup, keep_holds: bool, most_work: u64, observer: &dyn Observer) -> Found {
     // With a limit of work of its own.
-    let nominal = Setup { work: Arc::default(), ..nominal.clone() };
+    let nominal = Setup { work: Arc::new(Work::of_fits_within(most_work)), ..nominal.clone() };
     observer.begins(&nominal.work);
     let mut search = Search::new(nominal, &[], observer);
     search.keep_holds = keep_holds;
+    search.most_work = most_work;
     search.run()
 }
 
@@ -652,26 +682,57 @@ fn polish(fitted: &Fitted, scale: &[f64], window: f64) -> Polished {
     }
 }
 
-/// What each part explains of the residual `base` of which all leave `full`: the mean of what it takes away alone and
-/// of what is missed without it (`lost`), which are two figures where parts take over from each other, scaled so that
-/// they add up to what all explain. Of two parts it is Shapley's value (L. S. Shapley, *A value for n-person games*, 1953).
-fn divided(
+/// Residual sum of squares with each part alone, refitted; `without` is that without each part, `base` that without all.
+fn rss_alone(
     search: &Search<'_>,
-    improved: &Fitted,
+    (calibrated, improved): (&Fitted, &Fitted),
     scale: &[f64],
-    lost: &[f64],
-    (base, full): (f64, f64),
+    without: &[f64],
+    base: f64,
 ) -> Vec<f64> {
+    match without {
+        // All there is, and without the other.
+        [] | [_] => vec![0.0; without.len()],
+        [first, second] => vec![*second, *first],
+        _ => (0..without.len())
+            .into_par_iter()
+            .map(|i| {
+                let others: Vec<usize> = (0..without.len()).rev().filter(|&j| j != i).collect();
+                search.rss_without(improved, &others, calibrated, scale).unwrap_or(base)
+            })
+            .collect(),
+    }
+}
+
+/// What is left of the residual with each part `alone` and `without` each, for parts that are told in the order of their
+/// shares; nothing where there are no two.
+fn subsets_of(shares: &[f64], [alone, without]: [Vec<f64>; 2], all: f64) -> Vec<Subset> {
+    let n = shares.len();
+    if n < 2 {
+        return Vec::new();
+    }
+    let mut order: Vec<usize> = (0..n).collect();
+    order.sort_by(|a, b| shares[*b].total_cmp(&shares[*a]));
+    let mut subsets = vec![Subset { mechanisms: Vec::new(), left: 1.0 }];
+    subsets.extend(order.iter().enumerate().map(|(at, i)| Subset { mechanisms: vec![at], left: alone[*i] }));
+    if n > 2 {
+        subsets.extend(order.iter().enumerate().rev().map(|(at, i)| Subset {
+            mechanisms: (0..n).filter(|other| *other != at).collect(),
+            left: without[*i],
+        }));
+    }
+    subsets.push(Subset { mechanisms: (0..n).collect(), left: all });
+    subsets
+}
+
+/// What each part explains of a residual of which they explain `all`: the mean of what it takes away alone (`gained`)
+/// and of what is missed without it (`lost`), which are two figures where parts take over from each other, scaled so
+/// that they add up. Of two parts it is Shapley's value (L. S. Shapley, *A value for n-person games*, 1953).
+fn divided(lost: &[f64], gained: &[f64], all: f64) -> Vec<f64> {
     if lost.len() < 2 {
         return lost.to_vec();
     }
-    let gained = |i: usize| {
-        let others: Vec<usize> = (0..lost.len()).rev().filter(|&j| j != i).collect();
-        let alone = search.rss_without(improved, &others, scale).unwrap_or(base);
-        ((base - alone) / base.max(1e-300)).clamp(0.0, 1.0)
-    };
-    let means: Vec<f64> = (0..lost.len()).into_par_iter().map(|i| 0.5 * (gained(i) + lost[i])).collect();
-    let all = ((base - full) / base.max(1e-300)).clamp(0.0, 1.0);
+    let means: Vec<f64> = lost.iter().zip(gained).map(|(l, g)| 0.5 * (l + g)).collect();
     let sum: f64 = means.iter().sum();
     means.into_iter().map(|m| if sum > 0.0 { m * all / sum } else { 0.0 }).collect()
 }
@@ -709,9 +770,10 @@ fn figure(
 }
 
 /// A list that describes some other law piece by piece: three or more forces on one and the same motion, or two
-/// of one family beside which forces of free shape still explain something (`remains`), each a considerable part
-/// of what is missing, or the two `redundant`: nearly superfluous beside each other. (Beside a law that explains
-/// nearly everything, small corrections are what a real machine has.)
+/// of one family beside which a constant stands (a law and the first terms of its series) or forces of free shape
+/// still explain something (`remains`), each a considerable part of what is missing, or the two `redundant`: nearly
+/// superfluous beside each other. (Beside a law that explains nearly everything, small corrections are what a real
+/// machine has.)
 fn is_patchwork(
     improved: &Fitted,
     shares: &[f64],
@@ -744,8 +806,22 @@ fn is_patchwork(
         let here = |l: &&(usize, &Motion, &str, bool)| l.3 && l.1.coefficients == motion.coefficients;
         laws.iter().filter(here).filter(|l| considerable(l.0)).count()
     };
+    // A force that depends on nothing.
+    let is_constant = |part: &Part| {
+        let mut depends = false;
+        part.instance.expression.walk(&mut |e| {
+            depends |= matches!(e, Expr::Var { name, .. } if improved.setup.model.parameter(name).is_none());
+        });
+        !depends
+    };
+    let beside_constant = |motion: &Motion| {
+        improved.parts.iter().enumerate().any(|(i, part)| match &part.candidate.place {
+            Place::Equation(e) => motion.weights[*e] != 0.0 && considerable(i) && is_constant(part),
+            _ => false,
+        })
+    };
     laws.iter().any(|l| considerable(l.0) && patches(l.1) >= PATCHES)
-        || (remains && (0..laws.len()).any(|b| (0..b).any(|a| relatives(a, b))))
+        || (0..laws.len()).any(|b| (0..b).any(|a| relatives(a, b) && (remains || beside_constant(laws[a].1))))
 }
 
 /// Whether a law stands beside another one of the same variables on the same motion: two shapes of a
@@ -1256,7 +1332,7 @@ pub fn calibrate(
 ) -> Result<Calibration, DiagnoseError> {
     let Layout { train, holdout, source } = layout(model, train, holdout)?;
     let nominal = Setup::new(model, train.clone(), free_parameters(model))?;
-    let found = alone(&nominal, true, observer);
+    let found = alone(&nominal, true, MOST_WORK, observer);
     let durations: Vec<f64> = train.pieces.iter().map(|p| (p.len.saturating_sub(1)) as f64 * p.dt).collect();
     let window = window_length(&durations, train.pieces.iter().map(|p| p.dt).fold(0.0, f64::max));
     let Baseline { polished: Polished { fitted, origin }, scale, .. } =

@@ -19,7 +19,9 @@ pub mod spectra;
 pub mod surface;
 mod uncertainty;
 
-pub use diagnosis::{Calibration, DiagnoseError, Diagnosis, Estimate, Options, Verdict, calibrate, diagnose};
+pub use diagnosis::{
+    Calibration, DiagnoseError, Diagnosis, Estimate, Options, Subset, Verdict, calibrate, diagnose,
+};
 pub use library::{Mechanism, MechanismError, built_in};
 
 use std::sync::Arc;

@@ -34,7 +34,7 @@ const SLOWEST: f64 = 10.0;
 const MOST_SAMPLES: usize = 5000;
 /// Work after which nothing more is looked for: laws that the library lacks are pieced together from mechanisms with
 /// memories and delays, each slower to simulate than the one before.
-pub const MOST_WORK: u64 = 80_000_000_000;
+pub const MOST_WORK: u64 = 120_000_000_000;
 /// Most mechanisms that are looked for.
 const MOST_MECHANISMS: usize = 4;
 /// Most candidates that are fitted per round.
@@ -76,6 +76,9 @@ const FINALISTS: usize = 5;
 const MORE_STEPS: usize = 12;
 const BEST: usize = 2;
 const LAST_STEPS: usize = 40;
+/// Steps of a fit without a part, for each that is left out, and how much of the others it may begin with.
+const STEPS_WITHOUT: usize = 10;
+const FAINT: f64 = 0.1;
 /// Steps that bring the starts of new segments to given parameters.
 const STARTS: usize = 6;
 /// Residual on all data over that of the windows from which a model holds for the windows alone.
@@ -590,14 +593,30 @@ impl<'a> Search<'a> {
         scale: &[f64],
         iterations: usize,
     ) -> Option<Fitted> {
+        self.reassembled_from(fitted, parts, Vec::new(), scale, iterations)
+    }
+
+    /// [`reassembled`](Self::reassembled) from there or from one of the `others`, values of all parameters.
+    fn reassembled_from(
+        &self,
+        fitted: &Fitted,
+        parts: &[(Candidate, Vec<f64>, Vec<f64>)],
+        others: Vec<Vec<f64>>,
+        scale: &[f64],
+        iterations: usize,
+    ) -> Option<Fitted> {
         let n0 = self.nominal.model.parameters.len();
         let head = &fitted.fit.point.parameters[..n0];
         let (setup, kept) = self.assemble(&fitted.setup.holds, head, parts, &fitted.setup).ok()?;
-        let mut parameters = head.to_vec();
-        parameters.extend(parts.iter().flat_map(|p| p.1.iter().copied()));
+        let mut own = head.to_vec();
+        own.extend(parts.iter().flat_map(|p| p.1.iter().copied()));
         let level = same_level(&setup, &fitted.level);
         let starts = transfer(&fitted.setup, &level, &fitted.fit.point.starts, &setup, &[]);
-        let fit = setup.fit(&level, scale, &[Point { parameters, starts }], limits(iterations));
+        let points: Vec<Point> = std::iter::once(own)
+            .chain(others)
+            .map(|parameters| Point { parameters, starts: starts.clone() })
+            .collect();
+        let fit = setup.fit(&level, scale, &points, limits(iterations));
         Some(Fitted { setup, parts: kept, level, fit })
     }
 
@@ -743,12 +762,25 @@ impl<'a> Search<'a> {
         (on_windows(&found.calibrated), on_windows(&found.improved))
     }
 
-    /// Residual sum of squares of a model without some of its parts (indices falling), refitted.
-    pub fn rss_without(&self, fitted: &Fitted, parts: &[usize], scale: &[f64]) -> Option<f64> {
-        let mut left = fitted.clone();
-        for index in parts {
-            left = self.without(&left, *index, scale, 10)?;
+    /// Residual sum of squares of a model without some of its parts (indices falling), refitted: from where it is, or
+    /// from the calibrated model with a little of each part that stays. What is left of laws that hold each other up may
+    /// not even be stable.
+    pub fn rss_without(
+        &self,
+        fitted: &Fitted,
+        parts: &[usize],
+        calibrated: &Fitted,
+        scale: &[f64],
+    ) -> Option<f64> {
+        let mut rest = self.parts(fitted);
+        parts.iter().for_each(|index| drop(rest.remove(*index)));
+        let n0 = self.nominal.model.parameters.len();
+        let mut faint = calibrated.fit.point.parameters[..n0].to_vec();
+        for (candidate, values, _) in &rest {
+            let linear = self.library[candidate.mechanism].linear.len();
+            faint.extend(values.iter().enumerate().map(|(i, v)| if i < linear { FAINT * v } else { *v }));
         }
+        let left = self.reassembled_from(fitted, &rest, vec![faint], scale, STEPS_WITHOUT * parts.len())?;
         Some(raw_rss(&left, scale).iter().sum())
     }
 
@@ -1585,6 +1617,9 @@ impl<'a> Search<'a> {
                 && f.fit.rss.iter().zip(&fitted.fit.rss).all(|(x, y)| *x < 1.005 * y);
             let disputed = likelihood && (e.score < evidence.score) != (e.akaike < evidence.akaike);
             let close = (e.score - evidence.score).abs() < UNDECIDED;
+            // A refinement that the data do not show cannot be told from the law that it refines; from others it may.
+            let refined = &self.library[open[c].mechanism].refines;
+            let undetermined = undetermined && refined.contains(&self.library[open[chosen].mechanism].kind);
             let equivalent = as_good || disputed || close || undetermined;
             let instance = f.parts.last()?.instance.clone();
             Some(Rival { candidate: open[c].clone(), instance, evidence: e, equivalent })

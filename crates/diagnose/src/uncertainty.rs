@@ -11,6 +11,7 @@
 //!
 //! The first counts, unless the second says more than that scatter explains.
 
+use greybox_calibrate::noise_model::MOST;
 use greybox_calibrate::{Autoregression, qr, student_quantile};
 use statrs::distribution::{ChiSquared, ContinuousCDF};
 
@@ -19,8 +20,6 @@ use crate::search::Fitted;
 
 /// Blocks of samples over all recordings.
 const BLOCKS: usize = 40;
-/// Largest order of the noise.
-const ORDER: usize = 6;
 /// How seldom the blocks' scatter alone may make their variance count.
 const CHANCE: f64 = 0.1;
 
@@ -108,16 +107,22 @@ impl Uncertainty {
     }
 }
 
+/// Adds `weight` CᵀC of the columns to a matrix.
+fn add_gram(sum: &mut [f64], columns: &[impl AsRef<[f64]>], weight: f64) {
+    let np = columns.len();
+    for (a, left) in columns.iter().enumerate() {
+        for (b, right) in columns.iter().enumerate() {
+            sum[a * np + b] += weight * qr::dot(left.as_ref(), right.as_ref());
+        }
+    }
+}
+
 /// JᵀJ.
 fn gram(segments: &[Projected], np: usize) -> Vec<f64> {
     let mut h = vec![0.0; np * np];
     for p in segments {
-        let m = p.rows;
-        for a in 0..np {
-            for b in 0..np {
-                h[a * np + b] += qr::dot(&p.jp[a * m..(a + 1) * m], &p.jp[b * m..(b + 1) * m]);
-            }
-        }
+        let columns: Vec<&[f64]> = p.jp.chunks(p.rows.max(1)).collect();
+        add_gram(&mut h, &columns, 1.0);
     }
     h
 }
@@ -149,13 +154,6 @@ fn between(inverse: &[Vec<f64>], meat: &[f64], np: usize) -> Vec<f64> {
 fn stationary(fitted: &Fitted, segments: &[Projected], priors: &[f64]) -> (Vec<f64>, f64) {
     let (ny, np) = (fitted.setup.system.ny, priors.len());
     let mut meat = vec![0.0; np * np];
-    let add = |meat: &mut [f64], columns: &[Vec<f64>], variance: f64| {
-        for a in 0..np {
-            for b in 0..np {
-                meat[a * np + b] += variance * qr::dot(&columns[a], &columns[b]);
-            }
-        }
-    };
     let ranges = |c: usize| {
         segments.iter().zip(&fitted.level.segments).map(move |(p, s)| {
             let n = s.range.len();
@@ -171,7 +169,7 @@ fn stationary(fitted: &Fitted, segments: &[Projected], priors: &[f64]) -> (Vec<f
             .map(|(p, range)| p.r[range].iter().map(|r| if *r == 0.0 { f64::NAN } else { *r }).collect())
             .collect();
         let stretches: Vec<&[f64]> = residuals.iter().map(Vec::as_slice).collect();
-        let noise = Autoregression::fit(&stretches, ORDER);
+        let noise = Autoregression::fit(&stretches, MOST);
         let present = stretches.iter().flat_map(|s| s.iter()).filter(|r| r.is_finite()).count();
         if noise.total_variance() > 0.0 {
             independent += present as f64 * noise.variance() / noise.total_variance();
@@ -183,7 +181,7 @@ fn stationary(fitted: &Fitted, segments: &[Projected], priors: &[f64]) -> (Vec<f
                 column
             };
             let columns: Vec<Vec<f64>> = (0..np).map(coloured).collect();
-            add(&mut meat, &columns, inflate * noise.variance());
+            add_gram(&mut meat, &columns, inflate * noise.variance());
         }
     }
     // What the priors of starts and parameters say is as uncertain as the samples are.
@@ -192,7 +190,7 @@ fn stationary(fitted: &Fitted, segments: &[Projected], priors: &[f64]) -> (Vec<f
     for (p, s) in segments.iter().zip(&fitted.level.segments) {
         let columns: Vec<Vec<f64>> =
             (0..np).map(|a| p.jp[a * p.rows..(a + 1) * p.rows][ny * s.range.len()..].to_vec()).collect();
-        add(&mut meat, &columns, variance);
+        add_gram(&mut meat, &columns, variance);
     }
     priors.iter().enumerate().for_each(|(i, prior)| meat[i * np + i] += variance * prior);
     (meat, (independent - np as f64).max(2.0))

@@ -194,6 +194,63 @@ fn a_law_outside_the_library_is_not_named_as_its_neighbour() {
     assert_eq!(confident("periodic_disturbance", swinging), 0);
 }
 
+const TANK: &str = r#"
+name = "tank, linearised"
+[inputs]
+q = { unit = "m^3/s", hold = "zero" }
+[states]
+h = { unit = "m" }
+[parameters]
+A = { value = 0.05, unit = "m^2", fixed = true }
+k = { value = 8e-4, unit = "m^2/s" }
+[equations]
+balance = "A*h' + k*h = q"
+"#;
+
+/// A h' + a √(2 g h) = q, the inflow a new one every 150 s, the level to half a millimetre.
+fn tank(seed: u64) -> Recording {
+    let mut rng = rand_pcg::Pcg64Mcg::seed_from_u64(seed);
+    let (inflow, noise) = (Uniform::new(1.3e-4, 5.7e-4).unwrap(), Normal::new(0.0, 5e-4).unwrap());
+    let (area, outlet, fine) = (0.05, 1.6e-4, 20);
+    let mut h = 0.25f64;
+    let (mut q, mut level, mut current) = (Vec::new(), Vec::new(), 0.0);
+    for k in 0..2400 {
+        if k % 150 == 0 {
+            current = inflow.sample(&mut rng);
+        }
+        q.push(current);
+        level.push(h + noise.sample(&mut rng));
+        for _ in 0..fine {
+            h = (h + (current - outlet * (2.0 * 9.81 * h).sqrt()) / area / f64::from(fine)).max(0.0);
+        }
+    }
+    let channel = |name: &str, unit: &str, values| Channel {
+        name: name.to_string(),
+        unit: Some(unit.to_string()),
+        values,
+    };
+    let time = (0..q.len()).map(|k| k as f64).collect();
+    Recording::from_columns("tank.csv", time, vec![channel("q", "m^3/s", q), channel("h", "m", level)])
+        .unwrap()
+}
+
+/// A root is no sum of springs, however well three of them follow it: what is missing is a force that depends on the
+/// level, all of it.
+#[test]
+fn a_law_that_can_be_pieced_together_is_not() {
+    let model = Model::from_toml(TANK, "tank.toml").unwrap();
+    let unexplained = (0..4).filter(|seed| {
+        let found =
+            diagnose(&model, &[tank(*seed)], &[tank(seed + 100)], &Options::default(), &Quiet).unwrap();
+        found.verdict == Verdict::Unexplained
+            && found.remainder.significant
+            && found.remainder.share_of_residual > 0.9
+            && found.remainder.shape.as_deref() == Some("a force that depends on h")
+    });
+    let unexplained = unexplained.count();
+    assert!(unexplained >= 3, "{unexplained} of 4");
+}
+
 /// A search without work left says so, and what it has found stands.
 #[test]
 fn a_search_that_runs_out_of_work_says_so() {
