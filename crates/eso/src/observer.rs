@@ -185,6 +185,10 @@ impl<const N: usize> Observer<N> {
     /// The noise of an estimate: its standard deviation over that of white noise on the samples of y, once the start is
     /// forgotten, in the linear regime. In 1/sⁱ for the state i (counted from 0).
     ///
+    /// With one step z′ = A z + b y + c y′, w = z − c y has the covariance P = A P Aᵀ + d dᵀ, d = A c + b (discrete
+    /// Lyapunov equation; K. J. Åström, *Introduction to Stochastic Control Theory*, 1970, ch. 3), and the estimates
+    /// have P + c cᵀ.
+    ///
     /// It is what [`Design::from_bandwidth`] pays for a short [`lag`](Observer::lag).
     ///
     /// ```
