@@ -1,6 +1,7 @@
 //! What a command that finished has to say.
 
 use std::io::{ErrorKind, Write};
+use std::process::ExitCode;
 
 use crate::failure::Failure;
 
@@ -13,21 +14,31 @@ pub(crate) enum Manner {
     Json,
 }
 
+/// Exit status of a command that did its work and found what was to make it fail.
+const FAILED: u8 = 3;
+
 /// The result of a command, in words and for machines.
 #[derive(Debug)]
 pub(crate) struct Answer {
     text: String,
     json: Option<serde_json::Value>,
+    /// Conditions that were to make it fail, and hold.
+    met: Vec<String>,
 }
 
 impl Answer {
     pub(crate) fn new(text: String, json: serde_json::Value) -> Answer {
-        Answer { text, json: Some(json) }
+        Answer { text, json: Some(json), met: Vec::new() }
+    }
+
+    /// The same, of a command that fails for these reasons; none is success.
+    pub(crate) fn failing(self, met: Vec<String>) -> Answer {
+        Answer { met, ..self }
     }
 
     /// Help or version: the same words in either manner.
     pub(crate) fn words(text: String) -> Answer {
-        Answer { text, json: None }
+        Answer { text, json: None, met: Vec::new() }
     }
 
     /// Adds words, which JSON does not have.
@@ -35,11 +46,11 @@ impl Answer {
         self.text.push_str(words);
     }
 
-    /// Prints on standard output.
+    /// Prints on standard output, and on standard error what makes the command fail.
     ///
     /// # Errors
     /// Bad input: standard output cannot be written.
-    pub(crate) fn print(&self, manner: Manner) -> Result<(), Failure> {
+    pub(crate) fn print(&self, manner: Manner) -> Result<ExitCode, Failure> {
         let printed = match (&self.json, manner) {
             (Some(json), Manner::Json) => print(&format!("{json:#}\n")),
             _ => print(&self.text),
@@ -47,7 +58,11 @@ impl Answer {
         printed.map_err(|e| {
             Failure::input(format!("standard output cannot be written: {e}"))
                 .mend("see that the disk has room; what `--out` names is written")
-        })
+        })?;
+        let said: String = self.met.iter().map(|what| format!("failed: {what}\n")).collect();
+        // With standard error closed there is nobody left to tell.
+        let _ = std::io::stderr().lock().write_all(said.as_bytes());
+        Ok(if self.met.is_empty() { ExitCode::SUCCESS } else { ExitCode::from(FAILED) })
     }
 }
 

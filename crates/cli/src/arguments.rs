@@ -36,7 +36,8 @@ use greybox_recording::{Recording, Rename, RenameError};
   greybox export result/improved.toml --to python --out machine.py
   greybox new servo --out servo.toml
 
-Exit status: 0 finished, whatever the verdict; 2 bad usage or bad input; 1 internal failure."
+Exit status: 0 finished, whatever the verdict; 2 bad usage or bad input; 1 internal failure; 3 what
+`compare --fail-if` names holds."
 )]
 pub(crate) struct Cli {
     #[command(subcommand)]

@@ -27,7 +27,7 @@ fn main() -> ExitCode {
     // The default hook has said on standard error where a panic was.
     let outcome = std::panic::catch_unwind(|| run(arguments)).unwrap_or_else(|_| Err(Failure::fault()));
     match outcome.and_then(|answer| answer.print(manner)) {
-        Ok(()) => ExitCode::SUCCESS,
+        Ok(status) => status,
         Err(failure) => failure::print(&failure, manner),
     }
 }

@@ -282,6 +282,35 @@ fn two_diagnoses_are_held_against_each_other() {
     let printed = bench.greybox(&[&compare as &[&str], &["--json"]].concat());
     assert_eq!(serde_json::from_str::<Value>(&printed.stdout).unwrap(), json);
 
+    // As a test: a run that concludes the same, one that lost its mechanism, one that is less exact.
+    let said = fs::read_to_string(bench.path("out/monday/report.json")).unwrap();
+    let mut other: Value = serde_json::from_str(&said).unwrap();
+    other["mechanisms"] = Value::Array(Vec::new());
+    bench.write("gone.json", &other.to_string());
+    let mut other: Value = serde_json::from_str(&said).unwrap();
+    for (_, score) in other["fit"]["holdout"]["improved"].as_object_mut().unwrap() {
+        score["nrmse"] = (1.2 * score["nrmse"].as_f64().unwrap()).into();
+    }
+    bench.write("worse.json", &other.to_string());
+    let fail_if = |after: &str, options: &[&str]| {
+        bench.greybox(&[&["compare", "out/monday", after, "--json"], options].concat())
+    };
+    let (changed, worse) = (["--fail-if", "changed"], ["--fail-if", "worse"]);
+    let both = [changed, worse].concat();
+    assert_eq!(fail_if("out/monday", &both).code, 0);
+    for (after, options, part) in
+        [("gone.json", &changed[..], "conclude differently"), ("worse.json", &both, "more than 10 %")]
+    {
+        let failed = fail_if(after, options);
+        assert_eq!(failed.code, 3, "{after}: {}", failed.stderr);
+        assert!(failed.stderr.starts_with("failed: ") && failed.stderr.contains(part), "{}", failed.stderr);
+        assert_eq!(failed.stderr.lines().count(), 1, "{}", failed.stderr);
+        assert!(serde_json::from_str::<Value>(&failed.stdout).is_ok(), "{}", failed.stdout);
+    }
+    assert_eq!(fail_if("worse.json", &changed).code, 0);
+    assert_eq!(fail_if("worse.json", &[&worse[..], &["--margin", "25"]].concat()).code, 0);
+    assert_eq!(fail_if("worse.json", &[&worse[..], &["--margin", "-1"]].concat()).code, 2);
+
     bench.write("no.json", "{\"verdict\": 3}");
     for (path, part) in [("no.json", "this is no report of a diagnosis"), ("nowhere", "no such file")] {
         let refused = bench.greybox(&["compare", path, "out/friday", "--out", "none"]);

@@ -38,9 +38,9 @@ pub fn identification(report: &IdentifyReport) -> String {
     }
     let rows: Vec<Vec<String>> = [("training", &report.fit.train), ("held out", &report.fit.holdout)]
         .into_iter()
-        .flat_map(|(role, set)| set.improved.iter().map(move |(channel, score)| (role, channel, score)))
-        .map(|(role, channel, score)| {
-            let floor = report.noise_floor.get(channel).copied().unwrap_or(f64::NAN);
+        .flat_map(|(role, set)| set.improved.iter().map(move |(channel, score)| (role, set, channel, score)))
+        .map(|(role, set, channel, score)| {
+            let floor = report.fit.floor_in(set, channel, &report.noise_floor);
             let name = format!("{role}, {}", expression::text(channel));
             vec![name, format::percent(score.nrmse), format::percent(floor)]
         })
@@ -157,7 +157,7 @@ pub fn fit_table(fit: &Fit, noise_floor: &Ordered<f64>) -> String {
         for channel in set.channels() {
             let mut row = vec![format!("{role}, {}", expression::text(channel))];
             row.extend(models(set, improved).iter().map(|scores| percent(scores.get(channel))));
-            row.push(format::percent(noise_floor.get(channel).copied().unwrap_or(f64::NAN)));
+            row.push(format::percent(fit.floor_in(set, channel, noise_floor)));
             rows.push(row);
         }
     }

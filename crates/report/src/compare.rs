@@ -106,6 +106,13 @@ pub struct MechanismChange {
     pub parameters: Ordered<Change>,
 }
 
+impl MechanismChange {
+    /// Whether only one run has it, or a parameter of it differs by more than its intervals.
+    pub(crate) fn is_changed(&self) -> bool {
+        self.before.is_none() || self.after.is_none() || has_changed(&self.parameters)
+    }
+}
+
 /// How much a mechanism counts in a run.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize, JsonSchema)]
 pub struct Weight {
@@ -184,6 +191,28 @@ impl Comparison {
         comparison
     }
 
+    /// Whether the runs conclude differently: another verdict, a mechanism that is new, gone or changed, or a parameter
+    /// that changed by more than its intervals.
+    #[must_use]
+    pub fn is_changed(&self) -> bool {
+        self.before.verdict != self.after.verdict
+            || self.mechanisms.iter().any(MechanismChange::is_changed)
+            || has_changed(&self.parameters)
+    }
+
+    /// Whether the model that came of the later run is the worse one: the held-out error of a channel is more than
+    /// `growth` (0.1 = 10 %) above that of the run before, is no number any more, or is not there.
+    #[must_use]
+    pub fn is_worse(&self, growth: f64) -> bool {
+        self.holdout.values().filter_map(|errors| errors.before.map(|before| (before, errors.after))).any(
+            |(before, after)| {
+                let limit = before.improved * (1.0 + growth);
+                let within = after.is_some_and(|after| after.improved <= limit);
+                before.improved.is_finite() && !within
+            },
+        )
+    }
+
     /// The comparison as indented JSON with a final newline.
     ///
     /// # Errors
@@ -239,6 +268,11 @@ fn mechanisms(before: &Report, after: &Report) -> Vec<MechanismChange> {
     out
 }
 
+/// Whether any of these differs by more than its intervals.
+fn has_changed(changes: &Ordered<Change>) -> bool {
+    changes.values().any(|c| c.changed == Some(true))
+}
+
 /// The estimates of either side, those of `after` first.
 fn changes(before: &Ordered<Estimate>, after: &Ordered<Estimate>) -> Ordered<Change> {
     let names = after.keys().chain(before.keys().filter(|name| !after.contains_key(*name)));
@@ -273,7 +307,7 @@ fn holdout(before: &Report, after: &Report) -> Ordered<ErrorChange> {
             nominal: nominal.unwrap_or(f64::NAN),
             calibrated: calibrated.unwrap_or(f64::NAN),
             improved: improved.unwrap_or(f64::NAN),
-            noise: report.noise_floor.get(channel).copied().unwrap_or(f64::NAN),
+            noise: report.fit.floor_in(fit, channel, &report.noise_floor),
         })
     };
     let mut channels = after.fit.holdout.channels();

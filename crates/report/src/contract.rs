@@ -42,14 +42,18 @@ pub struct Report {
     /// What the model leaves out, sorted by `share_explained`, largest first. Empty unless the verdict is
     /// `missing_physics`.
     pub mechanisms: Vec<Mechanism>,
+    /// What fewer of several mechanisms would leave: none, each alone, all but one, all. Empty where there is one, or
+    /// none.
+    #[serde(default, skip_serializing_if = "Vec::is_empty")]
+    pub subsets: Vec<Subset>,
     /// What is still unexplained, whatever the verdict.
     pub remainder: Remainder,
     /// The model's own parameters before and after, in the order of the model.
     pub parameters: Ordered<Parameter>,
     /// How well the nominal, the calibrated and the improved model reproduce the measurements.
     pub fit: Fit,
-    /// Estimated measurement-noise RMS over RMS(measurement − its mean), by channel: the `nrmse` that no
-    /// model can beat.
+    /// Estimated measurement-noise RMS over RMS(measurement − its mean) of the training data, by channel: the `nrmse`
+    /// there that no model can beat.
     #[serde(with = "number_map")]
     #[schemars(schema_with = "number_map_schema")]
     pub noise_floor: Ordered<f64>,
@@ -98,6 +102,18 @@ pub enum Verdict {
     MissingPhysics,
     /// Something is missing, located and sized, but nothing in the library explains it.
     Unexplained,
+}
+
+/// Some of the mechanisms, and how well the model does with these alone.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize, JsonSchema)]
+pub struct Subset {
+    /// Indices into `mechanisms`, counted from 0, rising.
+    pub mechanisms: Vec<usize>,
+    /// Residual sum of squares, noise included, over that of the calibrated model, 0 to 1; the parameters are refitted
+    /// with these mechanisms.
+    #[serde(with = "number")]
+    #[schemars(schema_with = "number_schema")]
+    pub left: f64,
 }
 
 /// One piece of missing physics.
@@ -342,6 +358,21 @@ pub struct Fit {
     pub recordings: Ordered<RecordingFit>,
 }
 
+impl Fit {
+    /// What `noise_floor`, taken on the training data, is in another set, whose signals vary more or less: the `nrmse`
+    /// there that no model can beat. The floor itself where the scores do not tell how much they vary.
+    ///
+    /// Both `nrmse` and `rmse` are of the same simulation, so that rmse/nrmse is the RMS of the measurement about its
+    /// mean, s; of the floor σ/s₁ in the training data, σ/s₂ = σ/s₁ · s₁/s₂ is left in the other.
+    pub fn floor_in(&self, set: &FitSet, channel: &str, noise_floor: &Ordered<f64>) -> f64 {
+        let floor = noise_floor.get(channel).copied().unwrap_or(f64::NAN);
+        match (self.train.spread(channel), set.spread(channel)) {
+            (Some(train), Some(other)) => floor * train / other,
+            _ => floor,
+        }
+    }
+}
+
 /// Scores of one recording; a recording whose last part is held out has both.
 #[derive(Debug, Clone, PartialEq, Default, Serialize, Deserialize, JsonSchema)]
 pub struct RecordingFit {
@@ -368,6 +399,15 @@ impl FitSet {
     /// True when no model has a score.
     pub fn is_empty(&self) -> bool {
         self.nominal.is_empty() && self.calibrated.is_empty() && self.improved.is_empty()
+    }
+
+    /// RMS of a channel about its mean, in its unit.
+    fn spread(&self, channel: &str) -> Option<f64> {
+        [&self.nominal, &self.calibrated, &self.improved]
+            .into_iter()
+            .filter_map(|model| model.get(channel))
+            .filter_map(|score| score.rmse.map(|rmse| rmse / score.nrmse))
+            .find(|spread| spread.is_finite() && *spread > 0.0)
     }
 
     /// The channels in order of first appearance over the three models.

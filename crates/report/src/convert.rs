@@ -43,6 +43,11 @@ pub fn report(diagnosis: &Diagnosis, sources: &Sources<'_>) -> Report {
         },
         summary: Vec::new(),
         mechanisms: d.mechanisms.iter().map(|m| mechanism(m, &d.improved, &basis)).collect(),
+        subsets: d
+            .subsets
+            .iter()
+            .map(|s| Subset { mechanisms: s.mechanisms.clone(), left: s.left })
+            .collect(),
         remainder: Remainder {
             significant: d.remainder.significant,
             location: location(&d.remainder.location, &d.nominal),
@@ -187,13 +192,12 @@ fn converted(expression: &str, model: &Model) -> Option<String> {
     if unit.factor == 1.0 || expression.contains(['*', '/', '^']) {
         return None;
     }
-    let rate = first.len() - name.len();
+    let primes = (first.len() - name.len()) as u8;
     let angle = unit.dimension.is_none() && unit.text != "%";
-    Some(match rate {
-        0 if angle => "rad".to_owned(),
-        1 if angle => "rad/s".to_owned(),
-        _ if angle => format!("rad/s^{rate}"),
-        _ => Unit::si(unit.dimension / Dimension::TIME.pow(rate as f64)).text,
+    Some(if angle {
+        control::per_second("rad", primes)
+    } else {
+        Unit::si(unit.dimension / Dimension::TIME.pow(f64::from(primes))).text
     })
 }
 
@@ -582,11 +586,13 @@ fn residuals(d: &Diagnosis) -> Vec<Residual> {
 
 /// Measurement minus simulation of channel `c` of one recording, in units of `factor`.
 fn residual(data: &Data, run: &FreeRun, recording: usize, c: usize, factor: f64) -> Vec<f64> {
-    joined(data, recording, |i| {
-        let n = data.pieces[i].len;
-        let simulated = &run.y[i][c * n..(c + 1) * n];
-        data.pieces[i].measured[c].iter().zip(simulated).map(|(m, y)| (m - y) / factor).collect()
-    })
+    joined(data, recording, |i| left_over(data, run, i, c).into_iter().map(|e| e / factor).collect())
+}
+
+/// Measurement minus simulation of channel `c` of one piece, SI.
+fn left_over(data: &Data, run: &FreeRun, piece: usize, c: usize) -> Vec<f64> {
+    let n = data.pieces[piece].len;
+    data.pieces[piece].measured[c].iter().zip(&run.y[piece][c * n..(c + 1) * n]).map(|(m, y)| m - y).collect()
 }
 
 /// Spectra of the residuals; an empty `before` stays empty.
@@ -619,11 +625,7 @@ fn correlations(
     // A tenth of the recording, in steps that leave so many lags.
     let stride = (n / 10).div_ceil(LAGS).max(1);
     let reach = n / 10 / stride * stride;
-    let residuals = runs.map(|run| {
-        run.map_or_else(Vec::new, |run| -> Vec<f64> {
-            piece.measured[c].iter().zip(&run.y[i][c * n..(c + 1) * n]).map(|(m, y)| m - y).collect()
-        })
-    });
+    let residuals = runs.map(|run| run.map_or_else(Vec::new, |run| left_over(data, run, i, c)));
     let inputs = model.inputs.iter().zip(&piece.inputs).map(|(input, u)| (Some(input.name.clone()), Some(u)));
     std::iter::once((None, None))
         .chain(inputs)
@@ -634,8 +636,8 @@ fn correlations(
             });
             let [before, after] = found;
             let after = after?;
-            // Of itself the residual says the same at both sides.
-            let from = if with.is_some() { 0 } else { reach };
+            // With itself a residual is the same at both sides, and one at lag zero.
+            let from = if with.is_some() { 0 } else { reach + stride };
             let told = || (from..=2 * reach).step_by(stride);
             let lag = told().map(|k| (k as f64 - reach as f64) * piece.dt).collect();
             let part = |c: Correlation| told().map(|k| c.values[k]).collect::<Vec<f64>>();

@@ -18,7 +18,7 @@ use serde::Serialize;
 
 use crate::contract::{
     Finding, Fit, FitSet, InputHold, Interval, Location, Mechanism, ModelId, Names, Ordered, Producer,
-    RecordingFit, Score, Severity, Verdict,
+    RecordingFit, Report, Score, Severity, Subset, Verdict,
 };
 use crate::decimate::{Buckets, MAX_POINTS, round_to_range};
 use crate::diff::{Edit, diff};
@@ -250,6 +250,8 @@ struct View {
     equations: Vec<EquationView>,
     shares: Vec<ShareView>,
     mechanisms: Vec<MechanismView>,
+    /// Which mechanisms, how many, and what is left with these alone.
+    subsets: Vec<[String; 3]>,
     remainder: RemainderView,
     parameters: Vec<ParameterView>,
     calibrated_known: bool,
@@ -435,6 +437,7 @@ impl View {
                 .enumerate()
                 .map(|(index, mechanism)| mechanism_view(page, index, mechanism))
                 .collect(),
+            subsets: subsets(report),
             remainder: remainder_view(page),
             parameters: parameters(page),
             calibrated_known: report.parameters.values().any(|parameter| parameter.calibrated.is_some()),
@@ -604,6 +607,25 @@ const FUNCTIONS: [&str; 16] = [
 
 // -- where the residual comes from ------------------------------------------------------------------------
 
+fn subsets(report: &Report) -> Vec<[String; 3]> {
+    let titles: Vec<String> = report.mechanisms.iter().map(|m| format::kind(&m.kind)).collect();
+    // Two of one kind are told apart by their place in the list.
+    let named = |index: &usize| {
+        let title = titles.get(*index).map_or("?", String::as_str);
+        let twins = titles.iter().filter(|t| *t == title).count() > 1;
+        if twins { format!("{title} ({})", index + 1) } else { title.to_owned() }
+    };
+    let row = |s: &Subset| {
+        let what = match s.mechanisms.len() {
+            0 => "None (calibrated)".to_owned(),
+            n if n == titles.len() => "All".to_owned(),
+            _ => s.mechanisms.iter().map(named).collect::<Vec<_>>().join(", "),
+        };
+        [what, s.mechanisms.len().to_string(), format::percent(s.left)]
+    };
+    report.subsets.iter().map(row).collect()
+}
+
 fn shares(page: &Page) -> Vec<ShareView> {
     let report = &page.report;
     if report.verdict != Verdict::MissingPhysics {
@@ -661,7 +683,7 @@ fn fit_row(channel: &str, set: &FitSet, scene: &Scene<'_>) -> FitRow {
         .fold(0.0, f64::max);
     let cells =
         models.into_iter().map(|model| fit_cell(model.key, model.scores(set).get(channel), unit, largest));
-    let floor = scene.noise_floor.get(channel).copied().unwrap_or(f64::NAN);
+    let floor = scene.fit.floor_in(set, channel, scene.noise_floor);
     FitRow { channel: expression::text(channel), cells: cells.collect(), floor: format::percent(floor) }
 }
 
@@ -944,9 +966,8 @@ fn residual_view(scene: &Scene<'_>, residual: &Residual, island: &mut Island) ->
 
 fn correlation_view(shown: &str, after: &str, found: &Lagged) -> Option<CorrelationView> {
     let outside = |values: &[f64]| {
-        let told = found.lag.iter().zip(values).filter(|(h, _)| found.with.is_some() || **h > 0.0);
-        let told: Vec<bool> = told.map(|(_, v)| v.abs() > found.bound).collect();
-        format!("{} of {} lags", told.iter().filter(|out| **out).count(), told.len())
+        let beyond = values.iter().filter(|v| v.abs() > found.bound).count();
+        format!("{beyond} of {} lags", values.len())
     };
     let sizes: Vec<String> = [("calibrated", &found.before), (after, &found.after)]
         .into_iter()

@@ -117,7 +117,7 @@ pub struct Residual {
     pub spectrum: Option<Spectrum>,
     /// Magnitude of the residual over two coordinates of the state space.
     pub map: Option<StateMap>,
-    /// Correlation of the residual with itself and with the inputs.
+    /// Correlation of the residual with itself, at lags above zero, and with the inputs.
     pub correlations: Vec<Lagged>,
 }
 

@@ -129,6 +129,33 @@ impl Frame {
         );
     }
 
+    /// Lines where the coordinates are zero, inside the frame.
+    fn zeros(&self, out: &mut String) {
+        if self.x.0 < 0.0 && self.x.1 > 0.0 {
+            let _ =
+                write!(out, "<path class=\"zero\" d=\"M{:.1} {TOP}V{}\"/>", self.px(0.0), HEIGHT - BOTTOM);
+        }
+        if self.y.0 < 0.0 && self.y.1 > 0.0 {
+            let _ = write!(out, "<path class=\"zero\" d=\"M{LEFT} {:.1}H{:.1}\"/>", self.py(0.0), self.right);
+        }
+    }
+
+    /// A line through points; one that is not finite lifts the pen.
+    fn line(&self, points: impl IntoIterator<Item = [f64; 2]>) -> String {
+        let mut line = String::new();
+        let mut pen_down = false;
+        for [x, y] in points {
+            if x.is_finite() && y.is_finite() {
+                let _ =
+                    write!(line, "{}{:.1} {:.1}", if pen_down { 'L' } else { 'M' }, self.px(x), self.py(y));
+                pen_down = true;
+            } else {
+                pen_down = false;
+            }
+        }
+        line
+    }
+
     fn border(&self, out: &mut String) {
         let _ = write!(
             out,
@@ -290,12 +317,7 @@ pub fn law_plot(plot: &MechanismPlot, alt: &str) -> Option<LawPlot> {
     };
     let mut out = open(alt);
     frame.axes(&mut out, &plot.x_label, &plot.y_label);
-    if frame.x.0 < 0.0 && frame.x.1 > 0.0 {
-        let _ = write!(out, "<path class=\"zero\" d=\"M{:.1} {TOP}V{}\"/>", frame.px(0.0), HEIGHT - BOTTOM);
-    }
-    if frame.y.0 < 0.0 && frame.y.1 > 0.0 {
-        let _ = write!(out, "<path class=\"zero\" d=\"M{LEFT} {:.1}H{:.1}\"/>", frame.py(0.0), frame.right);
-    }
+    frame.zeros(&mut out);
     let every = finite.len().div_ceil(MAX_DOTS).max(1);
     let mut dots = String::new();
     for &[x, y] in finite.iter().step_by(every).filter(|[x, y]| frame.contains(*x, *y)) {
@@ -304,16 +326,7 @@ pub fn law_plot(plot: &MechanismPlot, alt: &str) -> Option<LawPlot> {
     if !dots.is_empty() {
         let _ = write!(out, "<path class=\"dots\" d=\"{dots}\"/>");
     }
-    let mut line = String::new();
-    let mut pen_down = false;
-    for &[x, y] in &plot.curve {
-        if x.is_finite() && y.is_finite() {
-            let _ = write!(line, "{}{:.1} {:.1}", if pen_down { 'L' } else { 'M' }, frame.px(x), frame.py(y));
-            pen_down = true;
-        } else {
-            pen_down = false;
-        }
-    }
+    let line = frame.line(plot.curve.iter().copied());
     if !line.is_empty() {
         let _ = write!(out, "<path class=\"halo\" d=\"{line}\"/><path class=\"law\" d=\"{line}\"/>");
     }
@@ -327,35 +340,24 @@ pub fn law_plot(plot: &MechanismPlot, alt: &str) -> Option<LawPlot> {
 /// is finite.
 pub fn correlation_plot(found: &Lagged, alt: &str) -> Option<String> {
     let values = || found.before.iter().chain(&found.after).copied();
-    let of_itself = found.with.is_none();
-    // The residual with itself is one at lag zero, which says nothing and would flatten all others.
-    let told = |values: &[f64]| -> Vec<[f64; 2]> {
-        let pairs = found.lag.iter().zip(values).skip(usize::from(of_itself));
-        pairs.filter(|(_, v)| v.is_finite()).map(|(h, v)| [*h, *v]).collect()
-    };
     values().find(|v| v.is_finite())?;
-    let (before, after) = (told(&found.before), told(&found.after));
-    let heights = before.iter().chain(&after).map(|p| p[1]).chain([found.bound, -found.bound]);
-    let frame =
-        Frame { x: range(found.lag.iter().copied(), 0.03)?, y: range(heights, 0.08)?, right: WIDTH - 12.0 };
+    let frame = Frame {
+        x: range(found.lag.iter().copied(), 0.03)?,
+        y: range(values().chain([found.bound, -found.bound]), 0.08)?,
+        right: WIDTH - 12.0,
+    };
     let mut out = open(alt);
     frame.axes(&mut out, "lag in s", "correlation");
-    let (top, bottom) = (frame.py(found.bound), frame.py(-found.bound));
     let _ = write!(
         out,
-        "<path class=\"chance\" d=\"M{LEFT} {top:.1}H{r:.1}V{bottom:.1}H{LEFT}Z\"/>\
-         <path class=\"zero\" d=\"M{LEFT} {:.1}H{r:.1}\"/>",
-        frame.py(0.0),
-        r = frame.right
+        "<path class=\"chance\" d=\"M{LEFT} {:.1}H{:.1}V{:.1}H{LEFT}Z\"/>",
+        frame.py(found.bound),
+        frame.right,
+        frame.py(-found.bound)
     );
-    if !of_itself {
-        let _ = write!(out, "<path class=\"zero\" d=\"M{:.1} {TOP}V{}\"/>", frame.px(0.0), HEIGHT - BOTTOM);
-    }
-    for (class, points) in [("before", &before), ("law", &after)] {
-        let line = points.iter().enumerate().fold(String::new(), |mut line, (i, [x, y])| {
-            let _ = write!(line, "{}{:.1} {:.1}", if i == 0 { 'M' } else { 'L' }, frame.px(*x), frame.py(*y));
-            line
-        });
+    frame.zeros(&mut out);
+    for (class, values) in [("before", &found.before), ("law", &found.after)] {
+        let line = frame.line(found.lag.iter().zip(values).map(|(lag, value)| [*lag, *value]));
         if !line.is_empty() {
             let _ = write!(out, "<path class=\"{class}\" d=\"{line}\"/>");
         }
@@ -580,21 +582,17 @@ mod tests {
     use super::*;
 
     #[test]
-    fn a_correlation_leaves_out_that_with_itself_at_lag_zero() {
-        let mut found = Lagged {
+    fn a_correlation_has_a_line_of_each_model_and_the_band_of_chance() {
+        let found = Lagged {
             with: None,
-            lag: vec![0.0, 0.1, 0.2],
-            before: vec![1.0, 0.5, 0.2],
-            after: vec![1.0, 0.05, -0.02],
+            lag: vec![0.1, 0.2, 0.3],
+            before: vec![0.5, 0.2, 0.1],
+            after: vec![0.05, -0.02, 0.01],
             bound: 0.06,
         };
         let svg = correlation_plot(&found, "a < b").unwrap();
-        assert!(
-            svg.contains("a &lt; b") && svg.contains("class=\"chance\"") && svg.contains("class=\"law\"")
-        );
-        assert_eq!(svg.matches('L').count(), 2, "two lines of two points each");
-        found.with = Some("u".into());
-        assert_eq!(correlation_plot(&found, "").unwrap().matches('L').count(), 4);
+        assert!(svg.contains("a &lt; b") && svg.contains("class=\"chance\""));
+        assert_eq!(svg.matches('L').count(), 4, "two lines of three points each");
         let empty = Lagged { before: Vec::new(), after: vec![f64::NAN; 3], ..found };
         assert_eq!(correlation_plot(&empty, ""), None);
     }

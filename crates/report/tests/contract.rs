@@ -1,7 +1,7 @@
 //! `report.json` against its schema, and the schema against its checked-in copy.
 #![allow(clippy::unwrap_used, reason = "helpers of tests panic like the tests themselves")]
 
-use greybox_report::contract::{Interval, Location, Names, Verdict, schema};
+use greybox_report::contract::{Fit, FitSet, Interval, Location, Names, Ordered, Score, Verdict, schema};
 use greybox_report::{Report, sentence};
 
 #[path = "common/schema.rs"]
@@ -165,4 +165,30 @@ fn a_held_out_error_that_rises_is_told() {
     );
     report.fit.holdout.improved[worse].nrmse = 0.321;
     assert_eq!(told(&report), Vec::<String>::new());
+}
+
+/// The noise is as large in a recording that moves half as much, and twice as large a part of it.
+#[test]
+fn the_noise_of_held_out_data_is_a_part_of_their_own_motion() {
+    let score =
+        |nrmse: f64, rmse: Option<f64>| Score { nrmse, rmse, nrmse_windowed: None, rmse_windowed: None };
+    let set = |scores: [Score; 2]| FitSet {
+        calibrated: [("x".to_owned(), scores[0])].into_iter().collect(),
+        improved: [("x".to_owned(), scores[1])].into_iter().collect(),
+        ..FitSet::default()
+    };
+    let floor: Ordered<f64> = [("x".to_owned(), 0.015)].into_iter().collect();
+    let train = set([score(0.2, Some(0.4)), score(0.02, Some(0.04))]);
+    let in_holdout = |holdout: FitSet| {
+        let fit = Fit { train: train.clone(), holdout, ..Fit::default() };
+        assert_eq!(fit.floor_in(&fit.train, "x", &floor), 0.015);
+        fit.floor_in(&fit.holdout, "x", &floor)
+    };
+    let close = |a: f64, b: f64| assert!((a - b).abs() < 1e-12, "{a} {b}");
+    close(in_holdout(set([score(0.4, Some(0.4)), score(0.05, Some(0.05))])), 0.03);
+    // A simulation that diverged says nothing of the motion, another one does.
+    close(in_holdout(set([score(f64::NAN, Some(f64::INFINITY)), score(0.05, Some(0.05))])), 0.03);
+    close(in_holdout(set([score(0.4, None), score(0.0, Some(0.0))])), 0.015);
+    let fit = Fit { train, ..Fit::default() };
+    assert!(fit.floor_in(&fit.train, "y", &floor).is_nan());
 }

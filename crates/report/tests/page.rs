@@ -2,7 +2,7 @@
 #![allow(clippy::unwrap_used, reason = "helpers of tests panic like the tests themselves")]
 
 use greybox_report::Page;
-use greybox_report::contract::{Finding, Severity, Verdict};
+use greybox_report::contract::{Finding, Severity, Subset, Verdict};
 use greybox_report::page::{Channel, Recording, Residual, Role};
 
 #[path = "../examples/sample/mod.rs"]
@@ -59,6 +59,33 @@ fn the_page_says_what_a_reader_must_know() {
     ] {
         assert!(html.contains(text), "the page lacks {text:?}");
     }
+}
+
+#[test]
+fn what_fewer_mechanisms_would_leave_stands_in_a_table() {
+    let mut page = sample::page();
+    assert!(!page.to_html().unwrap().contains("With fewer mechanisms"));
+    let first = page.report.mechanisms[0].clone();
+    page.report
+        .mechanisms
+        .push(greybox_report::contract::Mechanism { kind: "dead_zone".to_owned(), ..first });
+    page.report.subsets = [(vec![], 1.0), (vec![0], 0.0412), (vec![1], 0.73), (vec![0, 1], 0.001)]
+        .map(|(mechanisms, left)| Subset { mechanisms, left })
+        .to_vec();
+    let html = page.to_html().unwrap();
+    for (name, number, left) in [
+        ("None (calibrated)", 0, "100 %"),
+        ("Coulomb friction", 1, "4.12 %"),
+        ("Dead zone", 1, "73.0 %"),
+        ("All", 2, "0.100 %"),
+    ] {
+        let row = format!(
+            "<th scope=\"row\">{name}</th><td class=\"num\">{number}</td><td class=\"num\">{left}</td>"
+        );
+        assert!(html.contains(&row), "{row}");
+    }
+    page.report.mechanisms[1].kind = page.report.mechanisms[0].kind.clone();
+    assert!(page.to_html().unwrap().contains("Coulomb friction (2)</th>"));
 }
 
 #[test]

@@ -2,7 +2,7 @@
 
 use std::path::{Path, PathBuf};
 
-use clap::Args;
+use clap::{Args, ValueEnum};
 use greybox_report::{Comparison, Report, ReportError};
 
 use crate::answer::Answer;
@@ -17,9 +17,12 @@ const FILES: [&str; 2] = ["comparison.json", "comparison.html"];
 #[derive(Debug, Args)]
 #[command(after_help = "Example:
   greybox compare march april --out change
+  greybox compare expected.json result --fail-if changed --fail-if worse
 
 BEFORE and AFTER are folders that `greybox diagnose` wrote, or their report.json. With --out, the folder gets
-comparison.json and comparison.html.")]
+comparison.json and comparison.html.
+
+With --fail-if, for tests of a simulation against its machine, the exit status is 3 where one of the conditions holds.")]
 pub(crate) struct Arguments {
     /// The earlier diagnosis
     #[arg(value_name = "BEFORE")]
@@ -32,6 +35,42 @@ pub(crate) struct Arguments {
     /// Folder for the comparison; made where it is missing
     #[arg(long, value_name = "DIR")]
     out: Option<PathBuf>,
+
+    /// Exit with status 3 where this holds; may be repeated
+    #[arg(long, value_name = "CONDITION")]
+    fail_if: Vec<Condition>,
+
+    /// Growth of a held-out error, in percent of what it was, up to which it is not worse
+    #[arg(long, value_name = "PERCENT", value_parser = percent, default_value_t = 10.0, allow_negative_numbers = true)]
+    margin: f64,
+}
+
+/// What may be asked of the two runs.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, ValueEnum)]
+enum Condition {
+    /// Another verdict, a mechanism that is new or gone, or a parameter that changed by more than its intervals
+    Changed,
+    /// A held-out error of the improved model grew by more than the margin
+    Worse,
+}
+
+impl Condition {
+    /// What to say where it holds.
+    fn met(self, comparison: &Comparison, margin: f64) -> Option<String> {
+        match self {
+            Condition::Changed => {
+                comparison.is_changed().then(|| "the two runs conclude differently".to_owned())
+            }
+            Condition::Worse => comparison
+                .is_worse(0.01 * margin)
+                .then(|| format!("a held-out error grew by more than {margin} %, or is missing")),
+        }
+    }
+}
+
+fn percent(text: &str) -> Result<f64, String> {
+    let value = text.parse().ok().filter(|v: &f64| v.is_finite() && *v >= 0.0);
+    value.ok_or_else(|| "write a number of percent from 0, such as 5".to_owned())
 }
 
 pub(crate) fn run(arguments: &Arguments) -> Result<Answer, Failure> {
@@ -53,7 +92,9 @@ pub(crate) fn run(arguments: &Arguments) -> Result<Answer, Failure> {
     if let Some(path) = &arguments.out {
         text.push_str(&format!("\n{}\n", path.join(FILES[1]).display()));
     }
-    Ok(Answer::new(text, serde_json::from_str(&json).map_err(|e| Failure::internal(e.to_string()))?))
+    let json = serde_json::from_str(&json).map_err(|e| Failure::internal(e.to_string()))?;
+    let met = arguments.fail_if.iter().filter_map(|c| c.met(&comparison, arguments.margin)).collect();
+    Ok(Answer::new(text, json).failing(met))
 }
 
 /// The report of a folder, or of a file.

@@ -261,9 +261,9 @@ fn correlation(before: &[f64], after: &[f64]) -> Lagged {
     let [before, after] = [before, after].map(|e| Correlation::of(e, reach).expect("a residual that varies"));
     Lagged {
         with: None,
-        lag: (0..=reach).map(|k| k as f64 * STEP).collect(),
-        before: before.values[reach..].to_vec(),
-        after: after.values[reach..].to_vec(),
+        lag: (1..=reach).map(|k| k as f64 * STEP).collect(),
+        before: before.values[reach + 1..].to_vec(),
+        after: after.values[reach + 1..].to_vec(),
         bound: after.bound,
     }
 }
@@ -416,6 +416,7 @@ pub(crate) fn page() -> Page {
         verdict: Verdict::MissingPhysics,
         summary: Vec::new(),
         mechanisms: vec![mechanism(windows.clone())],
+        subsets: Vec::new(),
         remainder: Remainder {
             significant: false,
             location: Location::default(),

@@ -119,7 +119,7 @@ fn rounded(value: f64, size: f64) -> f64 {
 }
 
 /// `rad` → `rad/s^2`
-fn per_second(unit: &str, primes: u8) -> String {
+pub(super) fn per_second(unit: &str, primes: u8) -> String {
     match (unit, primes) {
         ("", _) | (_, 0) => unit.to_owned(),
         (unit, 1) => format!("{unit}/s"),

@@ -83,9 +83,7 @@ struct ErrorView {
 
 impl View {
     fn new(c: &Comparison) -> View {
-        let different = c.before.verdict != c.after.verdict
-            || c.mechanisms.iter().any(|m| state(m).1)
-            || c.parameters.values().any(|p| p.changed == Some(true));
+        let different = c.is_changed();
         let mut sentences: Vec<String> = c.summary.iter().map(|s| format::tie(s)).collect();
         let headline = if sentences.is_empty() { String::new() } else { sentences.remove(0) };
         let title = |run: &Run| {
@@ -143,18 +141,17 @@ fn runs(before: &Run, after: &Run) -> Vec<[String; 3]> {
     ]
 }
 
-/// In which run it is, and whether that, or a parameter, changed.
-fn state(m: &MechanismChange) -> (&'static str, bool) {
+/// In which run it is, and whether it changed.
+fn state(m: &MechanismChange) -> &'static str {
     match (m.before, m.after) {
-        (None, _) => ("new", true),
-        (_, None) => ("gone", true),
-        _ if m.parameters.values().any(|c| c.changed == Some(true)) => ("in both, changed", true),
-        _ => ("in both", false),
+        (None, _) => "new",
+        (_, None) => "gone",
+        _ if m.is_changed() => "in both, changed",
+        _ => "in both",
     }
 }
 
 fn mechanism(m: &MechanismChange) -> MechanismView {
-    let (state, changed) = state(m);
     let weight = |w: Option<Weight>, of: fn(Weight) -> f64| {
         w.map_or_else(|| "–".to_owned(), |w| format::probability(of(w)))
     };
@@ -175,8 +172,8 @@ fn mechanism(m: &MechanismChange) -> MechanismView {
         title: format::kind(&m.law.kind),
         place: place(&m.law),
         expression_html: expression::html(&m.law.expression),
-        state,
-        changed,
+        state: state(m),
+        changed: m.is_changed(),
         rows: Rows(rows),
     }
 }

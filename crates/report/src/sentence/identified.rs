@@ -74,7 +74,7 @@ fn prediction(report: &IdentifyReport) -> Option<String> {
     let held = !report.fit.holdout.is_empty();
     let set = if held { &report.fit.holdout } else { &report.fit.train };
     let where_ = if held { "held-out" } else { "training" };
-    let parts: Vec<String> = channels(set, &report.noise_floor);
+    let parts: Vec<String> = channels(report, set);
     if parts.is_empty() {
         return None;
     }
@@ -85,15 +85,19 @@ fn prediction(report: &IdentifyReport) -> Option<String> {
 }
 
 /// `1.2 % (noise alone 1.1 %)` for each channel, with its name where there are several.
-fn channels(set: &FitSet, floor: &Ordered<f64>) -> Vec<String> {
+fn channels(report: &IdentifyReport, set: &FitSet) -> Vec<String> {
     let several = set.improved.len() > 1;
     set.improved
         .iter()
         .map(|(channel, score)| {
             let of = if several { format!(" of {}", expression::text(channel)) } else { String::new() };
-            let noise = floor.get(channel).map_or_else(String::new, |floor| {
-                format!(" (noise alone {})", format::percent_short(*floor))
-            });
+            let noise = match report.noise_floor.contains_key(channel) {
+                true => {
+                    let floor = report.fit.floor_in(set, channel, &report.noise_floor);
+                    format!(" (noise alone {})", format::percent_short(floor))
+                }
+                false => String::new(),
+            };
             if score.nrmse.is_finite() {
                 format!("{}{of}{noise}", format::percent_short(score.nrmse))
             } else {
