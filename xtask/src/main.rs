@@ -47,7 +47,7 @@ enum Task {
         #[arg(long)]
         check: bool,
     },
-    /// Make a Python with NumPy and SciPy, as bench/requirements.txt pins them, and print its path for $GREYBOX_PYTHON
+    /// Make a Python with NumPy, SciPy and a reader of Modelica, as bench/requirements.txt pins them, and print its path for $GREYBOX_PYTHON
     Python,
     /// Build the wheel of the Python package, install it in an environment of its own, and run its tests and notebooks
     PythonPackage,
@@ -105,7 +105,15 @@ fn root() -> PathBuf {
 fn python(root: &Path) -> Result<Ending> {
     let folder = process::target(root).join("python");
     let list = root.join("bench").join("requirements.txt");
-    println!("{}", bench::peer::environment(&list, &folder, &["numpy", "scipy"])?.display());
+    println!(
+        "{}",
+        bench::peer::environment(
+            &list,
+            &folder,
+            &["numpy", "scipy", "antlr4-python3-runtime", "casadi", "pymoca"]
+        )?
+        .display()
+    );
     Ok(Ending::Done)
 }
 

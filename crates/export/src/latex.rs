@@ -3,7 +3,7 @@
 use std::fmt::Write as _;
 
 use greybox_model::expr::{BinOp, Func};
-use greybox_model::{Equation, Expr, Model};
+use greybox_model::{Expr, Model};
 
 use crate::infix::number;
 
@@ -11,7 +11,8 @@ use crate::infix::number;
 ///
 /// Derivatives are dots, quotients fractions, |x| bars; `sign`, `deadzone` and `saturate` are operators;
 /// `delay(x, tau)` is x(t − τ) for a symbol and a bar with the instant for an expression. Greek names are
-/// letters, and what follows `_` or trailing digits is an index, as in the report.
+/// letters, and what follows `_` or trailing digits is an index, as in the report. Equations longer than a line of an
+/// article break before a term, and then all stand at the left.
 ///
 /// ```
 /// use greybox_model::Model;
@@ -26,15 +27,94 @@ use crate::infix::number;
 /// ```
 #[must_use]
 pub fn latex(model: &Model) -> String {
-    let mut rows: Vec<String> = model.equations.iter().map(row).collect();
-    rows.extend(
+    // The terms of both sides.
+    let mut sides: Vec<[Vec<String>; 2]> =
+        model.equations.iter().map(|e| [&e.lhs, &e.rhs].map(terms)).collect();
+    sides.extend(
         model
             .measurements
             .iter()
             .filter(|m| !is_own_channel(model, &m.channel, &m.expr))
-            .map(|m| format!("y_{{\\text{{{}}}}} &= {}", escaped(&m.channel), math(&m.expr, Level::Sum))),
+            .map(|m| [vec![format!("y_{{\\text{{{}}}}}", escaped(&m.channel))], terms(&m.expr)]),
     );
+    // Aligned at their signs, all left sides are as wide as the widest.
+    let widest = |side: usize| -> usize {
+        let widths = sides.iter().map(|both| both[side].iter().map(|term| width(term) + 1).sum());
+        widths.max().unwrap_or(0)
+    };
+    let row = if widest(0) + widest(1) <= WIDTH { on_one_line } else { on_lines };
+    let rows: Vec<String> = sides.iter().map(row).collect();
     format!("\\begin{{align}}\n  {}\n\\end{{align}}\n", rows.join(" \\\\\n  "))
+}
+
+/// Letters and signs of an equation that a line of an article holds beside the number.
+const WIDTH: usize = 54;
+
+/// An equation, aligned at its sign.
+fn on_one_line([left, right]: &[Vec<String>; 2]) -> String {
+    format!("{} &= {}", left.join(" "), right.join(" "))
+}
+
+/// An equation on as many lines as its terms need, all but the first indented.
+fn on_lines([left, right]: &[Vec<String>; 2]) -> String {
+    let (first, rest) = right.split_first().map_or(("0", &[][..]), |(first, rest)| (first.as_str(), rest));
+    let terms = left.iter().cloned().chain(std::iter::once(format!("= {first}"))).chain(rest.iter().cloned());
+    let mut text = String::from("& ");
+    let mut used = 0;
+    for term in terms {
+        let size = width(&term) + 1;
+        if used > 0 && used + size > WIDTH {
+            text.push_str("\\notag \\\\\n  & \\quad {} ");
+            used = 2;
+        }
+        text.push_str(&term);
+        text.push(' ');
+        used += size;
+    }
+    text.trim_end().to_owned()
+}
+
+/// The terms of a sum, each but the first with its sign in front.
+fn terms(e: &Expr) -> Vec<String> {
+    match e {
+        Expr::Bin(op @ (BinOp::Add | BinOp::Sub), a, b) => {
+            let mut all = terms(a);
+            all.push(match op {
+                BinOp::Add => format!("+ {}", math(b, Level::Term)),
+                _ => format!("- {}", math(b, Level::Product)),
+            });
+            all
+        }
+        _ => vec![math(e, Level::Sum)],
+    }
+}
+
+/// About how many letters and signs a formula shows.
+fn width(formula: &str) -> usize {
+    // Commands that show nothing of their own; of operators, the name in braces is shown.
+    const SILENT: [&str; 8] = ["left", "right", "frac", "mathit", "operatorname", "text", "dot", "ddot"];
+    let mut shown = 0;
+    let mut rest = formula.chars().peekable();
+    while let Some(c) = rest.next() {
+        match c {
+            '\\' => {
+                let mut name = String::new();
+                while let Some(letter) = rest.next_if(char::is_ascii_alphabetic) {
+                    name.push(letter);
+                }
+                if name.is_empty() {
+                    rest.next(); // a space or a brace
+                } else if !SILENT.contains(&name.as_str()) {
+                    // A Greek letter, or a function by its name.
+                    let function = ["sin", "cos", "tan", "exp", "ln", "tanh", "arctan", "min", "max"];
+                    shown += if function.contains(&name.as_str()) { name.len() } else { 1 };
+                }
+            }
+            '{' | '}' | '^' | '_' | ' ' => {}
+            _ => shown += 1,
+        }
+    }
+    shown
 }
 
 /// The model as a LaTeX document of its own: the equations of [`latex`], what its functions mean, and the
@@ -84,10 +164,6 @@ fn table(out: &mut String, columns: &str, head: &str, rows: &[String]) {
             rows.concat()
         );
     }
-}
-
-fn row(equation: &Equation) -> String {
-    format!("{} &= {}", math(&equation.lhs, Level::Sum), math(&equation.rhs, Level::Sum))
 }
 
 /// Whether a measurement says no more than that a state's channel is called as the state.

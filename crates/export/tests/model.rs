@@ -83,6 +83,27 @@ fn latex_reads_like_a_textbook() {
 }
 
 #[test]
+fn a_long_equation_breaks_before_a_term() {
+    let mut model = axis();
+    model.equations[0].lhs = parse(
+        "m*x'' + fc*sign(x') + k*deadzone(x - r*theta_m, gap) - k*x^2 + fc*sign(x')*abs(x) + k*x^3/(1 + x^2)",
+    )
+    .unwrap()
+    .expr;
+    let text = latex(&model);
+    let lines: Vec<&str> = text.lines().collect();
+    assert_eq!(
+        lines[1..3],
+        [
+            r"  & m\,\ddot{x} + \mathit{fc}\,\operatorname{sign}\left(\dot{x}\right) + k\,\operatorname{deadzone}\left(x - r\,\theta_{\text{m}}, \mathit{gap}\right) - k\,x^{2} \notag \\",
+            r"  & \quad {} + \mathit{fc}\,\operatorname{sign}\left(\dot{x}\right)\,\left|x\right| + \frac{k\,x^{3}}{1 + x^{2}} = 0 \\",
+        ]
+    );
+    assert!(lines[3].starts_with(r"  & \mathit{Jm}") && lines[3].contains(" = r"), "{text}");
+    assert_eq!(lines.len(), 5);
+}
+
+#[test]
 fn quotients_and_signs_keep_their_value_in_latex() {
     let mut model = axis();
     for (text, expected) in [
