@@ -4,6 +4,7 @@
 #![allow(clippy::unwrap_used)]
 
 use std::fs;
+use std::path::Path;
 
 use common::{Bench, names};
 use serde_json::Value;
@@ -332,6 +333,7 @@ fn demo_tells_the_story_and_writes_what_it_shows() {
     assert_eq!(outcome.code, 0, "{}", outcome.stderr);
     assert!(outcome.stdout.contains("Coulomb friction is missing in the hub equation"), "{}", outcome.stdout);
     assert!(outcome.stdout.contains("held out, θ"), "{}", outcome.stdout);
+    assert!(!outcome.stdout.contains("limit of work"), "{}", outcome.stdout);
     assert_eq!(bench.names(), ["model.toml", "run1.csv", "run2.csv"], "nothing is written without --out");
 
     let json = bench.json(&["demo", "--out", "demo"]);
