@@ -331,8 +331,14 @@ fn boolean(table: &DeTable<'_>, key: &str, item: &str) -> Result<Option<bool>, L
 
 fn number(value: &Spanned<DeValue<'_>>, key: &str, item: &str) -> Result<f64, Located> {
     let parsed = match value.get_ref() {
-        DeValue::Integer(v) if v.radix() == 10 => v.as_str().parse::<f64>().ok(),
-        DeValue::Integer(v) => i64::from_str_radix(v.as_str(), v.radix()).ok().map(|v| v as f64),
+        // TOML's integers have 64 bits; what writes a model back reads no others.
+        DeValue::Integer(v) => match i64::from_str_radix(v.as_str(), v.radix()) {
+            Ok(v) => Some(v as f64),
+            Err(_) => {
+                let message = format!("`{key}` is an integer of more than 64 bits");
+                return Err(bad(item, message, value.span(), "write it with an exponent, like `5e20`"));
+            }
+        },
         DeValue::Float(v) => v.as_str().parse::<f64>().ok(),
         other => {
             let message = format!("`{key}` must be a number, found {}", kind(other));

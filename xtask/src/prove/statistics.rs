@@ -14,6 +14,7 @@ use rand::{RngExt, SeedableRng};
 use rand_distr::{Distribution, StandardNormal};
 use rand_pcg::Pcg64Mcg;
 use rayon::prelude::*;
+use statrs::distribution::{Binomial, DiscreteCDF};
 
 use super::{Figure, Outcome, identify};
 use crate::book;
@@ -46,37 +47,111 @@ mass = "m*x'' + c*x' + k*x = f"
 #[derive(Debug, Clone, Copy)]
 struct Effect {
     kind: &'static str,
+    /// Begin of the law's expression, where another of this kind says something else.
+    law: &'static str,
     parameter: &'static str,
     strength: (f64, f64),
-    /// Force that it takes away, at position, velocity and strength; dry friction is no function of them.
+    /// Force that it takes away, at position, velocity and strength.
     force: fn(f64, f64, f64) -> f64,
-    dry: bool,
+    /// Dry friction, which holds a body at rest: its level at velocity and strength.
+    dry: fn(f64, f64) -> f64,
 }
 
+/// Effects that have one parameter.
 const EFFECTS: [Effect; 4] = [
     Effect {
         kind: "coulomb_friction",
+        law: "",
         parameter: "fc",
         strength: (0.2, 0.8),
         force: |_, _, _| 0.0,
-        dry: true,
+        dry: |_, s| s,
     },
     Effect {
         kind: "cubic_stiffness",
+        law: "",
         parameter: "k3",
         strength: (100.0, 400.0),
         force: |x, _, s| s * x * x * x,
-        dry: false,
+        dry: |_, _| 0.0,
     },
     Effect {
         kind: "quadratic_drag",
+        law: "",
         parameter: "cd",
         strength: (0.3, 1.5),
         force: |_, v, s| s * v * v.abs(),
-        dry: false,
+        dry: |_, _| 0.0,
     },
-    Effect { kind: "constant_offset", parameter: "f0", strength: (0.3, 1.5), force: |_, _, s| s, dry: false },
+    Effect {
+        kind: "constant_offset",
+        law: "",
+        parameter: "f0",
+        strength: (0.3, 1.5),
+        force: |_, _, s| s,
+        dry: |_, _| 0.0,
+    },
 ];
+
+/// Others that are taken for these, and for each other, where little of them is seen.
+const LOOKALIKES: [Effect; 4] = [
+    Effect {
+        kind: "asymmetric_coulomb_friction",
+        law: "",
+        parameter: "fcp",
+        strength: (0.2, 0.8),
+        force: |_, _, _| 0.0,
+        dry: |v, s| if v > 0.0 { s } else { 0.6 * s },
+    },
+    Effect {
+        kind: "stribeck_friction",
+        law: "",
+        parameter: "fc",
+        strength: (0.2, 0.8),
+        force: |_, _, _| 0.0,
+        dry: |v, s| s * (1.0 + 0.8 * (-(v / 0.1).powi(2)).exp()),
+    },
+    Effect {
+        kind: "quadratic_stiffness",
+        law: "",
+        parameter: "k2",
+        strength: (20.0, 80.0),
+        force: |x, _, s| s * x * x,
+        dry: |_, _| 0.0,
+    },
+    Effect {
+        kind: "dead_zone",
+        law: "kd*",
+        parameter: "gap",
+        strength: (0.03, 0.1),
+        // A second spring, which takes hold on either side of the middle.
+        force: |x, _, s| 60.0 * (x - x.clamp(-s, s)),
+        dry: |_, _| 0.0,
+    },
+];
+
+/// How much is recorded of a machine.
+#[derive(Debug, Clone, Copy)]
+struct Plan {
+    /// Samples.
+    train: usize,
+    holdout: usize,
+    /// Sines of the force.
+    sines: usize,
+    /// Factor of the strengths of effects.
+    weaker: f64,
+    /// Bounds of the noise over the motion.
+    noise: (f64, f64),
+}
+
+impl Plan {
+    const fn rich(noise: (f64, f64)) -> Plan {
+        Plan { train: 1200, holdout: 600, sines: 8, weaker: 1.0, noise }
+    }
+
+    /// Short, with two frequencies, of effects that are hardly there: what several laws explain.
+    const POOR: Plan = Plan { train: 400, holdout: 300, sines: 2, weaker: 0.4, noise: (0.01, 0.3) };
+}
 
 /// Noise of a sensor.
 #[derive(Debug, Clone, Copy, PartialEq)]
@@ -96,15 +171,15 @@ struct Drawn {
     holdout: Recording,
 }
 
-/// Draws a machine of a case: `level` bounds the noise over the motion.
-fn draw(seed: u64, effect: Option<Effect>, noise: Noise, level: (f64, f64)) -> Result<Drawn> {
+/// Draws a machine of a case.
+fn draw(seed: u64, effect: Option<Effect>, noise: Noise, plan: Plan) -> Result<Drawn> {
     let mut random = Pcg64Mcg::seed_from_u64(seed);
     let mut around = |value: f64| value * random.random_range(0.85..1.15);
     let truth = [around(1.0), around(0.6), around(40.0)];
-    let effect = effect.map(|e| (e, random.random_range(e.strength.0..e.strength.1)));
-    let level = (random.random_range(level.0.ln()..=level.1.ln())).exp();
-    let train = record(&mut random, &truth, effect, noise, level, 1200)?;
-    let holdout = record(&mut random, &truth, effect, noise, level, 600)?;
+    let effect = effect.map(|e| (e, plan.weaker * random.random_range(e.strength.0..e.strength.1)));
+    let level = (random.random_range(plan.noise.0.ln()..=plan.noise.1.ln())).exp();
+    let mut record = |n| record(&mut random, &truth, effect, (noise, level), (plan.sines, n));
+    let (train, holdout) = (record(plan.train)?, record(plan.holdout)?);
     Ok(Drawn { truth, effect, train, holdout })
 }
 
@@ -114,13 +189,12 @@ fn record(
     random: &mut Pcg64Mcg,
     truth: &[f64; 3],
     effect: Option<(Effect, f64)>,
-    noise: Noise,
-    level: f64,
-    n: usize,
+    (noise, level): (Noise, f64),
+    (sines, n): (usize, usize),
 ) -> Result<Recording> {
     let [m, c, k] = *truth;
     let (dt, fine) = (0.01, 200);
-    let sines: Vec<[f64; 2]> = (0..8)
+    let sines: Vec<[f64; 2]> = (0..sines)
         .map(|_| [random.random_range(1.0_f64..14.0), random.random_range(0.0..std::f64::consts::TAU)])
         .collect();
     let time: Vec<f64> = (0..n).map(|i| i as f64 * dt).collect();
@@ -128,7 +202,6 @@ fn record(
         time.iter().map(|t| sines.iter().map(|[w, p]| 2.0 * (w * t + p).sin()).sum()).collect();
     let (mut x, mut v) = (0.02, 0.0);
     let h = dt / fine as f64;
-    let dry = effect.filter(|(e, _)| e.dry).map_or(0.0, |(_, s)| h * s / m);
     let mut motion = Vec::with_capacity(n);
     for i in 0..n {
         motion.push(x);
@@ -139,6 +212,7 @@ fn record(
             let rate =
                 |v: f64| (f - c * v - k * middle - effect.map_or(0.0, |(e, s)| (e.force)(middle, v, s))) / m;
             let free = v + h * rate(v + 0.5 * h * rate(v));
+            let dry = effect.map_or(0.0, |(e, s)| h * (e.dry)(free, s) / m);
             v = if free.abs() <= dry { 0.0 } else { free - dry * free.signum() };
             x = middle + 0.5 * h * v;
         }
@@ -181,29 +255,58 @@ impl Covered {
     }
 }
 
-/// What one diagnosis of a machine with something left out says.
+/// What one diagnosis of a machine with something left out says of it.
+#[derive(Debug, Clone, Copy, PartialEq)]
+enum Told {
+    /// Its kind.
+    Named,
+    /// Another kind, which these recordings do not tell from it: the report says so.
+    Equal,
+    /// Something else.
+    Otherwise,
+    /// No mechanism.
+    Nothing,
+}
+
+/// What one diagnosis says.
 #[derive(Debug, Clone, Copy)]
-struct Named {
-    /// Confidence of the first mechanism and whether it is the right one; `None` where none is named.
-    first: Option<(f64, bool)>,
-    /// The intervals, where just the right one is named.
+struct Answer {
+    told: Told,
+    /// Confidence of the first mechanism, if any.
+    confidence: Option<f64>,
+    /// The intervals, where just the right law is named.
     covered: Covered,
 }
 
-fn named(drawn: &Drawn, (effect, strength): (Effect, f64), diagnosis: &Diagnosis) -> Named {
-    let mut covered = Covered::default();
-    if let [only] = diagnosis.mechanisms.as_slice()
-        && only.kind == effect.kind
-    {
-        for (p, truth) in diagnosis.parameters.iter().zip(drawn.truth) {
-            covered.count(truth, p.improved.ci95);
+impl Answer {
+    fn of(drawn: &Drawn, (effect, strength): (Effect, f64), diagnosis: &Diagnosis) -> Answer {
+        let mut covered = Covered::default();
+        if let [only] = diagnosis.mechanisms.as_slice()
+            && only.kind == effect.kind
+            && only.expression.starts_with(effect.law)
+        {
+            for (p, truth) in diagnosis.parameters.iter().zip(drawn.truth) {
+                covered.count(truth, p.improved.ci95);
+            }
+            for (_, _, e) in only.parameters.iter().filter(|(n, ..)| n.starts_with(effect.parameter)) {
+                covered.count(strength, e.ci95);
+            }
         }
-        for (_, _, e) in only.parameters.iter().filter(|(n, ..)| n.starts_with(effect.parameter)) {
-            covered.count(strength, e.ci95);
-        }
+        let told = match diagnosis.mechanisms.first() {
+            None => Told::Nothing,
+            Some(first) if first.kind == effect.kind => Told::Named,
+            Some(first) if first.alternatives.iter().any(|a| a.equivalent && a.kind == effect.kind) => {
+                Told::Equal
+            }
+            Some(_) => Told::Otherwise,
+        };
+        Answer { told, confidence: diagnosis.mechanisms.first().map(|f| f.confidence), covered }
     }
-    let first = diagnosis.mechanisms.first().map(|f| (f.confidence, f.kind == effect.kind));
-    Named { first, covered }
+
+    /// The confidence told, and whether it is right.
+    fn judged(&self) -> Option<(f64, bool)> {
+        self.confidence.map(|confidence| (confidence, matches!(self.told, Told::Named | Told::Equal)))
+    }
 }
 
 /// Answers whose confidence lies in one bin.
@@ -227,12 +330,14 @@ impl Bin {
         let (n, p, z) = (self.answers as f64, self.rate(), 1.96_f64);
         let centre = (p + z * z / (2.0 * n)) / (1.0 + z * z / n);
         let half = z / (1.0 + z * z / n) * (p * (1.0 - p) / n + z * z / (4.0 * n * n)).sqrt();
-        (centre - half, centre + half)
+        ((centre - half).max(0.0), (centre + half).min(1.0))
     }
 
-    /// Whether the confidence is no higher than the answers deserve.
+    /// Whether the confidence is no higher than the answers deserve: so few right ones, or fewer, come by chance in 2.5 %
+    /// at least, were it so (exact binomial test).
     fn is_honest(&self) -> bool {
-        self.told <= self.interval().1
+        let by_chance = Binomial::new(self.told.clamp(0.0, 1.0), self.answers as u64);
+        by_chance.is_ok_and(|d| d.cdf(self.right as u64) >= 0.025)
     }
 }
 
@@ -260,7 +365,7 @@ fn over<T: Send>(seeds: &[u64], work: impl Fn(u64) -> Result<T> + Sync) -> Resul
 fn calibrated(seeds: &[u64], noise: Noise) -> Result<Figure> {
     let model = Model::from_toml(MODEL, "model.toml")?;
     let counts = over(seeds, |seed| {
-        let drawn = draw(seed, None, noise, (0.01, 0.05))?;
+        let drawn = draw(seed, None, noise, Plan::rich((0.01, 0.05)))?;
         let found = calibrate(&model, &[drawn.train], &[drawn.holdout], &Quiet)?;
         let mut covered = Covered::default();
         for (p, truth) in found.parameters.iter().zip(drawn.truth) {
@@ -276,7 +381,7 @@ fn calibrated(seeds: &[u64], noise: Noise) -> Result<Figure> {
 fn nulls(seeds: &[u64], noise: Noise) -> Result<Vec<Figure>> {
     let model = Model::from_toml(MODEL, "model.toml")?;
     let verdicts = over(seeds, |seed| {
-        let drawn = draw(seed, None, noise, (0.003, 0.1))?;
+        let drawn = draw(seed, None, noise, Plan::rich((0.003, 0.1)))?;
         Ok(diagnose(&model, &[drawn.train], &[drawn.holdout], &Options::default(), &Quiet)?.verdict)
     })?;
     let of = |verdict| verdicts.iter().filter(|v| **v == verdict).count();
@@ -293,31 +398,42 @@ fn nulls(seeds: &[u64], noise: Noise) -> Result<Vec<Figure>> {
     ])
 }
 
-/// Diagnoses of machines with one thing left out, by the noise over their motion.
-fn effects(seeds: &[u64], level: (f64, f64)) -> Result<Vec<(Effect, Named)>> {
+/// Diagnoses of machines with one thing left out, as they are recorded.
+fn effects(seeds: &[u64], drawn_from: &[Effect], plan: Plan) -> Result<Vec<(Effect, Answer)>> {
     let model = Model::from_toml(MODEL, "model.toml")?;
-    let all: Vec<(usize, u64)> = seeds.iter().enumerate().map(|(i, s)| (i % EFFECTS.len(), *s)).collect();
+    let all: Vec<(usize, u64)> = seeds.iter().enumerate().map(|(i, s)| (i % drawn_from.len(), *s)).collect();
     all.par_iter()
         .map(|(kind, seed)| {
-            let drawn = draw(*seed, Some(EFFECTS[*kind]), Noise::White, level)?;
+            let drawn = draw(*seed, Some(drawn_from[*kind]), Noise::White, plan)?;
             let (train, holdout) = ([drawn.train.clone()], [drawn.holdout.clone()]);
             let found = diagnose(&model, &train, &holdout, &Options::default(), &Quiet)?;
             let effect = drawn.effect.context("nothing was left out")?;
-            Ok((effect.0, named(&drawn, effect, &found)))
+            Ok((effect.0, Answer::of(&drawn, effect, &found)))
         })
         .collect()
 }
 
-fn effect_figures(found: &[(Effect, Named)]) -> Vec<Figure> {
+fn effect_figures(found: &[(Effect, Answer)]) -> Vec<Figure> {
     let all = found.iter().fold(Covered::default(), |sum, (_, n)| sum.and(n.covered));
     let mut figures = vec![identify::coverage("95 % intervals that hold the truth", (all.held, all.all))];
-    for effect in EFFECTS {
-        let of: Vec<&Named> = found.iter().filter(|(e, _)| e.kind == effect.kind).map(|(_, n)| n).collect();
-        let right = of.iter().filter(|n| n.first.is_some_and(|f| f.1)).count();
-        let covered = of.iter().fold(Covered::default(), |sum, n| sum.and(n.covered));
-        let rate = 100.0 * covered.held as f64 / covered.all.max(1) as f64;
-        let told = format!("{right} of {} named, {rate:.1} % of {} intervals", of.len(), covered.all);
-        figures.push(Figure::plain(effect.kind, told));
+    for effect in EFFECTS.iter().chain(&LOOKALIKES) {
+        let of: Vec<&Answer> = found.iter().filter(|(e, _)| e.kind == effect.kind).map(|(_, n)| n).collect();
+        if of.is_empty() {
+            continue;
+        }
+        let count = |told| of.iter().filter(|a| a.told == told).count();
+        let covered = of.iter().fold(Covered::default(), |sum, a| sum.and(a.covered));
+        let mut text = format!("{} of {} named", count(Told::Named), of.len());
+        for (told, words) in [(Told::Equal, "told as an equal"), (Told::Otherwise, "taken for another")] {
+            if count(told) > 0 {
+                text += &format!(", {} {words}", count(told));
+            }
+        }
+        if covered.all > 0 {
+            let rate = 100.0 * covered.held as f64 / covered.all as f64;
+            text += &format!("; {rate:.1} % of {} intervals", covered.all);
+        }
+        figures.push(Figure::plain(effect.kind, text));
     }
     figures
 }
@@ -343,7 +459,8 @@ fn bin_figures(bins: &[Bin]) -> Vec<Figure> {
 #[derive(Debug, Clone)]
 pub(crate) struct Found {
     pub(crate) outcomes: Vec<Outcome>,
-    bins: Vec<Bin>,
+    /// Of what is recorded well, and of the rest.
+    bins: [Vec<Bin>; 2],
     /// Seeds of each case.
     seeds: usize,
 }
@@ -368,17 +485,17 @@ fn table(found: &Found) -> String {
 }
 
 /// Answers that are right against the confidence told, with their intervals, and the line where both agree.
-fn diagram(bins: &[Bin]) -> Result<String> {
-    let told = || bins.iter().filter(|b| b.answers > 0);
+fn diagram(bins: &[Vec<Bin>; 2]) -> Result<String> {
     let at = |b: &Bin, rate: f64| [100.0 * b.told, 100.0 * rate];
-    let mut series = vec![
-        Series::new("as told", Style::Dashed, vec![[0.0, 0.0], [100.0, 100.0]]),
-        Series::new("measured", Style::Points, told().map(|b| at(b, b.rate())).collect()),
-    ];
-    series.extend(told().map(|b| {
-        let (low, high) = b.interval();
-        Series::new("", Style::Line, vec![at(b, low), at(b, high)])
-    }));
+    let mut series = vec![Series::new("as told", Style::Dashed, vec![[0.0, 0.0], [100.0, 100.0]])];
+    for (name, bins) in ["measured", "measured, little recorded"].into_iter().zip(bins) {
+        let told = || bins.iter().filter(|b| b.answers > 0);
+        series.push(Series::new(name, Style::Points, told().map(|b| at(b, b.rate())).collect()));
+        series.extend(told().map(|b| {
+            let (low, high) = b.interval();
+            Series::new("", Style::Line, vec![at(b, low), at(b, high)])
+        }));
+    }
     let plot = Plot {
         alt: "Answers that are right against the confidence told".into(),
         x: Axis::linear("confidence told in %"),
@@ -405,21 +522,30 @@ pub(crate) fn run(first: u64, count: Option<usize>, only: Option<&str>) -> Resul
     case("calibrate, coloured noise", &mut || Ok(vec![calibrated(&seeds, Noise::Coloured(0.8))?]))?;
     case("nothing missing, white noise", &mut || nulls(&seeds, Noise::White))?;
     case("nothing missing, coloured noise", &mut || nulls(&seeds, Noise::Coloured(0.8)))?;
-    let mut answers = Vec::new();
-    let mut note = |found: &[(Effect, Named)]| answers.extend(found.iter().filter_map(|(_, n)| n.first));
-    case("one effect missing, noise of 0.3 to 5 %", &mut || {
-        let found = effects(&seeds, (0.003, 0.05))?;
-        note(&found);
+    let (mut rich, mut poor) = (Vec::new(), Vec::new());
+    let judged =
+        |found: &[(Effect, Answer)]| found.iter().filter_map(|(_, a)| a.judged()).collect::<Vec<_>>();
+    for (name, noise) in [
+        ("one effect missing, noise of 0.3 to 5 %", (0.003, 0.05)),
+        ("one effect missing, noise of 10 to 60 %", (0.1, 0.6)),
+    ] {
+        case(name, &mut || {
+            let found = effects(&seeds, &EFFECTS, Plan::rich(noise))?;
+            rich.extend(judged(&found));
+            Ok(effect_figures(&found))
+        })?;
+    }
+    case("one effect missing, little of it recorded", &mut || {
+        let found = effects(&seeds, &[EFFECTS, LOOKALIKES].concat(), Plan::POOR)?;
+        poor.extend(judged(&found));
         Ok(effect_figures(&found))
     })?;
-    case("one effect missing, noise of 10 to 60 %", &mut || {
-        let found = effects(&seeds, (0.1, 0.6))?;
-        note(&found);
-        Ok(effect_figures(&found))
-    })?;
-    let bins = bins(&answers);
-    if !answers.is_empty() {
-        outcomes.push(Outcome { case: "confidence".into(), figures: bin_figures(&bins) });
+    // Apart: the many sure answers of the one would hide what the other shows.
+    let bins = [bins(&rich), bins(&poor)];
+    for (name, bins) in ["confidence", "confidence, little recorded"].into_iter().zip(&bins) {
+        if bins.iter().any(|b| b.answers > 0) {
+            outcomes.push(Outcome { case: name.into(), figures: bin_figures(bins) });
+        }
     }
     Ok(Found { outcomes, bins, seeds: n })
 }
@@ -443,6 +569,8 @@ mod tests {
         assert!((low - 0.7112).abs() < 1e-4 && (high - 0.8666).abs() < 1e-4, "{low} {high}");
         assert!(good.is_honest() && bin(&answers(95, 5, 0.8)).is_honest());
         assert!(!bin(&answers(60, 40, 0.8)).is_honest());
+        // One wrong answer of one proves nothing, three do: 0.2³ = 0.008.
+        assert!(bin(&answers(0, 1, 0.8)).is_honest() && !bin(&answers(0, 3, 0.8)).is_honest());
         assert_eq!(bin(&answers(3, 0, 1.0)).high, 1.0);
     }
 
@@ -459,7 +587,7 @@ mod tests {
     fn the_machine_moves_as_its_equation_says() {
         let mut random = Pcg64Mcg::seed_from_u64(1);
         let truth = [1.0, 0.6, 40.0];
-        let recording = record(&mut random, &truth, None, Noise::White, 0.0, 400).unwrap();
+        let recording = record(&mut random, &truth, None, (Noise::White, 0.0), (8, 400)).unwrap();
         let column = |name: &str| recording.channel(name).unwrap().values.clone();
         let (f, x) = (column("f"), column("x"));
         // Central differences, whose error is dt²/12 times the fourth derivative.

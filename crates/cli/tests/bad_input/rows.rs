@@ -578,6 +578,12 @@ fn toml() -> Vec<Row> {
         altered!(S, "an infinite value", "value = 30.0", "value = inf"),
         altered!(
             S,
+            "a value that is an integer of more than 64 bits",
+            "value = 30.0",
+            "value = 30000000000000000000"
+        ),
+        altered!(
+            S,
             "a value that its unit makes infinite",
             "value = 30.0, unit = \"N/m\"",
             "value = 1e308, unit = \"kN/mm\""
