@@ -70,10 +70,13 @@ fn the_readme_shows_what_the_demo_prints() {
         std::fs::read_to_string(Path::new(env!("CARGO_MANIFEST_DIR")).join("../../README.md")).unwrap();
     let readme = readme.replace("\r\n", "\n");
     let shown = readme.split("```text\n").nth(1).and_then(|rest| rest.split("```").next()).unwrap();
-    let run = Command::new(env!("CARGO_BIN_EXE_greybox")).arg("demo").output().unwrap();
+    let place = tempfile::tempdir().unwrap();
+    let run =
+        Command::new(env!("CARGO_BIN_EXE_greybox")).arg("demo").current_dir(place.path()).output().unwrap();
     assert!(run.status.success(), "{}", String::from_utf8_lossy(&run.stderr));
     let printed = String::from_utf8(run.stdout).unwrap();
     let without_digits = |text: &str| text.replace(|c: char| c.is_ascii_digit(), "");
     assert!(shown.lines().count() > 5, "{shown}");
     assert!(without_digits(&printed).contains(&without_digits(shown)), "{printed}");
+    assert_eq!(std::fs::read_dir(place.path()).unwrap().count(), 0, "nothing is written without --out");
 }
