@@ -890,6 +890,32 @@ impl Mechanism {
         alike && (0..8).all(|k| mine.iter().zip(&theirs).all(|(a, b)| agree(k, a, b)))
     }
 
+    /// Whether this law is the other, of one strength, where all its strengths are that one, whatever the rest.
+    pub fn is_at_equal_strengths(&self, other: &Mechanism) -> bool {
+        let static_laws = self.states.is_empty() && other.states.is_empty();
+        let [strength] = &other.linear[..] else { return false };
+        let alone = other.own.iter().all(|n| n == strength);
+        let alike = alone
+            && static_laws
+            && self.on == other.on
+            && self.reaction.is_some() == other.reaction.is_some();
+        // Any number will do for a signal and an inner parameter, a different one for each.
+        let number = |k: u8, n: &str, primes: u8| {
+            let name: f64 = n.bytes().map(f64::from).sum();
+            (1.7 * f64::from(k) + 0.9 * f64::from(primes) + name).sin()
+        };
+        let agree = |k: u8, a: &Expr, b: &Expr| {
+            let of = |m: &Mechanism, e: &Expr| {
+                e.eval(&|n, primes| {
+                    let linear = m.linear.iter().any(|l| l == n);
+                    Some(if linear { 0.7 } else { number(k, n, primes) })
+                })
+            };
+            of(self, a).zip(of(other, b)).is_some_and(|(a, b)| (a - b).abs() <= 1e-9 * (a.abs() + b.abs()))
+        };
+        alike && (0..8).all(|k| self.expressions().zip(other.expressions()).all(|(a, b)| agree(k, a, b)))
+    }
+
     /// The law's own parameters at values of the score test (linear ones, inner ones).
     pub fn values(&self, linear: &[f64], inner: &[f64]) -> Option<Vec<f64>> {
         let given = |n: &str| {
@@ -1364,6 +1390,20 @@ mod tests {
             ("b.toml".to_string(), file("").replace("\"k\"", "\"j\"")),
         ];
         assert_eq!(combine(&files).unwrap().added, ["a.toml", "b.toml"]);
+    }
+
+    #[test]
+    fn a_refinement_is_its_law_at_equal_strengths() {
+        let library = built_in().unwrap();
+        let law = |kind: &str| library.iter().find(|m| m.kind == kind).unwrap();
+        let at_equal = |law: &Mechanism| -> Vec<&str> {
+            library.iter().filter(|m| m.is_at_equal_strengths(law)).map(|m| m.kind.as_str()).collect()
+        };
+        let coulomb = at_equal(law("coulomb_friction"));
+        assert_eq!(coulomb, ["asymmetric_coulomb_friction", "coulomb_friction", "stribeck_friction"]);
+        // A law of two strengths has none that theirs could equal.
+        assert!(at_equal(law("stribeck_friction")).is_empty());
+        assert_eq!(at_equal(law("quadratic_drag")), ["quadratic_drag"]);
     }
 
     #[test]

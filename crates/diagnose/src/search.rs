@@ -14,7 +14,7 @@ use crate::candidate::{Candidate, Instance, candidates};
 use crate::evidence::{Evidence, Side, folds, kappa, least_kappa, weigh};
 use crate::library::Mechanism;
 use crate::place::{Place, places};
-use crate::screen::{Pair, Scored, first_states, screen, screen_pairs};
+use crate::screen::{Pair, Scored, first_states, inner_scales, screen, screen_pairs};
 use crate::uncertainty::Uncertainty;
 use crate::{Observer, Stage};
 
@@ -86,6 +86,8 @@ const BEYOND_WINDOWS: f64 = 2.0;
 /// Starting points of a mechanism with a memory that are followed, and for how many steps.
 const STARTING_POINTS: usize = 3;
 const STEPS_TO_TELL: usize = 3;
+/// Share of a law's strength by which a refinement's differs, to matter.
+const SUBSTANTIAL: f64 = 0.5;
 /// Log-likelihood gain that another hold must bring.
 const HOLD_GAIN: f64 = 10.0;
 
@@ -892,6 +894,7 @@ impl<'a> Search<'a> {
             }
         }
         self.simplify(&mut state);
+        self.declare_unseen(&mut state);
         let current = state.current;
         let better_holds = (0..current.setup.holds.len())
             .filter(|&i| current.setup.holds[i] != self.nominal.holds[i])
@@ -1786,6 +1789,118 @@ impl<'a> Search<'a> {
             }
             state.current = simpler;
         }
+    }
+
+    /// Declares refinements that these recordings would not show equals of the law that they refine: that BIC prefers
+    /// the law says then no more than that it is the simpler.
+    fn declare_unseen(&self, state: &mut State) {
+        for index in 0..state.current.parts.len() {
+            let law = state.current.parts[index].candidate.clone();
+            for refinement in self.all.iter().filter(|c| self.is_refined_by(&law, c)) {
+                if self.is_spent() {
+                    return;
+                }
+                let Some(instance) = self.unseen(&state.current, index, refinement, &state.scale) else {
+                    continue;
+                };
+                let Some(known) = state.accepted.iter_mut().find(|a| a.candidate == law) else { continue };
+                match known.rivals.iter_mut().find(|r| r.candidate == *refinement) {
+                    Some(rival) => rival.equivalent = true,
+                    None => known.rivals.push(Rival {
+                        candidate: refinement.clone(),
+                        instance,
+                        evidence: known.evidence,
+                        equivalent: true,
+                    }),
+                }
+            }
+        }
+    }
+
+    /// A refinement that may be there unseen, in place of the law that it refines: at half or more of the first values
+    /// of its inner parameters the 95 % interval of one of its strengths reaches further than [`SUBSTANTIAL`] from the
+    /// law's. Only of a refinement that is the law itself where its strengths are the law's.
+    fn unseen(
+        &self,
+        fitted: &Fitted,
+        index: usize,
+        refinement: &Candidate,
+        scale: &[f64],
+    ) -> Option<Instance> {
+        let parts = self.parts(fitted);
+        let (law, mechanism) = (&self.library[parts[index].0.mechanism], &self.library[refinement.mechanism]);
+        let ([_], [strength]) = (&law.linear[..], &parts[index].1[..]) else { return None };
+        if !mechanism.is_at_equal_strengths(law) {
+            return None;
+        }
+        let along = Along::smoothed(&fitted.setup, &fitted.level, scale, &fitted.fit.point);
+        let scales = inner_scales(mechanism, refinement, &along, &fitted.setup)?;
+        let choices = mechanism.inner.iter().zip(&scales).fold(vec![Vec::new()], |choices, (inner, size)| {
+            let longer = |c: &Vec<f64>| {
+                let c = c.clone();
+                inner.grid.iter().map(move |g| [&c[..], &[g * size]].concat()).collect::<Vec<_>>()
+            };
+            choices.iter().flat_map(longer).collect()
+        });
+        let at = |inner: &Vec<f64>| -> Option<(bool, Instance)> {
+            let mut parts = parts.clone();
+            let values = mechanism.values(&vec![*strength; mechanism.linear.len()], inner)?;
+            parts[index] = (refinement.clone(), values, scales.clone());
+            let held = self.held(fitted, &parts, index, scale)?;
+            let instance = held.parts[index].instance.clone();
+            Some((self.may_differ(&held, index, *strength, scale), instance))
+        };
+        let found: Vec<(bool, Instance)> = choices.par_iter().filter_map(at).collect();
+        let unseen = found.iter().filter(|f| f.0).count();
+        (2 * unseen >= choices.len()).then(|| found.into_iter().next().map(|f| f.1)).flatten()
+    }
+
+    /// The model with these parts, of which one has its inner parameters held where they are.
+    fn held(
+        &self,
+        fitted: &Fitted,
+        parts: &[(Candidate, Vec<f64>, Vec<f64>)],
+        index: usize,
+        scale: &[f64],
+    ) -> Option<Fitted> {
+        let mut held = self.reassembled(fitted, parts, scale, 0)?;
+        let mechanism = &self.library[held.parts[index].candidate.mechanism];
+        let names = mechanism.parameters().zip(&held.parts[index].instance.names);
+        let inner: Vec<usize> = names
+            .filter(|(plain, _)| !mechanism.linear.iter().any(|l| l == plain))
+            .filter_map(|(_, name)| held.setup.model.parameter(name))
+            .collect();
+        held.setup.free.retain(|f| !inner.contains(&f.index));
+        Some(self.refit(&held, scale, STEPS_TO_TELL))
+    }
+
+    /// Whether an admissible end of the 95 % interval of one of a part's strengths lies further than [`SUBSTANTIAL`]
+    /// from this one.
+    fn may_differ(&self, fitted: &Fitted, index: usize, strength: f64, scale: &[f64]) -> bool {
+        let part = &fitted.parts[index];
+        let mechanism = &self.library[part.candidate.mechanism];
+        let values: Vec<(&str, usize, f64)> = mechanism
+            .parameters()
+            .zip(&part.instance.names)
+            .filter_map(|(plain, name)| {
+                let at = fitted.setup.model.parameter(name)?;
+                Some((plain, at, fitted.fit.point.parameters[at]))
+            })
+            .collect();
+        let widths = Uncertainty::of(fitted, scale).widths();
+        let admissible = |name: &str, value: f64| {
+            let of =
+                |n: &str| values.iter().find(|v| v.0 == n).map(|v| if v.0 == name { value } else { v.2 });
+            mechanism.require.iter().all(|e| e.eval(&|n, _| of(n)).is_none_or(|v| v >= 0.0))
+        };
+        mechanism.linear.iter().any(|name| {
+            let Some((_, index, value)) = values.iter().find(|v| v.0 == name) else { return false };
+            let Some(at) = fitted.setup.free.iter().position(|f| f.index == *index) else { return false };
+            let least = if mechanism.positive.contains(name) { 0.0 } else { f64::NEG_INFINITY };
+            [(value - widths[at]).max(least), value + widths[at]]
+                .iter()
+                .any(|end| (end - strength).abs() > SUBSTANTIAL * strength.abs() && admissible(name, *end))
+        })
     }
 }
 
