@@ -4,6 +4,7 @@
 //! is. *Reliability*: of the mechanisms that are named with a confidence, how many are right. The recordings come from
 //! an oscillator of this file's own, whose parameters, force and noise are drawn anew for each seed.
 
+use std::collections::BTreeMap;
 use std::path::Path;
 
 use anyhow::{Context, Result};
@@ -57,76 +58,40 @@ struct Effect {
     dry: fn(f64, f64) -> f64,
 }
 
+impl Effect {
+    /// A force of position and velocity.
+    const fn smooth(
+        kind: &'static str,
+        parameter: &'static str,
+        strength: (f64, f64),
+        force: fn(f64, f64, f64) -> f64,
+    ) -> Effect {
+        Effect { kind, law: "", parameter, strength, force, dry: |_, _| 0.0 }
+    }
+
+    /// Dry friction of some level.
+    const fn dry(kind: &'static str, parameter: &'static str, dry: fn(f64, f64) -> f64) -> Effect {
+        Effect { kind, law: "", parameter, strength: (0.2, 0.8), force: |_, _, _| 0.0, dry }
+    }
+}
+
 /// Effects that have one parameter.
 const EFFECTS: [Effect; 4] = [
-    Effect {
-        kind: "coulomb_friction",
-        law: "",
-        parameter: "fc",
-        strength: (0.2, 0.8),
-        force: |_, _, _| 0.0,
-        dry: |_, s| s,
-    },
-    Effect {
-        kind: "cubic_stiffness",
-        law: "",
-        parameter: "k3",
-        strength: (100.0, 400.0),
-        force: |x, _, s| s * x * x * x,
-        dry: |_, _| 0.0,
-    },
-    Effect {
-        kind: "quadratic_drag",
-        law: "",
-        parameter: "cd",
-        strength: (0.3, 1.5),
-        force: |_, v, s| s * v * v.abs(),
-        dry: |_, _| 0.0,
-    },
-    Effect {
-        kind: "constant_offset",
-        law: "",
-        parameter: "f0",
-        strength: (0.3, 1.5),
-        force: |_, _, s| s,
-        dry: |_, _| 0.0,
-    },
+    Effect::dry("coulomb_friction", "fc", |_, s| s),
+    Effect::smooth("cubic_stiffness", "k3", (100.0, 400.0), |x, _, s| s * x * x * x),
+    Effect::smooth("quadratic_drag", "cd", (0.3, 1.5), |_, v, s| s * v * v.abs()),
+    Effect::smooth("constant_offset", "f0", (0.3, 1.5), |_, _, s| s),
 ];
 
 /// Others that are taken for these, and for each other, where little of them is seen.
 const LOOKALIKES: [Effect; 4] = [
+    Effect::dry("asymmetric_coulomb_friction", "fcp", |v, s| if v > 0.0 { s } else { 0.6 * s }),
+    Effect::dry("stribeck_friction", "fc", |v, s| s * (1.0 + 0.8 * (-(v / 0.1).powi(2)).exp())),
+    Effect::smooth("quadratic_stiffness", "k2", (20.0, 80.0), |x, _, s| s * x * x),
+    // A second spring, which takes hold on either side of the middle.
     Effect {
-        kind: "asymmetric_coulomb_friction",
-        law: "",
-        parameter: "fcp",
-        strength: (0.2, 0.8),
-        force: |_, _, _| 0.0,
-        dry: |v, s| if v > 0.0 { s } else { 0.6 * s },
-    },
-    Effect {
-        kind: "stribeck_friction",
-        law: "",
-        parameter: "fc",
-        strength: (0.2, 0.8),
-        force: |_, _, _| 0.0,
-        dry: |v, s| s * (1.0 + 0.8 * (-(v / 0.1).powi(2)).exp()),
-    },
-    Effect {
-        kind: "quadratic_stiffness",
-        law: "",
-        parameter: "k2",
-        strength: (20.0, 80.0),
-        force: |x, _, s| s * x * x,
-        dry: |_, _| 0.0,
-    },
-    Effect {
-        kind: "dead_zone",
         law: "kd*",
-        parameter: "gap",
-        strength: (0.03, 0.1),
-        // A second spring, which takes hold on either side of the middle.
-        force: |x, _, s| 60.0 * (x - x.clamp(-s, s)),
-        dry: |_, _| 0.0,
+        ..Effect::smooth("dead_zone", "gap", (0.03, 0.1), |x, _, s| 60.0 * (x - x.clamp(-s, s)))
     },
 ];
 
@@ -256,22 +221,24 @@ impl Covered {
 }
 
 /// What one diagnosis of a machine with something left out says of it.
-#[derive(Debug, Clone, Copy, PartialEq)]
+#[derive(Debug, Clone, PartialEq)]
 enum Told {
     /// Its kind.
     Named,
     /// Another kind, which these recordings do not tell from it: the report says so.
     Equal,
-    /// Something else.
-    Otherwise,
+    /// Something else: this kind.
+    Otherwise(String),
     /// No mechanism.
     Nothing,
 }
 
 /// What one diagnosis says.
-#[derive(Debug, Clone, Copy)]
+#[derive(Debug, Clone)]
 struct Answer {
     told: Told,
+    /// Kinds that it says these recordings do not tell from the first mechanism.
+    equals: usize,
     /// Confidence of the first mechanism, if any.
     confidence: Option<f64>,
     /// The intervals, where just the right law is named.
@@ -298,14 +265,17 @@ impl Answer {
             Some(first) if first.alternatives.iter().any(|a| a.equivalent && a.kind == effect.kind) => {
                 Told::Equal
             }
-            Some(_) => Told::Otherwise,
+            Some(first) => Told::Otherwise(first.kind.clone()),
         };
-        Answer { told, confidence: diagnosis.mechanisms.first().map(|f| f.confidence), covered }
+        let first = diagnosis.mechanisms.first();
+        let equals = first.map_or(0, |f| f.alternatives.iter().filter(|a| a.equivalent).count());
+        Answer { told, equals, confidence: first.map(|f| f.confidence), covered }
     }
 
-    /// The confidence told, and whether it is right.
-    fn judged(&self) -> Option<(f64, bool)> {
-        self.confidence.map(|confidence| (confidence, matches!(self.told, Told::Named | Told::Equal)))
+    /// The confidence told, and whether it is right: the name, or, where equals count, one of them.
+    fn judged(&self, equals_count: bool) -> Option<(f64, bool)> {
+        let right = self.told == Told::Named || (equals_count && self.told == Told::Equal);
+        self.confidence.map(|confidence| (confidence, right))
     }
 }
 
@@ -418,24 +388,41 @@ fn effect_figures(found: &[(Effect, Answer)]) -> Vec<Figure> {
     let mut figures = vec![identify::coverage("95 % intervals that hold the truth", (all.held, all.all))];
     for effect in EFFECTS.iter().chain(&LOOKALIKES) {
         let of: Vec<&Answer> = found.iter().filter(|(e, _)| e.kind == effect.kind).map(|(_, n)| n).collect();
-        if of.is_empty() {
-            continue;
+        if !of.is_empty() {
+            figures.push(Figure::plain(effect.kind, summary(&of)));
         }
-        let count = |told| of.iter().filter(|a| a.told == told).count();
-        let covered = of.iter().fold(Covered::default(), |sum, a| sum.and(a.covered));
-        let mut text = format!("{} of {} named", count(Told::Named), of.len());
-        for (told, words) in [(Told::Equal, "told as an equal"), (Told::Otherwise, "taken for another")] {
-            if count(told) > 0 {
-                text += &format!(", {} {words}", count(told));
-            }
-        }
-        if covered.all > 0 {
-            let rate = 100.0 * covered.held as f64 / covered.all as f64;
-            text += &format!("; {rate:.1} % of {} intervals", covered.all);
-        }
-        figures.push(Figure::plain(effect.kind, text));
     }
+    figures.push(Figure::plain("in all", summary(&found.iter().map(|(_, n)| n).collect::<Vec<_>>())));
     figures
+}
+
+/// How answers name what is left out, what they take it for, and how many of their intervals hold.
+fn summary(answers: &[&Answer]) -> String {
+    let count = |told: &Told| answers.iter().filter(|a| a.told == *told).count();
+    let mut text = format!("{} of {} named", count(&Told::Named), answers.len());
+    if count(&Told::Equal) > 0 {
+        text += &format!(", {} told as an equal", count(&Told::Equal));
+    }
+    let mut others = BTreeMap::new();
+    for answer in answers {
+        if let Told::Otherwise(kind) = &answer.told {
+            *others.entry(kind).or_insert(0) += 1;
+        }
+    }
+    for (kind, n) in others {
+        text += &format!(", {n} taken for {kind}");
+    }
+    let named: Vec<usize> = answers.iter().filter(|a| a.told == Told::Named).map(|a| a.equals).collect();
+    if named.iter().any(|n| *n > 0) {
+        let mean = named.iter().sum::<usize>() as f64 / named.len() as f64;
+        text += &format!("; {mean:.2} equals beside the name");
+    }
+    let covered = answers.iter().fold(Covered::default(), |sum, a| sum.and(a.covered));
+    if covered.all > 0 {
+        let rate = 100.0 * covered.held as f64 / covered.all as f64;
+        text += &format!("; {rate:.1} % of {} intervals", covered.all);
+    }
+    text
 }
 
 fn bin_figures(bins: &[Bin]) -> Vec<Figure> {
@@ -523,21 +510,23 @@ pub(crate) fn run(first: u64, count: Option<usize>, only: Option<&str>) -> Resul
     case("nothing missing, white noise", &mut || nulls(&seeds, Noise::White))?;
     case("nothing missing, coloured noise", &mut || nulls(&seeds, Noise::Coloured(0.8)))?;
     let (mut rich, mut poor) = (Vec::new(), Vec::new());
-    let judged =
-        |found: &[(Effect, Answer)]| found.iter().filter_map(|(_, a)| a.judged()).collect::<Vec<_>>();
+    // Where little is recorded, what these recordings cannot tell apart is no error.
+    let judged = |found: &[(Effect, Answer)], equals_count: bool| {
+        found.iter().filter_map(|(_, a)| a.judged(equals_count)).collect::<Vec<_>>()
+    };
     for (name, noise) in [
         ("one effect missing, noise of 0.3 to 5 %", (0.003, 0.05)),
         ("one effect missing, noise of 10 to 60 %", (0.1, 0.6)),
     ] {
         case(name, &mut || {
             let found = effects(&seeds, &EFFECTS, Plan::rich(noise))?;
-            rich.extend(judged(&found));
+            rich.extend(judged(&found, false));
             Ok(effect_figures(&found))
         })?;
     }
     case("one effect missing, little of it recorded", &mut || {
         let found = effects(&seeds, &[EFFECTS, LOOKALIKES].concat(), Plan::POOR)?;
-        poor.extend(judged(&found));
+        poor.extend(judged(&found, true));
         Ok(effect_figures(&found))
     })?;
     // Apart: the many sure answers of the one would hide what the other shows.

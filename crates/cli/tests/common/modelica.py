@@ -1,8 +1,10 @@
 """How far a model written by `greybox export --to modelica` is from `greybox simulate`.
 
-modelica.py FOLDER CLASS HOLDS UNITS INPUT.csv SIMULATED.csv ANSWER.json  reads FOLDER/CLASS.mo with pymoca, an independent
-reader of Modelica, integrates its equations, and prints for each channel the largest difference over the channel's
-spread as JSON; HOLDS is a JSON object: input, `zero` or `linear`, and UNITS one: channel, size of its unit. With FOLDER and CLASS alone it only reads the model.
+modelica.py FOLDER CLASS HOLDS UNITS INPUT.csv SIMULATED.csv ANSWER.json
+
+reads FOLDER/CLASS.mo with pymoca, an independent reader of Modelica, integrates its equations, and prints for each
+channel the largest difference over the channel's spread as JSON. HOLDS is a JSON object: input, `zero` or `linear`,
+and UNITS one: channel, size of its unit. With FOLDER and CLASS alone it only reads the model.
 """
 
 import csv
