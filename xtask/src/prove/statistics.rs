@@ -473,15 +473,13 @@ fn table(found: &Found) -> String {
 
 /// Answers that are right against the confidence told, with their intervals, and the line where both agree.
 fn diagram(bins: &[Vec<Bin>; 2]) -> Result<String> {
-    let at = |b: &Bin, rate: f64| [100.0 * b.told, 100.0 * rate];
     let mut series = vec![Series::new("as told", Style::Dashed, vec![[0.0, 0.0], [100.0, 100.0]])];
     for (name, bins) in ["measured", "measured, little recorded"].into_iter().zip(bins) {
         let told = || bins.iter().filter(|b| b.answers > 0);
-        series.push(Series::new(name, Style::Points, told().map(|b| at(b, b.rate())).collect()));
-        series.extend(told().map(|b| {
-            let (low, high) = b.interval();
-            Series::new("", Style::Line, vec![at(b, low), at(b, high)])
-        }));
+        let percent = |(low, high): (f64, f64)| (100.0 * low, 100.0 * high);
+        let points = told().map(|b| [100.0 * b.told, 100.0 * b.rate()]).collect();
+        let errors = told().map(|b| percent(b.interval())).collect();
+        series.push(Series::new(name, Style::Points, points).with_errors(errors));
     }
     let plot = Plot {
         alt: "Answers that are right against the confidence told".into(),

@@ -85,8 +85,8 @@ pub(crate) struct Series {
     pub(crate) label: String,
     /// (x, y); a value that is not finite breaks the line.
     pub(crate) points: Vec<[f64; 2]>,
-    /// Half lengths of error bars, one per point, or none.
-    pub(crate) errors: Vec<f64>,
+    /// Lower and upper ends of error bars, one for each point, or none.
+    pub(crate) errors: Vec<(f64, f64)>,
     /// How it is drawn.
     pub(crate) style: Style,
 }
@@ -97,13 +97,12 @@ impl Series {
         Self { label: label.into(), points, errors: Vec::new(), style }
     }
 
-    /// With error bars of ± `errors`, one per point.
-    #[cfg_attr(not(test), expect(dead_code, reason = "no table of chapters 2 to 4 is drawn with error bars"))]
-    pub(crate) fn with_errors(self, errors: Vec<f64>) -> Self {
+    /// With error bars between these ends, one for each point.
+    pub(crate) fn with_errors(self, errors: Vec<(f64, f64)>) -> Self {
         Self { errors, ..self }
     }
 
-    fn bars(&self) -> impl Iterator<Item = ([f64; 2], f64)> {
+    fn bars(&self) -> impl Iterator<Item = ([f64; 2], (f64, f64))> {
         self.points.iter().copied().zip(self.errors.iter().copied())
     }
 }
@@ -220,7 +219,7 @@ impl Plot {
         let right =
             WIDTH - MARGIN - (longest as f64 * CHARACTER + 8.0 * f64::from(longest > 0)).min(0.35 * WIDTH);
         let points = || self.series.iter().flat_map(|s| s.points.iter().copied());
-        let ends = self.series.iter().flat_map(|s| s.bars().flat_map(|([_, y], e)| [y - e, y + e]));
+        let ends = self.series.iter().flat_map(|s| s.bars().flat_map(|(_, (low, high))| [low, high]));
         let x = Mapped::new(&self.x, points().map(|p| p[0]), (LEFT, right))?;
         let y = Mapped::new(&self.y, points().map(|p| p[1]).chain(ends), (HEIGHT - BOTTOM, TOP))?;
         if !points().any(|[px, py]| x.holds(px) && y.holds(py)) {
@@ -316,10 +315,10 @@ fn draw(out: &mut String, series: &Series, colour: &str, x: &Mapped, y: &Mapped)
         let _ = write!(dots, "M{:.1} {:.1}h0", x.place(px), y.place(py));
         pen_down = true;
     }
-    for ([px, py], error) in series.bars().filter(|([px, py], _)| x.holds(*px) && y.holds(*py)) {
+    for ([px, _], (low, high)) in series.bars().filter(|([px, py], _)| x.holds(*px) && y.holds(*py)) {
         // A bar that reaches below zero ends at the frame of a logarithmic axis.
-        let low = if y.holds(py - error) { y.place(py - error) } else { y.places.0 };
-        let high = if y.holds(py + error) { y.place(py + error) } else { y.places.1 };
+        let low = if y.holds(low) { y.place(low) } else { y.places.0 };
+        let high = if y.holds(high) { y.place(high) } else { y.places.1 };
         let place = x.place(px);
         let _ =
             write!(bars, "M{place:.1} {low:.1}V{high:.1}M{:.1} {low:.1}h8M{0:.1} {high:.1}h8", place - 4.0);
@@ -452,7 +451,7 @@ mod tests {
 
     #[test]
     fn error_bars_widen_the_axis_and_labels_keep_apart() {
-        let one = Series::new("one", Style::Points, vec![[1.0, 1.0]]).with_errors(vec![5.0]);
+        let one = Series::new("one", Style::Points, vec![[1.0, 1.0]]).with_errors(vec![(-4.0, 6.0)]);
         let two = Series::new("two", Style::Line, vec![[0.0, 0.0], [1.0, 1.0]]);
         let plot =
             Plot { alt: String::new(), x: Axis::linear("x"), y: Axis::linear("y"), series: vec![one, two] };
