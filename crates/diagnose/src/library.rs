@@ -864,54 +864,51 @@ impl Mechanism {
         kinds.into_iter()
     }
 
-    /// Whether the law of `other` is this one at the values of `[special_case]`: by numbers, at several points.
+    /// Whether the law of `other` is this one at the values of `[special_case]`.
     fn is_special_case_of(&self, other: &Mechanism) -> bool {
-        let names = |m: &Mechanism| m.states.iter().map(|s| s.name.clone()).collect::<Vec<_>>();
-        let (mine, theirs): (Vec<&Expr>, Vec<&Expr>) =
-            (self.expressions().collect(), other.expressions().collect());
-        let alike = self.on == other.on && names(self) == names(other) && mine.len() == theirs.len();
-        // Any number will do for a signal, a different one for each, of either sign.
-        let signal = |k: u8, n: &str, primes: u8| {
-            let name: f64 = n.bytes().map(f64::from).sum();
-            (1.7 * f64::from(k) + 0.9 * f64::from(primes) + name).sin()
-        };
         let own = |n: &str| self.own.iter().position(|p| p == n).map(|i| 0.7 + 0.31 * i as f64);
         let given = |n: &str| {
             let (.., e) = self.special_case.iter().find(|(kind, p, _)| *kind == other.kind && p == n)?;
             e.eval(&|n, _| own(n))
         };
-        let agree = |k: u8, a: &Expr, b: &Expr| {
-            let a = a.eval(&|n, primes| own(n).or_else(|| Some(signal(k, n, primes))));
-            let b = b.eval(&|n, primes| {
-                if other.own.iter().any(|p| p == n) { given(n) } else { Some(signal(k, n, primes)) }
-            });
-            a.zip(b).is_some_and(|(a, b)| (a - b).abs() <= 1e-9 * (a.abs() + b.abs()))
-        };
-        alike && (0..8).all(|k| mine.iter().zip(&theirs).all(|(a, b)| agree(k, a, b)))
+        self.agrees_with(other, &|_, n| own(n), &|_, n| given(n))
     }
 
-    /// Whether this law is the other, of one strength, where all its strengths are that one, whatever the rest.
-    pub fn is_at_equal_strengths(&self, other: &Mechanism) -> bool {
-        let static_laws = self.states.is_empty() && other.states.is_empty();
-        let [strength] = &other.linear[..] else { return false };
-        let alone = other.own.iter().all(|n| n == strength);
-        let alike = alone
-            && static_laws
-            && self.on == other.on
-            && self.reaction.is_some() == other.reaction.is_some();
-        // Any number will do for a signal and an inner parameter, a different one for each.
-        let number = |k: u8, n: &str, primes: u8| {
+    /// Whether this law, without a memory, is the other, of one parameter, where its linear parameters all have that
+    /// one's value, whatever its inner ones.
+    pub(crate) fn is_at_equal_strengths(&self, other: &Mechanism) -> bool {
+        let one = other.linear.len() == 1 && other.own == other.linear;
+        let mine = |k: u8, n: &str| {
+            let inner =
+                self.own.iter().position(|p| p == n).map(|i| 0.3 + 0.31 * i as f64 + 0.17 * f64::from(k));
+            if self.linear.iter().any(|l| l == n) { Some(0.7) } else { inner }
+        };
+        one && self.states.is_empty() && self.agrees_with(other, &mine, &|_, _| Some(0.7))
+    }
+
+    /// Whether the laws are alike where their own parameters have these values, which may differ from point to point:
+    /// by numbers, at several points.
+    fn agrees_with(
+        &self,
+        other: &Mechanism,
+        mine: &dyn Fn(u8, &str) -> Option<f64>,
+        theirs: &dyn Fn(u8, &str) -> Option<f64>,
+    ) -> bool {
+        let names = |m: &Mechanism| m.states.iter().map(|s| s.name.clone()).collect::<Vec<_>>();
+        let count = |m: &Mechanism| m.expressions().count();
+        let alike = self.on == other.on && names(self) == names(other) && count(self) == count(other);
+        // Any number will do for a signal, a different one for each, of either sign.
+        let signal = |k: u8, n: &str, primes: u8| {
             let name: f64 = n.bytes().map(f64::from).sum();
             (1.7 * f64::from(k) + 0.9 * f64::from(primes) + name).sin()
         };
+        let at = |k: u8, m: &Mechanism, e: &Expr, value: &dyn Fn(u8, &str) -> Option<f64>| {
+            let own = |n: &str| m.own.iter().any(|p| p == n);
+            e.eval(&|n, primes| if own(n) { value(k, n) } else { Some(signal(k, n, primes)) })
+        };
         let agree = |k: u8, a: &Expr, b: &Expr| {
-            let of = |m: &Mechanism, e: &Expr| {
-                e.eval(&|n, primes| {
-                    let linear = m.linear.iter().any(|l| l == n);
-                    Some(if linear { 0.7 } else { number(k, n, primes) })
-                })
-            };
-            of(self, a).zip(of(other, b)).is_some_and(|(a, b)| (a - b).abs() <= 1e-9 * (a.abs() + b.abs()))
+            let both = at(k, self, a, mine).zip(at(k, other, b, theirs));
+            both.is_some_and(|(a, b)| (a - b).abs() <= 1e-9 * (a.abs() + b.abs()))
         };
         alike && (0..8).all(|k| self.expressions().zip(other.expressions()).all(|(a, b)| agree(k, a, b)))
     }

@@ -537,30 +537,35 @@ pub fn first_states(
     memory_starts(setup, mechanism, candidate, along, &model)
 }
 
-/// All choices of the inner parameters' first values.
+/// All choices of the inner parameters' first values, those that the spectrum proposes among them.
 fn grid(
     mechanism: &Mechanism,
     candidate: &Candidate,
     scales: &[f64],
     spectra: &Spectra<'_>,
 ) -> Vec<Vec<f64>> {
+    let proposed = mechanism.inner.iter().zip(scales).map(|(inner, scale)| {
+        let variable = inner.spectral.as_ref();
+        let proposed = variable.map(|v| spectra.propose(candidate, v, inner.carrier.as_ref()));
+        let admissible = |v: &f64| *v >= inner.low * scale && *v <= inner.high * scale;
+        proposed.into_iter().flatten().filter(admissible).collect()
+    });
+    choices(mechanism, scales, proposed.collect())
+}
+
+/// All choices of the inner parameters' first values in the mechanism's file, sizes from [`inner_scales`].
+pub fn first_values(mechanism: &Mechanism, scales: &[f64]) -> Vec<Vec<f64>> {
+    choices(mechanism, scales, vec![Vec::new(); mechanism.inner.len()])
+}
+
+/// All choices of the first values of a mechanism's file and `more` of each inner parameter.
+fn choices(mechanism: &Mechanism, scales: &[f64], more: Vec<Vec<f64>>) -> Vec<Vec<f64>> {
     let mut out: Vec<Vec<f64>> = vec![Vec::new()];
-    for (inner, scale) in mechanism.inner.iter().zip(scales) {
-        let mut values: Vec<f64> = inner.grid.iter().map(|g| g * scale).collect();
-        if let Some(variable) = &inner.spectral {
-            let proposed = spectra.propose(candidate, variable, inner.carrier.as_ref());
-            values
-                .extend(proposed.into_iter().filter(|v| *v >= inner.low * scale && *v <= inner.high * scale));
-        }
+    for ((inner, scale), more) in mechanism.inner.iter().zip(scales).zip(more) {
+        let values: Vec<f64> = inner.grid.iter().map(|g| g * scale).chain(more).collect();
         out = out
             .iter()
-            .flat_map(|head| {
-                values.iter().map(move |v| {
-                    let mut head = head.clone();
-                    head.push(*v);
-                    head
-                })
-            })
+            .flat_map(|head| values.iter().map(move |v| head.iter().copied().chain([*v]).collect()))
             .collect();
     }
     out

@@ -14,7 +14,7 @@ use crate::candidate::{Candidate, Instance, candidates};
 use crate::evidence::{Evidence, Side, folds, kappa, least_kappa, weigh};
 use crate::library::Mechanism;
 use crate::place::{Place, places};
-use crate::screen::{Pair, Scored, first_states, inner_scales, screen, screen_pairs};
+use crate::screen::{Pair, Scored, first_states, first_values, inner_scales, screen, screen_pairs};
 use crate::uncertainty::Uncertainty;
 use crate::{Observer, Stage};
 
@@ -439,14 +439,17 @@ impl<'a> Search<'a> {
 
     /// Whether every mechanism's requirements on its parameters hold.
     fn admissible(&self, fitted: &Fitted) -> bool {
-        fitted.parts.iter().all(|part| {
-            let mechanism = &self.library[part.candidate.mechanism];
-            let value = |n: &str| {
-                let i = mechanism.parameters().position(|p| p == n)?;
-                Some(fitted.fit.point.parameters[fitted.setup.model.parameter(&part.instance.names[i])?])
-            };
-            mechanism.require.iter().all(|e| e.eval(&|n, _| value(n)).is_none_or(|v| v >= 0.0))
-        })
+        fitted.parts.iter().all(|part| self.allows(part, &fitted.setup, &fitted.fit.point.parameters))
+    }
+
+    /// Whether a mechanism's requirements on its parameters hold at these values of the model's.
+    fn allows(&self, part: &Part, setup: &Setup, parameters: &[f64]) -> bool {
+        let mechanism = &self.library[part.candidate.mechanism];
+        let value = |n: &str| {
+            let i = mechanism.parameters().position(|p| p == n)?;
+            Some(parameters[setup.model.parameter(&part.instance.names[i])?])
+        };
+        mechanism.require.iter().all(|e| e.eval(&|n, _| value(n)).is_none_or(|v| v >= 0.0))
     }
 
     /// When no single candidate is believable and yet something is missing: the best pairs of those that
@@ -1656,21 +1659,28 @@ impl<'a> Search<'a> {
 
     /// Whether the 95 % interval of one of a part's strengths is wider than the largest of them.
     fn is_undetermined(&self, fitted: &Fitted, part: usize, scale: &[f64]) -> bool {
-        let Some(part) = fitted.parts.get(part) else { return false };
+        let strengths = self.strengths(fitted, part, scale);
+        let largest = strengths.iter().map(|s| s.value.abs()).fold(0.0, f64::max);
+        strengths.iter().any(|s| s.width > largest)
+    }
+
+    /// The linear parameters of a part that are fitted; none of a part that is not there.
+    fn strengths(&self, fitted: &Fitted, part: usize, scale: &[f64]) -> Vec<Strength> {
+        let Some(part) = fitted.parts.get(part) else { return Vec::new() };
         let mechanism = &self.library[part.candidate.mechanism];
         let widths = Uncertainty::of(fitted, scale).widths();
-        let strengths: Vec<(f64, f64)> = mechanism
+        mechanism
             .parameters()
             .zip(&part.instance.names)
             .filter(|(plain, _)| mechanism.linear.iter().any(|l| l == plain))
-            .filter_map(|(_, name)| {
+            .filter_map(|(plain, name)| {
                 let index = fitted.setup.model.parameter(name)?;
                 let at = fitted.setup.free.iter().position(|f| f.index == index)?;
-                Some((fitted.fit.point.parameters[index].abs(), widths[at]))
+                let least =
+                    if mechanism.positive.iter().any(|p| p == plain) { 0.0 } else { f64::NEG_INFINITY };
+                Some(Strength { index, value: fitted.fit.point.parameters[index], width: widths[at], least })
             })
-            .collect();
-        let largest = strengths.iter().map(|s| s.0).fold(0.0, f64::max);
-        strengths.iter().any(|s| s.1 > largest)
+            .collect()
     }
 
     /// The model with a law in place of its refinement, from the refinement's parameters.
@@ -1796,14 +1806,17 @@ impl<'a> Search<'a> {
     fn declare_unseen(&self, state: &mut State) {
         for index in 0..state.current.parts.len() {
             let law = state.current.parts[index].candidate.clone();
+            let Some(known) = state.accepted.iter_mut().find(|a| a.candidate == law) else { continue };
             for refinement in self.all.iter().filter(|c| self.is_refined_by(&law, c)) {
+                if known.rivals.iter().any(|r| r.equivalent && r.candidate == *refinement) {
+                    continue;
+                }
                 if self.is_spent() {
                     return;
                 }
                 let Some(instance) = self.unseen(&state.current, index, refinement, &state.scale) else {
                     continue;
                 };
-                let Some(known) = state.accepted.iter_mut().find(|a| a.candidate == law) else { continue };
                 match known.rivals.iter_mut().find(|r| r.candidate == *refinement) {
                     Some(rival) => rival.equivalent = true,
                     None => known.rivals.push(Rival {
@@ -1835,13 +1848,7 @@ impl<'a> Search<'a> {
         }
         let along = Along::smoothed(&fitted.setup, &fitted.level, scale, &fitted.fit.point);
         let scales = inner_scales(mechanism, refinement, &along, &fitted.setup)?;
-        let choices = mechanism.inner.iter().zip(&scales).fold(vec![Vec::new()], |choices, (inner, size)| {
-            let longer = |c: &Vec<f64>| {
-                let c = c.clone();
-                inner.grid.iter().map(move |g| [&c[..], &[g * size]].concat()).collect::<Vec<_>>()
-            };
-            choices.iter().flat_map(longer).collect()
-        });
+        let choices = first_values(mechanism, &scales);
         let at = |inner: &Vec<f64>| -> Option<(bool, Instance)> {
             let mut parts = parts.clone();
             let values = mechanism.values(&vec![*strength; mechanism.linear.len()], inner)?;
@@ -1877,31 +1884,28 @@ impl<'a> Search<'a> {
     /// Whether an admissible end of the 95 % interval of one of a part's strengths lies further than [`SUBSTANTIAL`]
     /// from this one.
     fn may_differ(&self, fitted: &Fitted, index: usize, strength: f64, scale: &[f64]) -> bool {
-        let part = &fitted.parts[index];
-        let mechanism = &self.library[part.candidate.mechanism];
-        let values: Vec<(&str, usize, f64)> = mechanism
-            .parameters()
-            .zip(&part.instance.names)
-            .filter_map(|(plain, name)| {
-                let at = fitted.setup.model.parameter(name)?;
-                Some((plain, at, fitted.fit.point.parameters[at]))
-            })
-            .collect();
-        let widths = Uncertainty::of(fitted, scale).widths();
-        let admissible = |name: &str, value: f64| {
-            let of =
-                |n: &str| values.iter().find(|v| v.0 == n).map(|v| if v.0 == name { value } else { v.2 });
-            mechanism.require.iter().all(|e| e.eval(&|n, _| of(n)).is_none_or(|v| v >= 0.0))
+        let admissible = |at: usize, value: f64| {
+            let mut parameters = fitted.fit.point.parameters.clone();
+            parameters[at] = value;
+            self.allows(&fitted.parts[index], &fitted.setup, &parameters)
         };
-        mechanism.linear.iter().any(|name| {
-            let Some((_, index, value)) = values.iter().find(|v| v.0 == name) else { return false };
-            let Some(at) = fitted.setup.free.iter().position(|f| f.index == *index) else { return false };
-            let least = if mechanism.positive.contains(name) { 0.0 } else { f64::NEG_INFINITY };
-            [(value - widths[at]).max(least), value + widths[at]]
+        self.strengths(fitted, index, scale).iter().any(|s| {
+            [(s.value - s.width).max(s.least), s.value + s.width]
                 .iter()
-                .any(|end| (end - strength).abs() > SUBSTANTIAL * strength.abs() && admissible(name, *end))
+                .any(|end| (end - strength).abs() > SUBSTANTIAL * strength.abs() && admissible(s.index, *end))
         })
     }
+}
+
+/// A fitted linear parameter of a mechanism.
+struct Strength {
+    /// Index in the model.
+    index: usize,
+    value: f64,
+    /// Half of the 95 % interval.
+    width: f64,
+    /// Least admissible value.
+    least: f64,
 }
 
 /// Where the search stands.
