@@ -6,6 +6,7 @@
 mod cases;
 mod concealed;
 mod identify;
+pub(crate) mod sets;
 pub(crate) mod statistics;
 mod table;
 
@@ -32,8 +33,8 @@ pub(crate) struct Arguments {
     /// Measure coverage, false alarms and the reliability of confidence over seeds instead
     #[arg(long, conflicts_with_all = ["recordings", "identify", "floors"])]
     statistics: bool,
-    /// Put what --statistics measured into the book
-    #[arg(long, requires = "statistics", conflicts_with = "only")]
+    /// Put what --statistics, or --recordings on the real sets, measured into the book
+    #[arg(long, conflicts_with = "only")]
     write_docs: bool,
     /// Seed of the concealed suite; first seed of --identify and --statistics
     #[arg(long, value_name = "N", default_value_t = 1)]
@@ -50,7 +51,8 @@ pub(crate) struct Arguments {
     /// Beside greybox, judge what sparse regression of the missing acceleration says of the concealed suite
     #[arg(long)]
     rival: bool,
-    /// Run the fixed suite of this file, and fail only when a figure falls below its floor there
+    /// Fail only when a figure falls below its floor in this file, which also names the fixed suite of concealed cases;
+    /// with --recordings, the floors of the real sets
     #[arg(long, value_name = "FILE")]
     floors: Option<PathBuf>,
     /// Write the figures as JSON
@@ -130,7 +132,14 @@ pub(crate) fn run(root: &Path, arguments: &Arguments) -> Result<Ending> {
         }
         None => return conceal(root, arguments),
     };
-    let mut cases = select(cases::all(), arguments.only.as_deref())?;
+    let sets = sets::read(&folder)?;
+    let only = arguments.only.as_deref();
+    let known = |word: &str| sets.as_ref().is_some_and(|s| s.has(word));
+    let mut cases = match only {
+        // A word that names sets alone.
+        Some(word) if known(word) && !cases::all().iter().any(|c| c.name.contains(word)) => Vec::new(),
+        only => select(cases::all(), only)?,
+    };
     if arguments.times_advisory {
         cases.iter_mut().for_each(|c| c.seconds = None);
     }
@@ -148,6 +157,25 @@ pub(crate) fn run(root: &Path, arguments: &Arguments) -> Result<Ending> {
         eprintln!("{} …", case.name);
         let out = process::target(root).join("prove").join(&case.name);
         outcomes.push(measure(&binary, &folder, case, &out, Duration::from_secs(arguments.timeout))?);
+    }
+    if let Some(sets) = sets {
+        let out = process::target(root).join("prove").join("sets");
+        let limit = Duration::from_secs(arguments.timeout);
+        let answers = sets::run(&sets, &folder, &binary, &out, only, limit)?;
+        println!("{}", sets::text(&answers));
+        let totals = sets::totals(&answers);
+        let figures = match &arguments.floors {
+            Some(path) => sets::judged(&totals, &sets::floors(path)?),
+            None => sets::plain(&totals),
+        };
+        outcomes.push(Outcome { case: "real sets".to_owned(), figures });
+        if arguments.write_docs {
+            crate::book::put_table(root, sets::PAGE, sets::BEGIN, &sets::markdown(&answers))?;
+        }
+        if let Some(path) = &arguments.json {
+            let json = json!({"cases": to_json(&outcomes)["cases"], "sets": answers, "totals": totals});
+            return finish(&outcomes, Some((path, json)));
+        }
     }
     conclude(&outcomes, arguments.json.as_deref())
 }
@@ -175,9 +203,13 @@ fn conceal(root: &Path, arguments: &Arguments) -> Result<Ending> {
 
 /// Prints the table, writes the JSON, and judges.
 fn conclude(outcomes: &[Outcome], json: Option<&Path>) -> Result<Ending> {
+    finish(outcomes, json.map(|path| (path, to_json(outcomes))))
+}
+
+fn finish(outcomes: &[Outcome], json: Option<(&Path, serde_json::Value)>) -> Result<Ending> {
     print!("{}", table::render(outcomes));
-    if let Some(path) = json {
-        let text = serde_json::to_string_pretty(&to_json(outcomes))? + "\n";
+    if let Some((path, value)) = json {
+        let text = serde_json::to_string_pretty(&value)? + "\n";
         std::fs::write(path, text).with_context(|| format!("{} cannot be written", path.display()))?;
     }
     let judged = outcomes.iter().flat_map(|o| &o.figures).filter_map(|f| f.met);
@@ -213,18 +245,7 @@ fn measure(binary: &Path, folder: &Path, case: &Case, out: &Path, limit: Duratio
     command.arg("--out").arg(out);
     let run = process::run(&mut command, out, limit)?;
     let mut figures = Vec::new();
-    let report = match run.status {
-        None => Err(format!("stopped after {:.0} s", run.seconds)),
-        Some(status) if !status.success() => {
-            let said = std::fs::read_to_string(out.join("stderr.txt")).unwrap_or_default();
-            let first = said.lines().find(|l| !l.trim().is_empty()).unwrap_or("no message").trim();
-            Err(format!("{status}: {first}"))
-        }
-        Some(_) => std::fs::read_to_string(out.join("report.json"))
-            .map_err(|e| format!("report.json: {e}"))
-            .and_then(|text| Report::from_json(&text).map_err(|e| e.to_string())),
-    };
-    match report {
+    match report_of(&run, out) {
         Ok(report) => figures.extend((case.judge)(&report)),
         Err(why) => figures.push(Figure::judged("run", why, "a report", false)),
     }
@@ -238,6 +259,21 @@ fn measure(binary: &Path, folder: &Path, case: &Case, out: &Path, limit: Duratio
         figures.push(Figure::plain("peak memory", format!("{:.0} MiB", bytes as f64 / (1024.0 * 1024.0))));
     }
     Ok(Outcome { case: case.name.clone(), figures })
+}
+
+/// The report that a run left in `out`, or why there is none.
+fn report_of(run: &process::Measured, out: &Path) -> Result<Report, String> {
+    match run.status {
+        None => Err(format!("stopped after {:.0} s", run.seconds)),
+        Some(status) if !status.success() => {
+            let said = std::fs::read_to_string(out.join("stderr.txt")).unwrap_or_default();
+            let first = said.lines().find(|l| !l.trim().is_empty()).unwrap_or("no message").trim();
+            Err(format!("{status}: {first}"))
+        }
+        Some(_) => std::fs::read_to_string(out.join("report.json"))
+            .map_err(|e| format!("report.json: {e}"))
+            .and_then(|text| Report::from_json(&text).map_err(|e| e.to_string())),
+    }
 }
 
 fn to_json(outcomes: &[Outcome]) -> serde_json::Value {

@@ -179,7 +179,8 @@ impl Data {
                     len: piece.len,
                     inputs: inputs
                         .iter()
-                        .map(|&i| greybox_recording::interpolate::fill_missing(&scaled(i, piece)))
+                        .zip(&model.inputs)
+                        .map(|(&i, input)| filled(&scaled(i, piece), input.hold))
                         .collect(),
                     measured: ys,
                     smooth,
@@ -362,6 +363,15 @@ fn find_channel(
         return Err(DataError::OutOfRange { file, channel: channel.to_string(), largest });
     }
     Ok((index, factor))
+}
+
+/// An input with its missing samples as its hold has them: a value is held until the next one, or joined with it.
+fn filled(u: &[f64], hold: Hold) -> Vec<f64> {
+    use greybox_recording::interpolate::{fill_missing, hold_missing};
+    match hold {
+        Hold::Zero => hold_missing(u),
+        Hold::Linear | Hold::BandLimited => fill_missing(u),
+    }
 }
 
 /// Noise of a channel. Fourth differences are blind where the signal itself is fast (nine samples per

@@ -42,9 +42,34 @@ pub struct Score {
     pub nrmse_windowed: f64,
 }
 
+/// By which figure simulations of a machine are judged.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub enum Criterion {
+    /// The free run over whole recordings.
+    FreeRun,
+    /// Simulations restarted every window: an error of the start, however small, outgrows the motion within a recording.
+    Windowed,
+}
+
+impl Criterion {
+    /// The mean over the channels of the logarithm of the figure that judges; infinite where it diverges.
+    pub fn misfit(self, scores: &[Score]) -> f64 {
+        let of = |s: &Score| match self {
+            Criterion::FreeRun => s.nrmse,
+            Criterion::Windowed => s.nrmse_windowed,
+        };
+        scores.iter().map(|s| of(s).max(f64::MIN_POSITIVE).ln()).sum::<f64>() / scores.len().max(1) as f64
+    }
+}
+
 /// Which samples of a piece may serve to estimate its initial state: a quarter, as DESIGN says for
 /// held-out recordings.
 pub const START_SHARE: f64 = 0.25;
+
+/// How many of `n` samples this share of them is, at least two.
+fn start_samples(n: usize, share: f64) -> usize {
+    ((n as f64 * share) as usize).clamp(2.min(n), n)
+}
 
 /// Samples from which an initial state is estimated first, and fewest that tell states no sensor sees.
 const FIRST_HORIZON: usize = 15;
@@ -54,11 +79,21 @@ impl Setup {
     /// Simulates every piece from an initial state estimated on its first quarter (prior: what the
     /// smoothed measurements say of the first sample; the residuals weigh `1/scale`).
     pub fn free_run(&self, parameters: &[f64], scale: &[f64]) -> FreeRun {
+        self.run_freely(parameters, scale, START_SHARE)
+    }
+
+    /// [`free_run`](Self::free_run) over recordings that the parameters were fitted to: the initial state is fitted to
+    /// the whole of each, as the parameters are.
+    pub fn training_run(&self, parameters: &[f64], scale: &[f64]) -> FreeRun {
+        self.run_freely(parameters, scale, 1.0)
+    }
+
+    fn run_freely(&self, parameters: &[f64], scale: &[f64], share: f64) -> FreeRun {
         let pieces: Vec<(Vec<f64>, greybox_simulate::Trajectory)> = (0..self.data.pieces.len())
             .into_par_iter()
             .map(|i| {
-                let x0 = self.estimate_start(i, parameters, scale);
                 let n = self.data.pieces[i].len;
+                let x0 = self.grow_start(i, parameters, scale, start_samples(n, share));
                 let environment = &self.environments[i];
                 let seeds = Seeds::default();
                 let run = integrate(&self.system, environment, parameters, &x0, 0..n, self.method, &seeds);
@@ -76,11 +111,52 @@ impl Setup {
         out
     }
 
+    /// Which figure judges simulations with these parameters, by the machine's own growth of errors, and the longest
+    /// window (s) over which it can be predicted.
+    ///
+    /// The tangents of a free run carry an error of the start, one standard deviation of what the smoothed measurements
+    /// say of it, to every sample. Where it outgrows the spread of a channel (an unstable or a chaotic machine, an
+    /// integrating one on a long record), or the run diverges, restarted windows judge; they are no longer than that.
+    pub fn criterion(&self, parameters: &[f64], scale: &[f64]) -> (Criterion, f64) {
+        let reach: Vec<f64> = (0..self.data.pieces.len())
+            .into_par_iter()
+            .map(|i| self.predictable(i, parameters, scale))
+            .collect();
+        let whole = |(r, p): (&f64, &crate::PieceData)| *r >= p.len.saturating_sub(1) as f64 * p.dt;
+        let criterion = match reach.iter().zip(&self.data.pieces).all(whole) {
+            true => Criterion::FreeRun,
+            false => Criterion::Windowed,
+        };
+        (criterion, reach.into_iter().fold(f64::INFINITY, f64::min))
+    }
+
+    /// Seconds until an error of a piece's start outgrows the motion; infinite where it does not.
+    fn predictable(&self, piece: usize, parameters: &[f64], scale: &[f64]) -> f64 {
+        let data = &self.data.pieces[piece];
+        let (n, ny, nx) = (data.len, self.system.ny, self.system.nx);
+        let seeds = Seeds { initial: (0..nx).collect(), ..Seeds::default() };
+        let x0 = self.estimate_start(piece, parameters, scale);
+        let run =
+            integrate(&self.system, &self.environments[piece], parameters, &x0, 0..n, self.method, &seeds);
+        let std: Vec<f64> =
+            self.start_prior(piece, 0).iter().map(|p| if p.1.is_finite() { p.1 } else { 0.0 }).collect();
+        let outgrown = |k: usize| {
+            (0..ny).any(|c| {
+                let error = |l: usize| run.dy[(l * ny + c) * n + k] * std[l];
+                (0..nx).map(|l| error(l).powi(2)).sum::<f64>().sqrt() > self.data.spread[c]
+            })
+        };
+        let end = run.diverged.unwrap_or(n);
+        match (0..end).find(|&k| outgrown(k)).or(run.diverged) {
+            Some(k) => k as f64 * data.dt,
+            None => f64::INFINITY,
+        }
+    }
+
     /// Initial state of a piece by output error on a growing part of its first quarter.
     pub fn estimate_start(&self, piece: usize, parameters: &[f64], scale: &[f64]) -> Vec<f64> {
         let n = self.data.pieces[piece].len;
-        let most = ((n as f64 * START_SHARE) as usize).clamp(2, n);
-        self.grow_start(piece, parameters, scale, most)
+        self.grow_start(piece, parameters, scale, start_samples(n, START_SHARE))
     }
 
     /// Initial state of a piece by output error on a growing part of its first `most` samples. The smoothed
@@ -129,7 +205,8 @@ impl Setup {
     }
 
     /// Scores per channel of a free run, over all pieces or those of one recording. Windows of
-    /// `window` seconds restart from a state estimated on their first quarter.
+    /// `window` seconds restart from a state estimated on their first quarter. The error of a simulation that diverges
+    /// is infinite.
     pub fn scores(
         &self,
         run: &FreeRun,
@@ -148,6 +225,10 @@ impl Setup {
                 let mut values = Vec::new();
                 for (&i, w) in chosen.iter().zip(&windowed) {
                     let n = self.data.pieces[i].len;
+                    if run.lengths[i] < n {
+                        // Frozen from there on, at a value that may happen to fit.
+                        sum = f64::INFINITY;
+                    }
                     for (k, y) in self.data.pieces[i].measured[c].iter().enumerate() {
                         if !y.is_nan() {
                             sum += (run.y[i][c * n + k] - y).powi(2);
@@ -173,10 +254,24 @@ impl Setup {
     /// window's first quarter (prior: the smoothed measurements; what no sensor sees, the free run). What
     /// was before a window stays known to delayed expressions.
     fn windowed(&self, piece: usize, run: &FreeRun, parameters: &[f64], window: f64) -> Vec<f64> {
+        self.restarted(piece, 0..self.data.pieces[piece].len, &run.x[piece], parameters, window)
+    }
+
+    /// Outputs over samples `range` of a piece, `y[c * range.len() + k]`, of simulations restarted every window (s), each
+    /// from a state estimated on the window's first quarter (prior: the smoothed measurements; what no sensor sees, the
+    /// `states[i * n + k]` of a run over the whole piece). Infinite in a window that diverges.
+    pub fn restarted(
+        &self,
+        piece: usize,
+        range: std::ops::Range<usize>,
+        states: &[f64],
+        parameters: &[f64],
+        window: f64,
+    ) -> Vec<f64> {
         let data = &self.data.pieces[piece];
-        let (n, ny) = (data.len, self.system.ny);
+        let (n, ny, m) = (data.len, self.system.ny, range.len());
         let length = ((window / data.dt).round() as usize).max(2);
-        let mut y = vec![0.0; ny * n];
+        let mut y = vec![0.0; ny * m];
         let simulation = Simulation {
             system: &self.system,
             environment: &self.environments[piece],
@@ -186,10 +281,10 @@ impl Setup {
         };
         let fixed = Setup { free: Vec::new(), noise: None, carried: Vec::new(), ..self.clone() };
         let mut before = None;
-        let mut a = 0;
-        while a < n {
-            let b = (a + length).min(n);
-            let mut x0: Vec<f64> = (0..self.system.nx).map(|i| run.x[piece][i * n + a]).collect();
+        let mut a = range.start;
+        while a < range.end {
+            let b = a.saturating_add(length).min(range.end);
+            let mut x0: Vec<f64> = (0..self.system.nx).map(|i| states[i * n + a]).collect();
             let mut prior = self.start_prior(piece, a);
             for (i, (x, (mean, std))) in x0.iter_mut().zip(&mut prior).enumerate() {
                 if std.is_finite() {
@@ -198,7 +293,7 @@ impl Setup {
                         *x = *mean;
                     }
                 } else {
-                    let state = &run.x[piece][i * n..(i + 1) * n];
+                    let state = &states[i * n..(i + 1) * n];
                     (*mean, *std) = (*x, (0.3 * crate::data::spread(state)).max(f64::MIN_POSITIVE));
                 }
             }
@@ -217,8 +312,14 @@ impl Setup {
             }
             let (part, carry) = simulation.run_on(&x0, a..b, before.as_ref(), &[]);
             before = Some(carry);
+            let (from, to) = (a - range.start, b - range.start);
             for c in 0..ny {
-                y[c * n + a..c * n + b].copy_from_slice(&part.y[c * (b - a)..(c + 1) * (b - a)]);
+                match part.diverged {
+                    Some(_) => y[c * m + from..c * m + to].fill(f64::INFINITY),
+                    None => {
+                        y[c * m + from..c * m + to].copy_from_slice(&part.y[c * (b - a)..(c + 1) * (b - a)])
+                    }
+                }
             }
             a = b;
         }
@@ -230,7 +331,12 @@ impl Setup {
 /// longest piece, at least 20 samples.
 pub fn window_length(durations: &[f64], dt: f64) -> f64 {
     let longest = durations.iter().copied().fold(0.0, f64::max);
-    let wanted = (longest / 20.0).max(20.0 * dt);
+    window_of(longest / 20.0, dt)
+}
+
+/// The 1-2-5 number of seconds nearest below `wanted`, at least 20 samples.
+pub fn window_of(wanted: f64, dt: f64) -> f64 {
+    let wanted = wanted.max(20.0 * dt);
     let decade = 10f64.powf(wanted.log10().floor());
     let mantissa = wanted / decade * (1.0 + 1e-9);
     let round = [5.0, 2.0, 1.0].into_iter().find(|m| mantissa >= *m).unwrap_or(1.0) * decade;

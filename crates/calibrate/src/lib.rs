@@ -6,7 +6,9 @@
 struct Readme;
 
 pub mod data;
+pub mod free;
 pub mod free_run;
+pub mod horizon;
 pub mod noise_model;
 pub mod problem;
 pub mod qr;
@@ -14,8 +16,10 @@ pub mod setup;
 mod student;
 
 pub use data::{Data, DataError, Hats, PieceData, spread};
-pub use free_run::{FreeRun, Score, window_length};
+pub use free::free_parameters;
+pub use free_run::{Criterion, FreeRun, Score, window_length, window_of};
+pub use horizon::Horizon;
 pub use noise_model::Autoregression;
-pub use problem::{Ending, Fit, Free, Limits, Point, Problem, Segment, SegmentRows, StartPrior, Work};
-pub use setup::{Level, Setup, SetupError, UnknownState, free_parameters};
+pub use problem::{Ending, Fit, Free, Limits, Point, Prior, Problem, Segment, SegmentRows, StartPrior, Work};
+pub use setup::{Level, Setup, SetupError, UnknownState};
 pub use student::student_quantile;

@@ -2,10 +2,10 @@
 //!
 //! ```text
 //! minimise  Σ_segments Σ_k Σ_c ((y_c(k) − ŷ_c(k; p, x₀ˢ)) / s_c)²
-//!         + Σ_i ((p_i − p̄_i)/σ_i)²  +  Σ_segments |(x₀ˢ − x̄₀ˢ)/σˢ|²
+//!         + Σ_i g_i(p_i)²  +  Σ_segments |(x₀ˢ − x̄₀ˢ)/σˢ|²
 //! ```
 //!
-//! over the parameters p and every segment's initial state x₀ˢ (Bock 1981, without the matching
+//! over the parameters p, with their priors g ([`Prior`]), and every segment's initial state x₀ˢ (Bock 1981, without the matching
 //! conditions: short segments keep the problem convex, long ones give it power). The initial states
 //! are eliminated segment by segment: Householder QR of \[J_x | J_p | r\] leaves a small triangle per
 //! segment, and the triangles are stacked and factored again.
@@ -53,15 +53,68 @@ pub struct Segment {
 /// infinite σ says nothing, σ = 0 pins the state.
 pub type StartPrior = Vec<(f64, f64)>;
 
+/// What is known of a parameter before the fit. With z the departure from the prior's centre over its scale, it adds
+/// g(z)² to the cost.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub enum Prior {
+    /// Nothing: g = 0.
+    Flat,
+    /// A normal distribution, for what is stated: g = z.
+    Normal {
+        /// Mean.
+        mean: f64,
+        /// Standard deviation, positive.
+        std: f64,
+    },
+    /// A Cauchy distribution, for a guess that may be wrong by orders of magnitude: g² = ln(1 + z²), which is z² near
+    /// the centre and grows without a bound to how far the data may draw the parameter (Gelman, Jakulin, Pittau, Su, *A
+    /// weakly informative default prior distribution*, Annals of Applied Statistics 2, 2008; half their exponent).
+    Cauchy {
+        /// Centre.
+        centre: f64,
+        /// Scale, positive.
+        scale: f64,
+    },
+}
+
+impl Prior {
+    /// g and dg/dp at the value p.
+    ///
+    /// ```
+    /// use greybox_calibrate::Prior;
+    /// assert_eq!(Prior::Normal { mean: 1.0, std: 0.5 }.at(2.0), (2.0, 2.0));
+    /// let (near, slope) = Prior::Cauchy { centre: 1.0, scale: 0.5 }.at(1.0);
+    /// assert_eq!((near, slope), (0.0, 2.0));
+    /// // Seventy times the guess costs as much as three standard deviations.
+    /// let (far, _) = Prior::Cauchy { centre: 1.0, scale: 0.5 }.at(70.0);
+    /// assert!((far - 3.14).abs() < 0.01);
+    /// ```
+    pub fn at(&self, value: f64) -> (f64, f64) {
+        match *self {
+            Prior::Flat => (0.0, 0.0),
+            Prior::Normal { mean, std } => ((value - mean) / std, 1.0 / std),
+            Prior::Cauchy { centre, scale } => {
+                let z = (value - centre) / scale;
+                let g = (z * z).ln_1p().sqrt().copysign(z);
+                let slope = if z.abs() < 1e-6 { 1.0 } else { z / ((1.0 + z * z) * g) };
+                (g, slope / scale)
+            }
+        }
+    }
+
+    /// Its part of the matrix of Gauss and Newton at a value: (dg/dp)².
+    pub fn precision(&self, value: f64) -> f64 {
+        self.at(value).1.powi(2)
+    }
+}
+
 /// A parameter the fit may move.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Free {
     /// Index in the system's parameter vector.
     pub index: usize,
-    /// Prior mean.
-    pub mean: f64,
-    /// Prior standard deviation (infinite: none).
-    pub std: f64,
+    /// What is known of it before the fit.
+    pub prior: Prior,
     /// Smallest admissible value.
     pub lower: f64,
     /// Largest admissible value.
@@ -167,8 +220,8 @@ const FIRST_RADIUS: f64 = 1.0;
 const LEAST_DAMPING: f64 = 1e-12;
 const MOST_DAMPING: f64 = 1e18;
 
-/// Residual where the simulation says no number (a logarithm of what is negative, an overflow), in units of the scale:
-/// much more than any that it may have, and not so much that a fit cannot leave such a place.
+/// Least residual where the simulation says no number (a logarithm of what is negative, an overflow) or has diverged, in
+/// units of the scale: much more than any that it may have, and not so much that a fit cannot leave such a place.
 const UNDEFINED: f64 = 1e3;
 
 /// A point of the search.
@@ -399,6 +452,8 @@ impl Problem<'_> {
         let rows = ny * n + nx;
         let mut r = vec![0.0; rows];
         let measured = self.measured[segment.piece];
+        // From there on the trajectory is frozen at its last good sample, which may happen to fit.
+        let followed = trajectory.diverged.unwrap_or(n);
         for c in 0..ny {
             let inverse = 1.0 / self.scale[c];
             let y = &measured[c][segment.range.clone()];
@@ -406,10 +461,12 @@ impl Problem<'_> {
                 let e = (y[k] - trajectory.y[c * n + k]) * inverse;
                 r[c * n + k] = if y[k].is_nan() {
                     0.0
-                } else if e.is_finite() {
-                    e
-                } else {
+                } else if !e.is_finite() {
                     UNDEFINED
+                } else if k >= followed {
+                    e.abs().max(UNDEFINED)
+                } else {
+                    e
                 };
             }
         }
@@ -462,10 +519,7 @@ impl Problem<'_> {
     }
 
     fn prior_cost(&self, parameters: &[f64]) -> f64 {
-        self.free
-            .iter()
-            .map(|f| if f.std.is_finite() { ((parameters[f.index] - f.mean) / f.std).powi(2) } else { 0.0 })
-            .sum()
+        self.free.iter().map(|f| f.prior.at(parameters[f.index]).0.powi(2)).sum()
     }
 
     /// Cost of a point.
@@ -678,11 +732,10 @@ impl Problem<'_> {
             }
         }
         for (i, f) in self.free.iter().enumerate() {
-            if f.std.is_finite() && f.std > 0.0 {
-                let row = reduced.len() * (np + 1) + i;
-                a[i * m + row] = 1.0 / f.std;
-                a[np * m + row] = (f.mean - parameters[f.index]) / f.std;
-            }
+            let (g, slope) = f.prior.at(parameters[f.index]);
+            let row = reduced.len() * (np + 1) + i;
+            a[i * m + row] = slope;
+            a[np * m + row] = -g;
         }
         qr::triangle(&mut a, m, np + 1)
     }

@@ -118,7 +118,7 @@ pub struct Level {
 }
 
 impl Setup {
-    /// Lays out a model. `nominal_free` are the parameters to fit (see [`free_parameters`]).
+    /// Lays out a model. `nominal_free` are the parameters to fit (see [`crate::free_parameters`]).
     ///
     /// # Errors
     /// When the model does not compile, or has a mode so much faster than the samples that it cannot be simulated.
@@ -584,30 +584,4 @@ impl Setup {
             .collect();
         Point { parameters: fit.parameters.clone(), starts }
     }
-}
-
-/// The parameters calibration may move: those not fixed. The prior is N(value, std) where `std` is
-/// stated and N(value, |value|/2) where not; a parameter keeps its sign (at least 2 % of its value).
-pub fn free_parameters(model: &Model) -> Vec<Free> {
-    model
-        .parameters
-        .iter()
-        .enumerate()
-        .filter(|(_, p)| !p.fixed)
-        .map(|(index, p)| {
-            let std = match p.std {
-                Some(std) if std > 0.0 => std,
-                _ if p.value != 0.0 => 0.5 * p.value.abs(),
-                _ => f64::INFINITY,
-            };
-            let (lower, upper) = if p.value > 0.0 {
-                (0.02 * p.value, f64::INFINITY)
-            } else if p.value < 0.0 {
-                (f64::NEG_INFINITY, 0.02 * p.value)
-            } else {
-                (f64::NEG_INFINITY, f64::INFINITY)
-            };
-            Free { index, mean: p.value, std, lower, upper }
-        })
-        .collect()
 }

@@ -4,7 +4,7 @@
 
 use std::path::PathBuf;
 
-use greybox_calibrate::{Fit, Free, Limits, Point, Problem, Segment, Work};
+use greybox_calibrate::{Fit, Free, Limits, Point, Prior, Problem, Segment, Work};
 use greybox_model::{Hold, Model, System};
 use greybox_simulate::{Environment, Method, Signal};
 use serde_json::Value;
@@ -50,13 +50,7 @@ fn solve(case: &Value, start: &[f64]) -> Fit {
         (0..x[0].len()).map(|i| Signal::new(Hold::Linear, 1.0, &column(i), |_| Vec::new())).collect();
     let environment = [Environment { start: 0.0, dt: 1.0, len: y.len(), inputs, forces: Vec::new() }];
     let free: Vec<Free> = (0..start.len())
-        .map(|index| Free {
-            index,
-            mean: 0.0,
-            std: f64::INFINITY,
-            lower: f64::NEG_INFINITY,
-            upper: f64::INFINITY,
-        })
+        .map(|index| Free { index, prior: Prior::Flat, lower: f64::NEG_INFINITY, upper: f64::INFINITY })
         .collect();
     let segments = [Segment { piece: 0, range: 0..y.len() }];
     let size = (y.iter().map(|y| y * y).sum::<f64>() / y.len() as f64).sqrt();

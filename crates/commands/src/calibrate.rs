@@ -46,6 +46,7 @@ impl Results {
     ) -> Result<Results, Failure> {
         let mut findings = findings(&loaded.model, train.iter().chain(holdout));
         findings.extend(calibration.limited.then(limit));
+        findings.extend((!calibration.converged && !calibration.limited).then(not_converged));
         let report = report(loaded, calibration, findings);
         let options = WriteOptions { original: Some(&loaded.text), ..Default::default() };
         let model_toml = calibration.model.to_toml(&options);
@@ -110,6 +111,7 @@ fn report(loaded: &LoadedModel, calibration: &Calibration, findings: Vec<contrac
             train: fit_set(&calibration.train),
             holdout: fit_set(&calibration.holdout),
             window_s: Some(calibration.window),
+            criterion: greybox_report::convert::criterion(calibration.criterion),
             holdout_source: calibration.holdout_source.clone(),
             recordings: Ordered::new(),
         },
@@ -152,6 +154,20 @@ fn limit() -> contract::Finding {
         mend: Some(
             "give it a shorter recording, or fix parameters that the recordings do not show".to_owned(),
         ),
+    }
+}
+
+/// The last fit was still gaining.
+fn not_converged() -> contract::Finding {
+    contract::Finding {
+        severity: contract::Severity::Warning,
+        code: "not_converged".to_owned(),
+        recording: None,
+        channel: None,
+        message: "the fit has not converged: it was still gaining when its steps were used up, and the parameters may \
+                  not be the best ones"
+            .to_owned(),
+        mend: Some("calibrate the model that was written once more, or fix parameters that the recordings do not show".to_owned()),
     }
 }
 

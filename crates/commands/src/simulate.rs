@@ -153,7 +153,7 @@ fn header_factor(header: Option<&str>, unit: &Unit) -> f64 {
 /// Writes what was simulated on a piece's grid to the rows the piece came from: row by row, or
 /// interpolated linearly where the piece was resampled (the last row may lie up to a step beyond the grid).
 fn at_rows(piece: &Piece, time: &[f64], simulated: &[f64], rows: &mut [f64]) {
-    if !piece.resampled {
+    if !piece.resampled && piece.len == piece.rows.len() {
         rows[piece.rows.clone()].copy_from_slice(simulated);
         return;
     }

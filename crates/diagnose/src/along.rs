@@ -194,6 +194,8 @@ impl<'a> Along<'a> {
             .map(|e| {
                 e.map(&mut |node| match &node {
                     Expr::Call(Func::Delay, args) => {
+                        // A delay within a delay is evaluated with it.
+                        let args: Vec<Expr> = args.iter().map(|arg| with_delays(arg, &delays)).collect();
                         let found = delays.iter().position(|d| d.0 == args[0] && d.1 == args[1]);
                         let i = found.unwrap_or_else(|| {
                             delays.push((args[0].clone(), args[1].clone()));
@@ -282,6 +284,20 @@ impl<'a> Along<'a> {
     }
 }
 
+/// An expression with its delays written out again, where leaves stand for them.
+fn with_delays(e: &Expr, delays: &[(Expr, Expr)]) -> Expr {
+    e.map(&mut |node| {
+        let index = match &node {
+            Expr::Var { name, .. } => name.strip_prefix("delayed#").and_then(|i| i.parse::<usize>().ok()),
+            _ => None,
+        };
+        match index.and_then(|i| delays.get(i)) {
+            Some((signal, lag)) => Expr::Call(Func::Delay, vec![signal.clone(), lag.clone()].into()),
+            None => node,
+        }
+    })
+}
+
 /// A signal delayed by `lag` samples (linear interpolation, first value held before the start).
 fn shift(u: &[f64], lag: f64) -> Vec<f64> {
     (0..u.len())
@@ -292,4 +308,33 @@ fn shift(u: &[f64], lag: f64) -> Vec<f64> {
             u[i] + w * (u.get(i + 1).unwrap_or(&u[i]) - u[i])
         })
         .collect()
+}
+
+#[cfg(test)]
+mod tests {
+    use std::sync::Arc;
+
+    use greybox_calibrate::{Data, free_parameters};
+    use greybox_model::Model;
+
+    use super::*;
+
+    #[test]
+    fn a_delay_within_a_delay_delays_twice() {
+        let text = "[states]\nx = { unit = \"m\" }\n[parameters]\nk = { value = 1.0, unit = \"1/s\" }\n\
+                    [equations]\nfall = \"x' + k*x = 0\"\n";
+        let model = Model::from_toml(text, "m.toml").unwrap();
+        let rows: String = (0..60).map(|k| format!("{},{}\n", 0.1 * f64::from(k), k * k)).collect();
+        let recording = greybox_recording::parse_csv(format!("t,x\n{rows}").as_bytes(), "r.csv").unwrap();
+        let data = Arc::new(Data::new(&model, &[recording]).unwrap());
+        let setup = Setup::new(&model, data, free_parameters(&model)).unwrap();
+        let x: Vec<f64> = (0..60).map(|k| f64::from(k * k)).collect();
+        let along = Along::simulated(&setup, std::slice::from_ref(&x), &[1.0]);
+        let delay = |e: Expr, by: f64| Expr::Call(Func::Delay, vec![e, Expr::Num(by)]);
+        let nested = delay(delay(Expr::var("x"), 0.2), 0.3);
+        let values = along.eval(&[nested, Expr::var("x")], &[]).unwrap();
+        for k in 6..60 {
+            assert!((values[0][0][k] - x[k - 5]).abs() < 1e-9, "{k}: {} {}", values[0][0][k], x[k - 5]);
+        }
+    }
 }

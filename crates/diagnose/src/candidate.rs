@@ -1,6 +1,6 @@
 //! A mechanism at a place: what it adds to the model.
 
-use greybox_calibrate::Free;
+use greybox_calibrate::{Free, Prior};
 use greybox_model::{Equation, Expr, Model, Parameter, State, Unit};
 
 use crate::library::{Mechanism, On};
@@ -321,6 +321,7 @@ impl Candidate {
                 unit: None,
                 std: None,
                 fixed: false,
+                positive: None,
             });
         }
         for (name, (lhs, rhs, unit)) in states.iter().zip(equations) {
@@ -353,7 +354,7 @@ impl Candidate {
                     }
                     None => (if positive(name) { 0.0 } else { f64::NEG_INFINITY }, f64::INFINITY),
                 };
-                Free { index: first + at, mean: 0.0, std: f64::INFINITY, lower, upper }
+                Free { index: first + at, prior: Prior::Flat, lower, upper }
             })
             .collect()
     }

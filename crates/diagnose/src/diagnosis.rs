@@ -5,8 +5,8 @@ use std::ops::Deref;
 use std::sync::Arc;
 
 use greybox_calibrate::{
-    Data, DataError, Fit, FreeRun, Level, Limits, Point, Score, Setup, SetupError, Work, free_parameters,
-    window_length,
+    Criterion, Data, DataError, Ending, Fit, FreeRun, Horizon, Level, Limits, Point, Score, Setup,
+    SetupError, Work, free_parameters, window_length, window_of,
 };
 use greybox_model::{Expr, Func, Hold, Model};
 use greybox_recording::Recording;
@@ -22,6 +22,7 @@ use crate::search::{
 };
 use crate::surface::{Surface, Variable, held_out};
 use crate::uncertainty::Uncertainty;
+use crate::validate::Gain;
 use crate::{Observer, Stage};
 
 /// Share of each recording held out when no recording is.
@@ -99,6 +100,17 @@ pub enum Verdict {
     MissingPhysics,
     /// Something is missing that no mechanism explains.
     Unexplained,
+}
+
+/// What the improved model rests on.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum Basis {
+    /// Mechanisms that are believed.
+    Named,
+    /// Mechanisms that predict data they were not fitted to, and that stand in for something without a name.
+    Proposed,
+    /// The given equations, refitted.
+    Calibrated,
 }
 
 /// A value with its 95 % interval, SI.
@@ -243,10 +255,16 @@ pub struct Diagnosis {
     pub nominal: Model,
     /// Refitted.
     pub calibrated: Model,
-    /// With the mechanisms (equal to `calibrated` when none was found).
+    /// The best simulation that can be defended, whatever the verdict.
     pub improved: Model,
+    /// What `improved` rests on.
+    pub basis: Basis,
+    /// By which figure simulations were judged.
+    pub criterion: Criterion,
     /// Mechanisms, largest share first.
     pub mechanisms: Vec<Finding>,
+    /// What `improved` holds that is not believed to be what is missing, largest share first.
+    pub candidates: Vec<Finding>,
     /// What fewer of several mechanisms would leave: none, each alone, all but one, all. Empty where there is one, or none.
     pub subsets: Vec<Subset>,
     /// Remainder.
@@ -261,8 +279,10 @@ pub struct Diagnosis {
     pub holdout_source: String,
     /// Window of the restarted simulations, s.
     pub window: f64,
-    /// Noise over the spread of each channel.
+    /// Noise over the spread of each channel, at most what the best of the models leaves.
     pub noise_floor: Vec<f64>,
+    /// Channels whose noise the recordings do not tell: a model leaves less than their fast differences say.
+    pub unknown_noise: Vec<usize>,
     /// Hold of each input: as given, and the better one.
     pub holds: Vec<(Hold, Hold)>,
     /// Whether the better hold mattered.
@@ -369,24 +389,43 @@ fn conclude(
     observer: &dyn Observer,
 ) -> Result<Diagnosis, DiagnoseError> {
     let train = nominal.data.clone();
-    let durations: Vec<f64> = train.pieces.iter().map(|p| (p.len.saturating_sub(1)) as f64 * p.dt).collect();
-    let dt = train.pieces.iter().map(|p| p.dt).fold(0.0, f64::max);
-    let window = window_length(&durations, dt);
     observer.stage(Stage::Simulating);
-    let mut baseline = Baseline::of(&found, &nominal.values());
+    // The model that fits best knows best how errors grow.
+    let judge = Judge::of(&found.improved, &residual_scale(&found.improved, &found.scale));
+    let window = judge.window;
+    let mut baseline = Baseline::of(&found, &nominal.values(), &judge);
     let mut limited = found.limited;
-    let Polished { fitted: improved, origin } = if found.improved.parts.is_empty() {
+    let mut found = found;
+    // What no round believed may still be what the equations lack: where the noise does not explain the rest, it is
+    // held against data that it was not fitted to.
+    let mut named = true;
+    let mut proposed = None;
+    if found.improved.parts.is_empty() && baseline.polished.fitted.misfit(&found.scale) > MISFIT {
+        for rejected in std::mem::take(&mut found.rejected).into_iter().rev() {
+            found.improved = rejected;
+            let polished = polish(&found.improved, &found.scale, &judge);
+            let polished = defend(search, &mut found, polished, &baseline, &judge, false);
+            if !polished.fitted.parts.is_empty() {
+                (named, proposed) = (false, Some(polished));
+                break;
+            }
+        }
+    }
+    let Polished { fitted: improved, origin } = if let Some(proposed) = proposed {
+        proposed
+    } else if found.improved.parts.is_empty() {
         baseline.polished.clone()
     } else {
         // The search fits the baseline with a scale that its mechanisms made small, and only where it goes on with
         // it. What is compared with is the best that the equations can do alone.
         let alone = alone(nominal, false, options.work, &Untold(observer));
         limited |= alone.limited;
-        let alone = Baseline::of(&alone, &nominal.values());
+        let alone = Baseline::of(&alone, &nominal.values(), &judge);
         if alone.misfit.total_cmp(&baseline.misfit).is_lt() {
             baseline = alone;
         }
-        polish(&found.improved, &found.scale, window)
+        let polished = polish(&found.improved, &found.scale, &judge);
+        defend(search, &mut found, polished, &baseline, &judge, true)
     };
     let scale = residual_scale(&improved, &found.scale);
     let Baseline { polished: Polished { fitted: calibrated, origin: own }, scale: calibrated_scale, .. } =
@@ -409,7 +448,7 @@ fn conclude(
         model
     };
     let (calibrated_model, improved_model) = (final_model(&calibrated), final_model(&improved));
-    let mut parameters: Vec<ParameterChange> = (0..nominal.model.parameters.len())
+    let parameters: Vec<ParameterChange> = (0..nominal.model.parameters.len())
         .map(|i| ParameterChange {
             index: i,
             nominal: nominal.model.parameters[i].value,
@@ -426,7 +465,10 @@ fn conclude(
                 true => f.for_simulations_of(data.clone(), parameters, &fine),
                 false => f.clone(),
             };
-            let run = setup.free_run(parameters, scale);
+            let run = match held {
+                true => setup.free_run(parameters, scale),
+                false => setup.training_run(parameters, scale),
+            };
             let scores = setup.scores(&run, parameters, window, None);
             let by_recording =
                 (0..data.recordings.len()).map(|r| setup.scores(&run, parameters, window, Some(r))).collect();
@@ -440,9 +482,9 @@ fn conclude(
             improved: run(&improved.setup, &improved.fit.point.parameters, &scale),
         }
     };
-    let mut train_role = role(&train, false);
+    let train_role = role(&train, false);
     follows([&train_role.calibrated.run, &train_role.improved.run], &train)?;
-    let mut holdout_role = role(&holdout, true);
+    let holdout_role = role(&holdout, true);
 
     // Mechanisms, remainder, verdict.
     // Where nothing was found, what the search's own noise model leaves white.
@@ -480,6 +522,7 @@ fn conclude(
     let is_imitation = (0..doubts.len())
         .any(|i| beaten(i) && (lost[i] > CORRECTION || (0..doubts.len()).any(|j| i != j && redundant(i, j))));
     let verdict = match left.verdict(improved.parts.len()) {
+        _ if !named && !improved.parts.is_empty() => Verdict::Unexplained,
         Verdict::MissingPhysics if is_imitation => Verdict::Unexplained,
         Verdict::MissingPhysics
             if is_patchwork(&improved, &shares, library, left.steady, redundant)
@@ -490,10 +533,10 @@ fn conclude(
         verdict => verdict,
     };
     let significant = left.significant(improved.parts.len()) || verdict == Verdict::Unexplained;
-    let (mut mechanisms, mut subsets) = (Vec::new(), Vec::new());
+    let mut mechanisms =
+        findings(&improved, &found, &nominal.model, library, &scale, &shares, &train_role, &uncertainty);
+    let mut subsets = Vec::new();
     if verdict == Verdict::MissingPhysics {
-        mechanisms =
-            findings(&improved, &found, &nominal.model, library, &scale, &shares, &train_role, &uncertainty);
         subsets = subsets_of(
             &shares,
             [&alone, &without].map(|rss| rss.iter().copied().map(share).collect()),
@@ -524,20 +567,28 @@ fn conclude(
             Remainder { share_of_residual: (all + left.share_of_residual).min(1.0), ..left }
         }
     };
-    let noise_floor = train.sigma.iter().zip(&train.spread).map(|(s, d)| s / d.max(1e-300)).collect();
+    // No model beats the noise: where one is below what fast differences say, they saw more than noise.
+    let models = [&train_role.nominal, &train_role.calibrated, &train_role.improved];
+    let reached = |c: usize| models.iter().map(|run| run.scores[c].nrmse).fold(f64::INFINITY, f64::min);
+    let estimated: Vec<f64> = train.sigma.iter().zip(&train.spread).map(|(s, d)| s / d.max(1e-300)).collect();
+    let noise_floor = estimated.iter().enumerate().map(|(c, &floor)| floor.min(reached(c))).collect();
+    let unknown_noise = (0..estimated.len()).filter(|&c| reached(c) < BELOW_NOISE * estimated[c]).collect();
     let holds = nominal.holds.iter().copied().zip(improved.setup.holds.iter().copied()).collect();
-    if unexplained {
-        // What is not believed improves nothing.
-        train_role.improved = train_role.calibrated.clone();
-        holdout_role.improved = holdout_role.calibrated.clone();
-        parameters.iter_mut().for_each(|p| p.improved = p.calibrated);
-    }
+    // What no name reaches is proposed without one: it predicts data that it was not fitted to.
+    let (basis, mechanisms, candidates) = match verdict {
+        Verdict::MissingPhysics => (Basis::Named, mechanisms, Vec::new()),
+        _ if mechanisms.is_empty() => (Basis::Calibrated, Vec::new(), Vec::new()),
+        _ => (Basis::Proposed, Vec::new(), mechanisms),
+    };
     Ok(Diagnosis {
         verdict,
+        basis,
+        criterion: judge.criterion,
         nominal: nominal.model.clone(),
-        improved: if unexplained { calibrated_model.clone() } else { improved_model },
+        improved: improved_model,
         calibrated: calibrated_model,
         mechanisms,
+        candidates,
         subsets,
         remainder,
         parameters,
@@ -546,6 +597,7 @@ fn conclude(
         holdout_source,
         window,
         noise_floor,
+        unknown_noise,
         holds,
         better_holds: found.better_holds.iter().map(|b| b.0).collect(),
         seed: options.seed,
@@ -610,76 +662,173 @@ struct Baseline {
     polished: Polished,
     /// Its residual.
     scale: Vec<f64>,
-    /// Sum over the channels of the squares of its free run's NRMSE.
+    /// How its simulations are judged ([`Criterion::misfit`]).
     misfit: f64,
 }
 
 impl Baseline {
-    /// What a search found without mechanisms, refitted on whole pieces, from its parameters and from the nominal
-    /// ones.
-    fn of(found: &Found, nominal: &[f64]) -> Baseline {
+    /// What a search found without mechanisms, refitted at growing horizons, from its parameters and from the nominal
+    /// ones: of all these fits the one that the criterion judges best.
+    fn of(found: &Found, nominal: &[f64], judge: &Judge) -> Baseline {
         let (fitted, setup) = (&found.calibrated, &found.calibrated.setup);
         let own = residual_scale(fitted, &found.scale);
-        let misfit = |p: &[f64], scale: &[f64]| -> f64 {
-            let run = setup.free_run(p, scale);
-            let scores = setup.scores(&run, p, f64::INFINITY, None);
-            scores.iter().map(|s| s.nrmse.powi(2)).sum()
-        };
-        let level = setup.level(1);
-        let mut best = (misfit(&fitted.fit.point.parameters, &own), None);
-        let stitched = setup.stitch(&fitted.level, &fitted.fit.point, &level, &own);
-        let measured = Point { parameters: nominal.to_vec(), starts: setup.starts(&level, nominal) };
-        for mut start in [stitched, measured] {
-            for (s, prior) in start.starts.iter_mut().zip(&level.priors) {
-                for (x, (mean, std)) in s.iter_mut().zip(prior) {
-                    if std.is_finite() {
-                        *x = *mean;
-                    }
-                }
-            }
-            let whole = setup.fit(&level, &own, &[start], Limits { iterations: 30, tolerance: 1e-6 });
-            let quality = misfit(&whole.point.parameters, &own);
-            if quality < best.0 {
-                best = (quality, Some(whole));
-            }
+        let measured = Point { parameters: nominal.to_vec(), starts: setup.starts(&fitted.level, nominal) };
+        let points = [fitted.fit.point.clone(), measured];
+        let mut polished = best_horizon(fitted, &points, &own, &found.scale, judge);
+        // A fit to segments may simulate the whole worse than what it began with.
+        if judge.misfit(setup, nominal, &own)
+            < judge.misfit(setup, &polished.fitted.fit.point.parameters, &own)
+        {
+            let level = setup.level(1);
+            let as_given = Point { parameters: nominal.to_vec(), starts: setup.starts(&level, nominal) };
+            let held = Limits { iterations: 0, ..HORIZON };
+            let fit = setup.fit(&level, &own, &[as_given], held);
+            polished = Polished::at(fitted, level, fit, &found.scale);
         }
-        let polished = match best.1 {
-            Some(whole) => Polished::at(fitted, level, whole, &found.scale),
-            None => Polished::kept(fitted.clone()),
-        };
         let scale = residual_scale(&polished.fitted, &found.scale);
-        let misfit = misfit(&polished.fitted.fit.point.parameters, &scale);
+        let misfit = judge.misfit(setup, &polished.fitted.fit.point.parameters, &scale);
         Baseline { polished, scale, misfit }
     }
 }
 
-/// The improved model refitted on whole pieces, kept where its free run gains and its restarted windows
-/// do not lose: an axis that integrates would otherwise bend its parameters to absorb drift.
-fn polish(fitted: &Fitted, scale: &[f64], window: f64) -> Polished {
+/// How simulations of the training recordings are judged.
+#[derive(Debug, Clone, Copy)]
+struct Judge {
+    criterion: Criterion,
+    /// Window of restarted simulations, s.
+    window: f64,
+}
+
+impl Judge {
+    /// By what a fitted model says of the machine.
+    fn of(fitted: &Fitted, scale: &[f64]) -> Judge {
+        let setup = &fitted.setup;
+        let durations: Vec<f64> =
+            setup.data.pieces.iter().map(|p| p.len.saturating_sub(1) as f64 * p.dt).collect();
+        let dt = setup.data.pieces.iter().map(|p| p.dt).fold(0.0, f64::max);
+        let window = window_length(&durations, dt);
+        let (criterion, predictable) = setup.criterion(&fitted.fit.point.parameters, scale);
+        Judge { criterion, window: if predictable < window { window_of(predictable, dt) } else { window } }
+    }
+
+    fn misfit(&self, setup: &Setup, parameters: &[f64], scale: &[f64]) -> f64 {
+        let run = setup.training_run(parameters, scale);
+        let window = match self.criterion {
+            Criterion::FreeRun => f64::INFINITY,
+            Criterion::Windowed => self.window,
+        };
+        self.criterion.misfit(&setup.scores(&run, parameters, window, None))
+    }
+}
+
+/// A model refitted at growing horizons from each of these points of its level: of all fits, and the model as it is, the
+/// one that is judged best.
+fn best_horizon(fitted: &Fitted, points: &[Point], own: &[f64], scale: &[f64], judge: &Judge) -> Polished {
     let setup = &fitted.setup;
-    let level = setup.level(1);
-    if level.segments == fitted.level.segments {
-        return Polished::kept(fitted.clone());
+    let mut best = (judge.misfit(setup, &fitted.fit.point.parameters, own), None);
+    for point in points {
+        for Horizon { level, fit } in setup.grow(&fitted.level, point, own, HORIZON) {
+            let quality = judge.misfit(setup, &fit.point.parameters, own);
+            if quality < best.0 {
+                best = (quality, Some((level, fit)));
+            }
+        }
     }
+    match best.1 {
+        Some((level, mut fit)) => {
+            if fit.ending == Ending::Limit {
+                let further = setup.fit(&level, own, std::slice::from_ref(&fit.point), FURTHER);
+                if judge.misfit(setup, &further.point.parameters, own) <= best.0 {
+                    fit = further;
+                }
+            }
+            Polished::at(fitted, level, fit, scale)
+        }
+        None => Polished::kept(fitted.clone()),
+    }
+}
+
+/// Limits of the fit at each horizon.
+const HORIZON: Limits = Limits { iterations: 30, tolerance: 1e-6 };
+/// Limits of the best of these fits, where it has not ended.
+const FURTHER: Limits = Limits { iterations: 100, tolerance: 1e-6 };
+
+/// Takes mechanisms away until what is left can be handed back: every one is determined, no inertia is negative, and the
+/// model is no worse than the calibrated one, neither in training nor (unless it leaves nothing but noise) on data left
+/// out of its fit. Nothing is left but the calibrated model where that takes all of them; what no round believed
+/// (`named` false) has to predict such data better than chance.
+fn defend(
+    search: &Search<'_>,
+    found: &mut Found,
+    polished: Polished,
+    baseline: &Baseline,
+    judge: &Judge,
+    named: bool,
+) -> Polished {
+    let errors = |p: &Polished, scale: &[f64]| {
+        crate::validate::errors(&p.origin, scale, judge.criterion, judge.window)
+    };
+    let simpler = LazyCell::new(|| errors(&baseline.polished, &baseline.scale));
+    let mut polished = polished;
+    loop {
+        let fitted = &polished.fitted;
+        if fitted.parts.is_empty() {
+            found.improved = found.calibrated.clone();
+            found.accepted.clear();
+            return baseline.polished.clone();
+        }
+        let scale = residual_scale(fitted, &found.scale);
+        let undetermined =
+            search.undetermined(&polished.origin, &Uncertainty::of(&polished.origin, &scale).widths());
+        let misfit = judge.misfit(&fitted.setup, &fitted.fit.point.parameters, &scale);
+        let worse = misfit.total_cmp(&baseline.misfit).is_gt();
+        let unsafe_elsewhere = || {
+            if named && fitted.misfit(&found.scale) <= MISFIT {
+                return false; // the likelihood has spoken
+            }
+            let gain = Gain::of(&simpler, &errors(&polished, &scale));
+            !(if named { gain.is_safe() } else { gain.is_beyond_chance() })
+        };
+        let fails = undetermined.is_some()
+            || worse
+            || search.has_negative_inertia(fitted, &found.scale)
+            || unsafe_elsewhere();
+        if !fails {
+            return polished;
+        }
+        let parts: Vec<usize> = undetermined.map_or_else(|| (0..fitted.parts.len()).collect(), |i| vec![i]);
+        let smaller = parts
+            .into_par_iter()
+            .filter_map(|i| {
+                let smaller = search.smaller(&found.improved, i, &found.scale)?;
+                let polished = polish(&smaller, &found.scale, judge);
+                let scale = residual_scale(&polished.fitted, &found.scale);
+                let of = &polished.fitted;
+                let misfit = judge.misfit(&of.setup, &of.fit.point.parameters, &scale);
+                Some((misfit, smaller, polished))
+            })
+            .collect::<Vec<_>>()
+            .into_iter()
+            .min_by(|a, b| a.0.total_cmp(&b.0));
+        match smaller {
+            Some((_, smaller, rest)) => {
+                found.accepted.retain(|a| smaller.parts.iter().any(|p| p.candidate == a.candidate));
+                found.improved = smaller;
+                polished = rest;
+            }
+            None => {
+                found.improved = found.calibrated.clone();
+                found.accepted.clear();
+                return baseline.polished.clone();
+            }
+        }
+    }
+}
+
+/// The improved model refitted at growing horizons.
+fn polish(fitted: &Fitted, scale: &[f64], judge: &Judge) -> Polished {
     let own = residual_scale(fitted, scale);
-    let stitched = setup.stitch(&fitted.level, &fitted.fit.point, &level, &own);
-    let hats = Point {
-        parameters: fitted.fit.point.parameters.clone(),
-        starts: setup.starts(&level, &fitted.fit.point.parameters),
-    };
-    let whole = setup.fit(&level, &own, &[stitched, hats], Limits { iterations: 20, tolerance: 1e-6 });
-    let quality = |p: &[f64]| -> (f64, f64) {
-        let run = setup.free_run(p, &own);
-        let scores = setup.scores(&run, p, window, None);
-        (scores.iter().map(|s| s.nrmse.ln()).sum(), scores.iter().map(|s| s.nrmse_windowed.ln()).sum())
-    };
-    let before = quality(&fitted.fit.point.parameters);
-    let after = quality(&whole.point.parameters);
-    if after.0 < before.0 && after.1 < before.1 + 0.02 {
-        Polished::at(fitted, level, whole, scale)
-    } else {
-        Polished::kept(fitted.clone())
-    }
+    best_horizon(fitted, &[fitted.fit.point.clone()], &own, scale, judge)
 }
 
 /// Residual sum of squares with each part alone, refitted; `without` is that without each part, `base` that without all.
@@ -1001,6 +1150,8 @@ const DOUBTED: f64 = 0.8;
 /// Residual over noise from which a residual is a misfit, whatever its colour; and from which it is one where
 /// samples hold so little information each that it must be slow.
 const MISFIT: f64 = 1.5;
+/// Residual over the estimated noise below which the estimate was not of noise alone.
+const BELOW_NOISE: f64 = 0.8;
 const SLOW_MISFIT: f64 = 1.2;
 const SLOW: f64 = 0.05;
 
@@ -1309,6 +1460,10 @@ pub struct Calibration {
     pub data: Arc<Data>,
     /// Held-out data.
     pub held: Arc<Data>,
+    /// By which figure simulations were judged.
+    pub criterion: Criterion,
+    /// The last fit ended because nothing more was to be gained.
+    pub converged: bool,
     /// The fits ended at their limit of work, not because nothing more was to be gained.
     pub limited: bool,
     /// Free runs on the training recordings: nominal, calibrated.
@@ -1333,10 +1488,10 @@ pub fn calibrate(
     let Layout { train, holdout, source } = layout(model, train, holdout)?;
     let nominal = Setup::new(model, train.clone(), free_parameters(model))?;
     let found = alone(&nominal, true, MOST_WORK, observer);
-    let durations: Vec<f64> = train.pieces.iter().map(|p| (p.len.saturating_sub(1)) as f64 * p.dt).collect();
-    let window = window_length(&durations, train.pieces.iter().map(|p| p.dt).fold(0.0, f64::max));
+    let judge = Judge::of(&found.calibrated, &residual_scale(&found.calibrated, &found.scale));
+    let window = judge.window;
     let Baseline { polished: Polished { fitted, origin }, scale, .. } =
-        Baseline::of(&found, &nominal.values());
+        Baseline::of(&found, &nominal.values(), &judge);
     let widths = Uncertainty::of(&origin, &scale).widths();
     let values = &fitted.fit.point.parameters;
     let mut calibrated = model.clone();
@@ -1351,20 +1506,24 @@ pub fn calibrate(
         })
         .collect();
     let spread: Vec<f64> = train.spread.iter().map(|s| s.max(1e-300)).collect();
-    let runs = |data: &Arc<Data>| -> Both {
+    let runs = |data: &Arc<Data>, held: bool| -> Both {
         let fine: Vec<f64> = scale.iter().map(|s| 0.02 * s).collect();
         let setup = fitted.setup.for_simulations_of(data.clone(), values, &fine);
-        let before = setup.free_run(&nominal.values(), &spread);
-        let after = setup.free_run(values, &scale);
+        let run = |parameters: &[f64], scale: &[f64]| match held {
+            true => setup.free_run(parameters, scale),
+            false => setup.training_run(parameters, scale),
+        };
+        let before = run(&nominal.values(), &spread);
+        let after = run(values, &scale);
         let scores = (
             setup.scores(&before, &nominal.values(), window, None),
             setup.scores(&after, values, window, None),
         );
         (scores, (before, after))
     };
-    let (train_scores, train_runs) = runs(&train);
+    let (train_scores, train_runs) = runs(&train, false);
     follows([&train_runs.1], &train)?;
-    let (holdout_scores, holdout_runs) = runs(&holdout);
+    let (holdout_scores, holdout_runs) = runs(&holdout, true);
     Ok(Calibration {
         model: calibrated,
         parameters,
@@ -1374,6 +1533,8 @@ pub fn calibrate(
         window,
         data: train,
         held: holdout,
+        criterion: judge.criterion,
+        converged: origin.fit.ending != Ending::Limit,
         limited: found.limited,
         train_runs,
         holdout_runs,

@@ -146,9 +146,7 @@ pub fn folds(setup: &Setup, level: &Level, scale: &[f64], point: &Point) -> Fold
         h.iter_mut().zip(jj).for_each(|(a, b)| *a += b);
     }
     for (i, f) in setup.free.iter().enumerate() {
-        if f.std.is_finite() && f.std > 0.0 {
-            h[i * np + i] += 1.0 / (f.std * f.std);
-        }
+        h[i * np + i] += f.prior.precision(point.parameters[f.index]);
     }
     let d: Vec<f64> = (0..np).map(|i| if h[i * np + i] > 0.0 { h[i * np + i].sqrt() } else { 1.0 }).collect();
     let count = FOLDS.min(blocks.len().max(1));

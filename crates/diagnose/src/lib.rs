@@ -18,6 +18,7 @@ pub mod smoother;
 pub mod spectra;
 pub mod surface;
 mod uncertainty;
+mod validate;
 
 pub use diagnosis::{
     Calibration, DiagnoseError, Diagnosis, Estimate, Options, Subset, Verdict, calibrate, diagnose,

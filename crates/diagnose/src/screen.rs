@@ -441,7 +441,14 @@ impl Recall {
                 .collect(),
             parameters: mechanism
                 .parameters()
-                .map(|n| Parameter { name: n.to_string(), value: 1.0, unit: None, std: None, fixed: false })
+                .map(|n| Parameter {
+                    name: n.to_string(),
+                    value: 1.0,
+                    unit: None,
+                    std: None,
+                    fixed: false,
+                    positive: None,
+                })
                 .collect(),
             equations: mechanism
                 .states
@@ -722,11 +729,10 @@ pub fn gram(
         lanes,
     });
     for (i, f) in setup.free.iter().enumerate() {
-        if f.std.is_finite() && f.std > 0.0 {
-            total.jj[i * np + i] += 1.0 / (f.std * f.std);
-            total.prior[i] = 1.0 / (f.std * f.std);
-            total.jr[i] += (f.mean - point.parameters[f.index]) / (f.std * f.std);
-        }
+        let (g, slope) = f.prior.at(point.parameters[f.index]);
+        total.jj[i * np + i] += slope * slope;
+        total.prior[i] = slope * slope;
+        total.jr[i] -= slope * g;
     }
     total
 }

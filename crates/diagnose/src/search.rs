@@ -18,8 +18,8 @@ use crate::screen::{Pair, Scored, first_states, first_values, inner_scales, scre
 use crate::uncertainty::Uncertainty;
 use crate::{Observer, Stage};
 
-/// Number of segments of the first and last level, where nothing else decides.
-const SEGMENTS: (usize, usize) = (60, 4);
+/// Number of segments of the first level, where nothing else decides.
+const SEGMENTS: usize = 60;
 /// Longest segments of the first level, in periods of the fastest channel: beyond, a wrong stiffness turns
 /// the phase of the response round, and the score test's first order means nothing.
 const PERIODS: f64 = 3.0;
@@ -47,7 +47,7 @@ const RIVALS: usize = 6;
 /// Pairs that are fitted when no single candidate pays, and the residual over noise that calls for them.
 const PAIRS: usize = 4;
 const PAIR_MISFIT: f64 = 1.1;
-/// Fewest samples among which pairs are looked for: there are many pairs.
+/// Fewest samples by which a pair is believed: there are many pairs.
 const PAIR_SAMPLES: usize = 500;
 /// Residual over noise from which a fit may be stuck.
 const STUCK: f64 = 1.2;
@@ -129,7 +129,7 @@ impl Fitted {
     }
 
     /// Largest residual RMS over the noise.
-    fn misfit(&self, scale: &[f64]) -> f64 {
+    pub fn misfit(&self, scale: &[f64]) -> f64 {
         rms(&self.fit, scale).iter().zip(&self.setup.data.sigma).map(|(r, s)| r / s).fold(0.0, f64::max)
     }
 
@@ -183,6 +183,8 @@ pub struct Found {
     pub scale: Vec<f64>,
     /// The work ran out before the search had come to its end.
     pub limited: bool,
+    /// With the best single candidate, and the best pair, of the last round that found nothing to be believed.
+    pub rejected: Vec<Fitted>,
 }
 
 /// The search with everything it needs.
@@ -205,8 +207,7 @@ pub struct Search<'a> {
     lengths: Vec<usize>,
 }
 
-/// Lengths of the segments: from a few periods of the fastest channel, by factors of four, to a quarter of
-/// the data.
+/// Lengths of the segments: from a few periods of the fastest channel, by factors of four, to whole pieces.
 fn lengths(setup: &Setup) -> Vec<usize> {
     let total: usize = setup.data.lengths().iter().sum();
     let mut period = f64::INFINITY;
@@ -219,8 +220,9 @@ fn lengths(setup: &Setup) -> Vec<usize> {
             }
         }
     }
-    let longest = (total.min(MOST_SAMPLES) / SEGMENTS.1).max(SHORTEST);
-    let first = ((PERIODS * period) as usize).min(total / SEGMENTS.0).max(SHORTEST).min(longest);
+    let piece = setup.data.lengths().into_iter().max().unwrap_or(0);
+    let longest = piece.min(MOST_SAMPLES).max(SHORTEST);
+    let first = ((PERIODS * period) as usize).min(total / SEGMENTS).max(SHORTEST).min(longest);
     let mut out = vec![first];
     while let Some(&last) = out.last()
         && last < longest
@@ -298,6 +300,8 @@ impl<'a> Search<'a> {
         let mut all = candidates(&nominal.model, library, &places);
         let samples: usize = nominal.data.lengths().iter().sum();
         all.retain(|c| samples >= MEMORY_SAMPLES || library[c.mechanism].states.is_empty());
+        // Time begins anew with every recording, and no drift does.
+        all.retain(|c| nominal.data.recordings.len() < 2 || !is_drift(&library[c.mechanism]));
         let (all, doubts) = all.into_iter().partition(|c| library[c.mechanism].doubts.is_empty());
         let lengths = lengths(&nominal);
         Search {
@@ -379,15 +383,7 @@ impl<'a> Search<'a> {
     /// The model fitted at another level, from the stitched trajectory or the measurements.
     fn relevel(&self, fitted: &Fitted, level: Level, scale: &[f64], iterations: usize) -> Fitted {
         let level = same_level(&fitted.setup, &level);
-        let stitched = fitted.setup.stitch(&fitted.level, &fitted.fit.point, &level, scale);
-        let hats = Point {
-            parameters: fitted.fit.point.parameters.clone(),
-            starts: fitted.setup.starts(&level, &fitted.fit.point.parameters),
-        };
-        // The starts alone first: parameters that fit elsewhere must not give way to starts that do not yet.
-        let held = Setup { free: Vec::new(), ..fitted.setup.clone() };
-        let settled = held.fit(&level, scale, &[stitched, hats], limits(STARTS)).point;
-        let fit = fitted.setup.fit(&level, scale, &[settled], limits(iterations));
+        let fit = fitted.setup.lengthen(&fitted.level, &fitted.fit.point, &level, scale, limits(iterations));
         Fitted { level, fit, ..fitted.clone() }
     }
 
@@ -429,7 +425,7 @@ impl<'a> Search<'a> {
         let starts = transfer(&base.setup, &base.level, &old.starts, &setup, &fresh);
         let fit = setup.fit(&level, scale, &[Point { parameters, starts }], limits(20));
         let fitted = Fitted { setup, parts, level, fit };
-        (fitted.fit.cost.is_finite() && self.admissible(&fitted)).then_some(fitted)
+        (fitted.fit.cost.is_finite() && self.admissible(&fitted, scale)).then_some(fitted)
     }
 
     /// Complexity of all mechanisms of a model.
@@ -437,9 +433,10 @@ impl<'a> Search<'a> {
         fitted.parts.iter().map(|p| self.library[p.candidate.mechanism].complexity()).sum()
     }
 
-    /// Whether every mechanism's requirements on its parameters hold.
-    fn admissible(&self, fitted: &Fitted) -> bool {
+    /// Whether every mechanism's requirements on its parameters hold, and no inertia is negative.
+    fn admissible(&self, fitted: &Fitted, scale: &[f64]) -> bool {
         fitted.parts.iter().all(|part| self.allows(part, &fitted.setup, &fitted.fit.point.parameters))
+            && !self.has_negative_inertia(fitted, scale)
     }
 
     /// Whether a mechanism's requirements on its parameters hold at these values of the model's.
@@ -449,17 +446,30 @@ impl<'a> Search<'a> {
             let i = mechanism.parameters().position(|p| p == n)?;
             Some(parameters[setup.model.parameter(&part.instance.names[i])?])
         };
-        mechanism.require.iter().all(|e| e.eval(&|n, _| value(n)).is_none_or(|v| v >= 0.0))
+        let required = mechanism.require.iter().all(|e| e.eval(&|n, _| value(n)).is_none_or(|v| v >= 0.0));
+        required && (!is_drift(mechanism) || self.keeps_its_sign(mechanism, &value))
+    }
+
+    /// Whether a parameter that drifts, with these values of the drift's own, has one sign until the end of the recordings.
+    fn keeps_its_sign(&self, mechanism: &Mechanism, value: &dyn Fn(&str) -> Option<f64>) -> bool {
+        let end = self.nominal.data.pieces.iter().map(|p| p.start + p.len as f64 * p.dt).fold(0.0, f64::max);
+        let at = |t: f64| {
+            mechanism.law.eval(&|n, _| match n {
+                "p" => Some(1.0),
+                "t" => Some(t),
+                _ => value(n),
+            })
+        };
+        match (at(0.0), at(end)) {
+            (Some(first), Some(last)) => first * last > 0.0,
+            _ => true,
+        }
     }
 
     /// When no single candidate is believable and yet something is missing: the best pairs of those that
     /// only pay together.
     fn pair_round(&self, calibrated: &mut Fitted, state: &mut State) -> bool {
-        let samples: usize = state.current.fit.count.iter().sum();
-        if state.current.parts.len() + 2 > MOST_MECHANISMS
-            || state.misfit() < PAIR_MISFIT
-            || samples < PAIR_SAMPLES
-        {
+        if state.current.parts.len() + 2 > MOST_MECHANISMS || state.misfit() < PAIR_MISFIT {
             return false;
         }
         let current = state.current.clone();
@@ -481,6 +491,8 @@ impl<'a> Search<'a> {
         let Some(best) = trials.into_iter().min_by(|a, b| a.rss().total_cmp(&b.rss())) else {
             return false;
         };
+        // (Beside a single candidate that was not believed either.)
+        state.rejected.push(best.clone());
         let control = self.control(&current, &best, &scale);
         let evidence = self.weigh(&control, &best, &scale);
         let share = (control.rss() - best.rss()) / calibrated_rss(calibrated, &scale).max(1e-300);
@@ -489,8 +501,10 @@ impl<'a> Search<'a> {
         for part in members {
             self.observer.weighed(&self.library[part.candidate.mechanism].kind, &evidence, share);
         }
-        // There are n²/2 pairs to choose from.
-        let believable = evidence.score > 4.0 * n.max(2.0).ln() + 6.0
+        // There are n²/2 pairs to choose from; of few samples, one of them always fits.
+        let samples: usize = state.current.fit.count.iter().sum();
+        let believable = samples >= PAIR_SAMPLES
+            && evidence.score > 4.0 * n.max(2.0).ln() + 6.0
             && members.iter().all(|part| {
                 self.believable(&evidence, &self.library[part.candidate.mechanism], share, first, false)
             });
@@ -837,6 +851,7 @@ impl<'a> Search<'a> {
             accepted: Vec::new(),
             loose: true,
             sigma,
+            rejected: Vec::new(),
         };
         self.method(&mut calibrated, &state.scale);
         calibrated = self.refit(&calibrated, &state.scale, 15);
@@ -880,6 +895,7 @@ impl<'a> Search<'a> {
         if !settled {
             self.think_again(&mut calibrated, &mut state);
         }
+        self.search_long(&calibrated, &mut state);
         let limited = self.limited.load(Ordering::Relaxed);
         // What was searched through windows is fitted to all data in the end.
         let length = self.lengths.last().copied().unwrap_or(SHORTEST);
@@ -903,8 +919,117 @@ impl<'a> Search<'a> {
             .filter(|&i| current.setup.holds[i] != self.nominal.holds[i])
             .map(|i| (i, self.nominal.holds[i], current.setup.holds[i]))
             .collect();
-        let (accepted, scale) = (state.accepted, state.scale);
-        Found { calibrated, improved: current, accepted, better_holds, scale, limited }
+        let (accepted, scale, rejected) = (state.accepted, state.scale, state.rejected);
+        Found { calibrated, improved: current, accepted, better_holds, scale, limited, rejected }
+    }
+
+    /// The model without part `index`, on the same segments, refitted.
+    pub fn smaller(&self, fitted: &Fitted, index: usize, scale: &[f64]) -> Option<Fitted> {
+        self.without(fitted, index, scale, STEPS_WITHOUT)
+    }
+
+    /// The part whose strengths the recordings determine least, where the 95 % intervals (half `widths`, of the free
+    /// parameters) of all of them hold zero: such a mechanism may as well not be there.
+    pub fn undetermined(&self, fitted: &Fitted, widths: &[f64]) -> Option<usize> {
+        let known = |part: &Part| -> f64 {
+            let mechanism = &self.library[part.candidate.mechanism];
+            let counts =
+                |plain: &str| mechanism.linear.is_empty() || mechanism.linear.iter().any(|l| l == plain);
+            let ratio = |name: &String| {
+                let index = fitted.setup.model.parameter(name)?;
+                let at = fitted.setup.free.iter().position(|f| f.index == index)?;
+                let value = fitted.fit.point.parameters[index].abs();
+                Some(if value > 0.0 { value / widths[at] } else { 0.0 })
+            };
+            let names = mechanism.parameters().zip(&part.instance.names);
+            let known = names.filter(|(plain, _)| counts(plain)).filter_map(|(_, name)| ratio(name));
+            known.fold(f64::NEG_INFINITY, f64::max)
+        };
+        let ratios = fitted.parts.iter().map(known).enumerate();
+        let least = ratios.filter(|(_, ratio)| !(*ratio >= 1.0)).min_by(|a, b| a.1.total_cmp(&b.1));
+        least.filter(|(_, ratio)| *ratio != f64::NEG_INFINITY).map(|(index, _)| index)
+    }
+
+    /// Whether the mechanisms turn the sign of the mass matrix's determinant somewhere along the recordings: a negative
+    /// inertia, or a coupling of accelerations stronger than the inertias that it couples.
+    pub fn has_negative_inertia(&self, fitted: &Fitted, scale: &[f64]) -> bool {
+        let along = Along::smoothed(&fitted.setup, &fitted.level, scale, &fitted.fit.point);
+        let n0 = self.nominal.system.nz;
+        let model = &fitted.setup.model;
+        let highest: Vec<(&str, u8)> =
+            self.nominal.model.states.iter().map(|s| (s.name.as_str(), s.order as u8)).collect();
+        let mass = |model: &Model| -> Option<Vec<greybox_model::Expr>> {
+            let rows = model.equations.iter().take(n0).map(|e| Some(e.residual().affine_in(&highest)?.0));
+            Some(rows.collect::<Option<Vec<_>>>()?.concat())
+        };
+        let (Some(before), Some(after)) = (mass(&self.nominal.model), mass(model)) else { return false };
+        if before == after {
+            return false;
+        }
+        let values = |exprs: &[greybox_model::Expr]| along.eval(exprs, &[]);
+        let (Some(before), Some(after)) = (values(&before), values(&after)) else { return false };
+        let sign = |values: &[Vec<Vec<f64>>], piece: usize, k: usize| {
+            let mut a: Vec<f64> = values.iter().map(|e| e[piece][k]).collect();
+            determinant_sign(&mut a, n0)
+        };
+        let pieces = self.nominal.data.lengths();
+        pieces
+            .iter()
+            .enumerate()
+            .any(|(p, &n)| (0..n).any(|k| sign(&before, p, k) * sign(&after, p, k) < 0.0))
+    }
+
+    /// Searches once more from the calibrated model on the longest segments alone. What acts slowly (a light damping) is
+    /// hardly seen on short ones, where the free starts of the segments absorb it, and what was taken for it there leaves
+    /// more to be explained: the result of fewer mechanisms, or of more evidence, counts. Not where a single mechanism
+    /// leaves nothing but white noise.
+    fn search_long(&self, calibrated: &Fitted, state: &mut State) {
+        let single = state.current.parts.len() <= 1;
+        if (single && state.current.leaves_white_noise(&state.scale))
+            || state.misfit() < STUCK && single
+            || self.lengths.len() < 2
+            || self.is_spent()
+        {
+            return;
+        }
+        let plain = Setup { noise: None, ..calibrated.setup.clone() };
+        let length = self.lengths.last().copied().unwrap_or(SHORTEST);
+        let level = self.nominal.windows(length, MOST_SAMPLES);
+        let mut baseline =
+            self.relevel(&Fitted { setup: plain, ..calibrated.clone() }, level, &state.scale, 20);
+        let mut other = State {
+            scale: next_scale(&baseline.fit, &state.scale, &state.sigma),
+            current: baseline.clone(),
+            accepted: Vec::new(),
+            sigma: state.sigma.clone(),
+            loose: false,
+            rejected: Vec::new(),
+        };
+        baseline = self.refit(&baseline, &other.scale, 10);
+        other.current = baseline.clone();
+        self.level(&mut baseline, &mut other);
+        self.think_again(&mut baseline, &mut other);
+        if other.current.parts.is_empty() {
+            if state.current.parts.is_empty() && !other.rejected.is_empty() {
+                state.rejected = other.rejected;
+            }
+            return;
+        }
+        // Both over the calibrated model, on the same segments and in the same units.
+        let scale = other.scale.clone();
+        let mut standing = state.current.clone();
+        standing.setup.noise = None;
+        let standing = if standing.level.segments == other.current.level.segments {
+            self.refit(&standing, &scale, 10)
+        } else {
+            self.relevel(&standing, other.current.level.clone(), &scale, 20)
+        };
+        let found = self.refit(&other.current, &scale, 10);
+        let evidence = self.weigh(&standing, &found, &scale);
+        let simpler = self.complexity(&found) < self.complexity(&standing);
+        if evidence.score > if simpler { -PARSIMONY } else { PARSIMONY } {
+            *state = other;
+        }
     }
 
     /// Whether the work is used up. Asked only between one step of the search and the next: the sum does not
@@ -1103,6 +1228,7 @@ impl<'a> Search<'a> {
         let mechanism = &self.library[winner.mechanism];
         self.observer.weighed(&mechanism.kind, &evidence, share);
         if !self.believable(&evidence, mechanism, share, state.current.parts.is_empty(), state.loose) {
+            state.rejected = vec![chosen];
             return false;
         }
         self.accept(state, winner, chosen, rivals, evidence);
@@ -1201,7 +1327,7 @@ impl<'a> Search<'a> {
                 .map(|(c, f)| {
                     (c, if f.fit.ending == Ending::Limit { self.refit(&f, scale, steps) } else { f })
                 })
-                .filter(|(_, f)| self.admissible(f))
+                .filter(|(_, f)| self.admissible(f, scale))
                 .collect()
         };
         let mut finished = go_on(trials, MORE_STEPS);
@@ -1502,7 +1628,7 @@ impl<'a> Search<'a> {
         scale: &[f64],
     ) -> Option<Fitted> {
         let fitted = self.fitted_trial(current, candidate, scored, scale)?;
-        self.admissible(&fitted).then_some(fitted)
+        self.admissible(&fitted, scale).then_some(fitted)
     }
 
     fn fitted_trial(
@@ -1607,10 +1733,13 @@ impl<'a> Search<'a> {
                 return None;
             }
             let best = self.best_of(&weighed, open, total, scale);
-            if !self.gives_way(&weighed, best, current, open, scale) {
+            if self.gives_way(&weighed, best, current, open, scale) {
+                undetermined.push(weighed.remove(best));
+            } else if self.shows_nothing(&weighed[best].1, scale) {
+                weighed.remove(best);
+            } else {
                 break best;
             }
-            undetermined.push(weighed.remove(best));
         };
         let (chosen, fitted, evidence) = weighed.remove(best);
         let likelihood = by_likelihood(&fitted, &evidence, scale);
@@ -1634,6 +1763,12 @@ impl<'a> Search<'a> {
             undetermined.into_iter().map(|u| (u, true)).chain(weighed.into_iter().map(|w| (w, false)));
         let rivals = rivals.filter_map(|(trial, undetermined)| tell(trial, undetermined)).collect();
         Some((open[chosen].clone(), fitted, rivals, evidence))
+    }
+
+    /// Whether the recordings determine none of the strengths of a model's last part.
+    fn shows_nothing(&self, fitted: &Fitted, scale: &[f64]) -> bool {
+        let last = fitted.parts.len().wrapping_sub(1);
+        self.undetermined(fitted, &Uncertainty::of(fitted, scale).widths()) == Some(last)
     }
 
     /// Whether a refinement is no choice: the law that it refines is at hand, and the data do not show its parts.
@@ -1897,6 +2032,11 @@ impl<'a> Search<'a> {
     }
 }
 
+/// Whether a mechanism lets a parameter change with time.
+fn is_drift(mechanism: &Mechanism) -> bool {
+    mechanism.on == crate::library::On::Parameter && mechanism.law.mentions("t")
+}
+
 /// A fitted linear parameter of a mechanism.
 struct Strength {
     /// Index in the model.
@@ -1919,6 +2059,8 @@ struct State {
     sigma: Vec<f64>,
     /// Rare effects may be believed.
     loose: bool,
+    /// With the best single candidate, and the best pair, of the last round that found nothing to be believed.
+    rejected: Vec<Fitted>,
 }
 
 impl State {
@@ -2004,6 +2146,17 @@ pub fn raw_rss(fitted: &Fitted, scale: &[f64]) -> Vec<f64> {
 /// Residual RMS per channel in SI, not whitened.
 pub fn raw_rms(fitted: &Fitted, scale: &[f64]) -> Vec<f64> {
     rms_of(&raw_rss(fitted, scale), &fitted.fit.count, scale)
+}
+
+/// The sign of the determinant of an n × n matrix, by rows, which it overwrites.
+fn determinant_sign(a: &mut [f64], n: usize) -> f64 {
+    let mut pivots = vec![0; n];
+    if !greybox_simulate::small::factor(a, &mut pivots, n) {
+        return 0.0;
+    }
+    let swaps = pivots.iter().enumerate().filter(|(i, p)| i != *p).count();
+    let product: f64 = (0..n).map(|i| a[i * n + i].signum()).product();
+    if swaps % 2 == 0 { product } else { -product }
 }
 
 fn calibrated_rss(calibrated: &Fitted, scale: &[f64]) -> f64 {

@@ -64,11 +64,8 @@ impl Uncertainty {
         let rows = setup.with_problem(&fitted.level, scale, |p| p.rows(&fitted.fit.point, true, None));
         let segments: Vec<Projected> = rows.into_iter().map(|rows| project(rows, nx)).collect();
         let mut h = gram(&segments, np);
-        let priors = setup.free.iter().map(|f| {
-            let known = f.std.is_finite() && f.std > 0.0;
-            if known { 1.0 / (f.std * f.std) } else { 0.0 }
-        });
-        let priors: Vec<f64> = priors.collect();
+        let at = &fitted.fit.point.parameters;
+        let priors: Vec<f64> = setup.free.iter().map(|f| f.prior.precision(at[f.index])).collect();
         priors.iter().enumerate().for_each(|(i, prior)| h[i * np + i] += prior);
         let inverse = inverse(&h, np);
         let (meat, freedom) = stationary(fitted, &segments, &priors);

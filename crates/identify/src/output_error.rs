@@ -9,7 +9,9 @@
 
 use std::sync::Arc;
 
-use greybox_calibrate::{Data, Fit, Free, Level, Limits, Point, Segment, SegmentRows, Setup, Work, qr};
+use greybox_calibrate::{
+    Data, Fit, Free, Level, Limits, Point, Prior, Segment, SegmentRows, Setup, Work, qr,
+};
 use rayon::prelude::*;
 
 use crate::choose::{Reduced, Roles};
@@ -66,7 +68,7 @@ pub(crate) fn setup(
                 (true, true) => (0.02 * p.value, 50.0 * p.value),
                 (true, false) => (50.0 * p.value, 0.02 * p.value),
             };
-            Free { index, mean: p.value, std: f64::INFINITY, lower, upper }
+            Free { index, prior: Prior::Flat, lower, upper }
         })
         .collect();
     let holds: Vec<greybox_model::Hold> = model.inputs.iter().map(|i| i.hold).collect();

@@ -38,7 +38,7 @@
 //! // What a diagnosis adds is the same language again.
 //! let friction = parse("fc*sign(theta')")?.expr;
 //! model.parameters.push(greybox_model::Parameter {
-//!     name: "fc".into(), value: 0.11, unit: None, std: None, fixed: false,
+//!     name: "fc".into(), value: 0.11, unit: None, std: None, fixed: false, positive: None,
 //! });
 //! model.add_term(0, friction);
 //! model.resolve_units()?;

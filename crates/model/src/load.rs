@@ -498,7 +498,7 @@ fn read_state(name: &str, value: &Spanned<DeValue<'_>>) -> Result<(State, bool),
 
 fn read_parameter(name: &str, value: &Spanned<DeValue<'_>>) -> Result<Parameter, Located> {
     let item = format!("parameter `{name}`");
-    let known = ["value", "unit", "std", "fixed"];
+    let known = ["value", "unit", "std", "fixed", "positive"];
     let shown = match value.get_ref() {
         DeValue::Integer(v) => v.as_str().to_owned(),
         DeValue::Float(v) => v.as_str().to_owned(),
@@ -524,8 +524,14 @@ fn read_parameter(name: &str, value: &Spanned<DeValue<'_>>) -> Result<Parameter,
         }
     };
     let fixed = boolean(table, "fixed", &item)?.unwrap_or(false);
+    let positive = boolean(table, "positive", &item)?;
     let value = quantity(factor, given, "value", &item)?;
-    Ok(Parameter { name: name.to_owned(), value, unit, std, fixed })
+    if positive == Some(true) && value <= 0.0 {
+        let message = format!("`positive = true`, and its value is {value}");
+        let help = "correct the value, or write `positive = false` if the parameter may have either sign";
+        return Err(bad(&item, message, given.span(), help));
+    }
+    Ok(Parameter { name: name.to_owned(), value, unit, std, fixed, positive })
 }
 
 /// Every name is declared, and primes stand on states only.

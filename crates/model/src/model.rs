@@ -78,6 +78,8 @@ pub struct Parameter {
     pub std: Option<f64>,
     /// Known exactly: calibration never moves it.
     pub fixed: bool,
+    /// Positive (`true`) or of either sign (`false`), if stated.
+    pub positive: Option<bool>,
 }
 
 /// `lhs = rhs`

@@ -316,6 +316,12 @@ fn write_parameter(old: Option<&Item>, parameter: &Parameter) -> Item {
         if table.get("fixed").and_then(Item::as_bool).unwrap_or(false) != parameter.fixed {
             set(table, "fixed", Value::from(parameter.fixed));
         }
+        match parameter.positive {
+            Some(positive) => set(table, "positive", Value::from(positive)),
+            None => {
+                table.remove("positive");
+            }
+        }
     })
 }
 

@@ -68,8 +68,14 @@ fn only_what_changed_is_rewritten() {
     model.name = "drive, improved".into();
     let fc = model.fresh_name("M");
     assert_eq!(fc, "M_2");
-    let parameter =
-        |name: &str, value| Parameter { name: name.into(), value, unit: None, std: None, fixed: false };
+    let parameter = |name: &str, value| Parameter {
+        name: name.into(),
+        value,
+        unit: None,
+        std: None,
+        fixed: false,
+        positive: None,
+    };
     model.parameters.push(parameter("fc", 20.123_456_7));
     model.add_term(0, parse("fc*sign(q')").unwrap().expr);
     model.measurements[0].expr = parse("q + so").unwrap().expr;
@@ -102,7 +108,8 @@ fn new_states_come_with_their_equations() {
     model.replace("u", 0, &Expr::var("ua"));
     let unit = model.inputs[0].unit.clone();
     model.states.push(State { name: "ua".into(), unit, order: 1, channel: None, initial: vec![] });
-    let ta = Parameter { name: "ta".into(), value: 0.01, unit: None, std: None, fixed: false };
+    let ta =
+        Parameter { name: "ta".into(), value: 0.01, unit: None, std: None, fixed: false, positive: None };
     model.parameters.push(ta);
     let lhs = parse("ta*ua' + ua").unwrap().expr;
     model.equations.push(Equation { name: "actuator".into(), lhs, rhs: Expr::var("u") });
@@ -145,6 +152,7 @@ fn all_layouts_of_toml_are_kept() {
         unit: None,
         std: Some(1.0),
         fixed: false,
+        positive: None,
     });
     model.add_term(0, parse("-c").unwrap().expr);
     model.resolve_units().unwrap();

@@ -8,6 +8,9 @@ use std::ops::Range;
 /// Largest departure of a time from the uniform grid, in steps, at which the rows are taken as they are.
 const JITTER_LIMIT: f64 = 0.01;
 
+/// Departure of the mean step from the median one, in steps, from which a log has several rates.
+const SEVERAL_RATES: f64 = 0.1;
+
 /// The uniform grid behind the times of a recording.
 #[derive(Debug, Clone, PartialEq)]
 pub(crate) struct Grid {
@@ -59,7 +62,9 @@ pub(crate) fn find(time: &[f64], resolution: f64) -> Grid {
         }
     }
     stretches.push(first..time.len());
-    let dt = pooled_slope(time, &stretches);
+    // Of a log with several rates no line is a fit: most rows decide.
+    let slope = pooled_slope(time, &stretches);
+    let dt = if (slope / middle - 1.0).abs() > SEVERAL_RATES && !coarse_clock { middle } else { slope };
     Grid { dt: tidy(dt, time.len()), stretches, rounding }
 }
 
@@ -107,31 +112,50 @@ fn tidy(dt: f64, n: usize) -> f64 {
         .unwrap_or(dt)
 }
 
-/// Cuts the channels into pieces on the grid and says what had to be mended.
+/// A gap longer than this share of the recording splits it: what the machine did meanwhile is anyone's guess.
+const LONGEST_GAP: f64 = 0.1;
+/// Most grid points for each row; beyond, the longest gaps split the recording.
+const MOST_POINTS: f64 = 64.0;
+
+/// Lays the channels on the grid and says what had to be mended. Rows that are left out are the same as rows with empty
+/// cells: the grid goes on, without a value. Only long gaps split the recording.
 pub(crate) fn pieces(grid: &Grid, time: &[f64], channels: &[Channel]) -> (Vec<Piece>, Vec<Finding>) {
+    let parts = parts(grid, time, channels);
+    let grid = &Grid { dt: over_gaps(grid, time, &parts), ..grid.clone() };
     let dt = grid.dt;
     let (mut pieces, mut warnings) = (Vec::new(), Vec::new());
     let mut worst = 0.0f64;
     let mut resampled_rows = 0;
     let (mut short, mut short_rows) = (Vec::new(), 0);
 
-    for rows in &grid.stretches {
-        if rows.len() < MIN_SAMPLES {
+    for rows in &parts {
+        let observed = |row: &usize| channels.iter().any(|c| !c.values[*row].is_nan());
+        if rows.len() < MIN_SAMPLES || rows.clone().filter(observed).count() < MIN_SAMPLES {
             short.push(rows.clone());
             short_rows += rows.len();
             continue;
         }
-        let apart = departure(time, rows, dt);
+        let places = places(grid, time, rows);
+        let apart = apart(time, rows, &places, dt);
         let resampled = apart > grid.rounding + JITTER_LIMIT * dt;
         let (len, columns) = if resampled {
             worst = worst.max(apart / dt);
             resampled_rows += rows.len();
             let times = &time[rows.clone()];
             let len = ((times[times.len() - 1] - times[0]) / dt + 1e-6).floor() as usize + 1;
-            let on_grid = |channel: &Channel| resample(times, &channel.values[rows.clone()], dt, len);
+            let ends = stretches_within(grid, rows);
+            let on_grid = |channel: &Channel| resample(times, &channel.values[rows.clone()], &ends, dt, len);
             (len, channels.iter().map(on_grid).collect())
         } else {
-            (rows.len(), channels.iter().map(|channel| channel.values[rows.clone()].to_vec()).collect())
+            let len = places.last().map_or(0, |last| last + 1);
+            let laid_out = |channel: &Channel| {
+                let mut column = vec![f64::NAN; len];
+                for (place, value) in places.iter().zip(&channel.values[rows.clone()]) {
+                    column[*place] = *value;
+                }
+                column
+            };
+            (len, channels.iter().map(laid_out).collect())
         };
         if len < MIN_SAMPLES {
             short.push(rows.clone());
@@ -176,18 +200,28 @@ pub(crate) fn pieces(grid: &Grid, time: &[f64], channels: &[Channel]) -> (Vec<Pi
         if holes.len() > 3 {
             places.push(format!("{} more", holes.len() - 3));
         }
+        let (split, mend) = match parts.len() {
+            1 => (
+                "they count as rows with empty cells".to_owned(),
+                "What an input did there follows its `hold`; record without dropped samples if it did otherwise.",
+            ),
+            n => (
+                format!("the recording is split into {n} pieces at the longest"),
+                "Each piece gets its own initial state; record without dropped samples for the full power.",
+            ),
+        };
         warnings.push(
             Finding::new(
                 Severity::Warning,
                 "gap",
                 format!(
-                    "About {} rows are missing in {} ({}); the recording is split there.",
+                    "About {} rows are missing in {} ({}); {split}.",
                     number(missing),
                     if holes.len() == 1 { "one gap".to_owned() } else { format!("{} gaps", holes.len()) },
                     places.join("; ")
                 ),
             )
-            .mend("Each piece gets its own initial state; record without dropped samples for the full power.")
+            .mend(mend)
             .value(missing, None),
         );
     }
@@ -209,26 +243,141 @@ pub(crate) fn pieces(grid: &Grid, time: &[f64], channels: &[Channel]) -> (Vec<Pi
     (pieces, warnings)
 }
 
-/// Linear interpolation onto `times[0] + k dt`; NaN where a neighbour that counts is missing.
-fn resample(times: &[f64], values: &[f64], dt: f64, len: usize) -> Vec<f64> {
-    let mut right = 1;
-    (0..len)
-        .map(|k| {
-            let t = times[0] + k as f64 * dt;
-            while right + 1 < times.len() && times[right] < t {
+/// The rows of each piece: the recording is split at gaps longer than [`LONGEST_GAP`] of it, whether rows are left out or
+/// hold no value, and at its longest gaps where the grid would have more than [`MOST_POINTS`] points for each row.
+fn parts(grid: &Grid, time: &[f64], channels: &[Channel]) -> Vec<Range<usize>> {
+    let observed: Vec<usize> =
+        (0..time.len()).filter(|&row| channels.iter().any(|c| !c.values[row].is_nan())).collect();
+    let (Some(&first), Some(&last)) = (observed.first(), observed.last()) else {
+        return vec![0..time.len()];
+    };
+    let span = time[last] - time[first];
+    let longest_step = 1.5 * grid.dt;
+    // Rows before and after each gap, longest gap first.
+    let mut gaps: Vec<(usize, usize)> = observed
+        .windows(2)
+        .map(|w| (w[0], w[1]))
+        .filter(|(a, b)| time[*b] - time[*a] > longest_step)
+        .collect();
+    gaps.sort_by(|x, y| (time[y.1] - time[y.0]).total_cmp(&(time[x.1] - time[x.0])));
+    let mut points = span / grid.dt;
+    let mut cuts = Vec::new();
+    for (a, b) in gaps {
+        let length = time[b] - time[a];
+        if length <= LONGEST_GAP * span && points <= MOST_POINTS * observed.len() as f64 {
+            break;
+        }
+        points -= length / grid.dt;
+        cuts.push((a, b));
+    }
+    cuts.sort_unstable();
+    let mut parts = Vec::new();
+    let mut from = 0;
+    for (a, b) in cuts {
+        parts.push(from..a + 1);
+        from = b;
+    }
+    parts.push(from..time.len());
+    parts
+}
+
+/// The step that also fits the gaps of a recording in one part: short stretches alone do not give it to many digits.
+fn over_gaps(grid: &Grid, time: &[f64], parts: &[Range<usize>]) -> f64 {
+    let [rows] = parts else { return grid.dt };
+    if grid.stretches.len() < 2 {
+        return grid.dt;
+    }
+    let places = places(grid, time, rows);
+    let n = places.len() as f64;
+    let middle = places.iter().map(|p| *p as f64).sum::<f64>() / n;
+    let (mut above, mut below) = (0.0, 0.0);
+    for (place, t) in places.iter().zip(&time[rows.clone()]) {
+        let x = *place as f64 - middle;
+        above += x * (t - time[rows.start] - *place as f64 * grid.dt);
+        below += x * x;
+    }
+    let dt = grid.dt + if below > 0.0 { above / below } else { 0.0 };
+    // Rows off the grid make it no better.
+    let fits = |dt: f64| apart(time, rows, &places, dt);
+    if fits(dt) < fits(grid.dt) && fits(dt) <= grid.rounding + JITTER_LIMIT * dt {
+        tidy(dt, places.last().map_or(0, |last| last + 1))
+    } else {
+        grid.dt
+    }
+}
+
+/// The stretches within these rows, counted from the first of them.
+fn stretches_within(grid: &Grid, rows: &Range<usize>) -> Vec<Range<usize>> {
+    grid.stretches
+        .iter()
+        .map(|s| s.start.max(rows.start)..s.end.min(rows.end))
+        .filter(|s| s.start < s.end)
+        .map(|s| s.start - rows.start..s.end - rows.start)
+        .collect()
+}
+
+/// The grid point of each of these rows: within a stretch one after the other, and over a gap as many further as its
+/// length holds steps.
+fn places(grid: &Grid, time: &[f64], rows: &Range<usize>) -> Vec<usize> {
+    let mut places = Vec::with_capacity(rows.len());
+    for stretch in stretches_within(grid, rows) {
+        let first = match places.last() {
+            None => 0,
+            Some(&before) => {
+                let gap = time[rows.start + stretch.start] - time[rows.start + stretch.start - 1];
+                before + ((gap / grid.dt).round() as usize).max(1)
+            }
+        };
+        places.extend((0..stretch.len()).map(|k| first + k));
+    }
+    places
+}
+
+/// Largest distance of the times from the grid that halves the extremes, s.
+fn apart(time: &[f64], rows: &Range<usize>, places: &[usize], dt: f64) -> f64 {
+    let origin = time[rows.start];
+    let (low, high) = time[rows.clone()]
+        .iter()
+        .zip(places)
+        .map(|(t, place)| t - origin - *place as f64 * dt)
+        .fold((f64::INFINITY, f64::NEG_INFINITY), |(low, high), e| (low.min(e), high.max(e)));
+    0.5 * (high - low)
+}
+
+/// Linear interpolation onto `times[0] + k dt` within the `stretches`; NaN in gaps, and where a neighbour that counts is
+/// missing. The ends of a stretch, which no point of the grid may meet, stand at the nearest one.
+fn resample(times: &[f64], values: &[f64], stretches: &[Range<usize>], dt: f64, len: usize) -> Vec<f64> {
+    let mut out = vec![f64::NAN; len];
+    for stretch in stretches {
+        let (t, v) = (&times[stretch.clone()], &values[stretch.clone()]);
+        let place = |t: f64| (t - times[0]) / dt;
+        let from = (place(t[0]) - 1e-6).ceil().max(0.0) as usize;
+        let to = ((place(t[t.len() - 1]) + 1e-6).floor() as usize + 1).min(len);
+        let mut right = 1.min(t.len() - 1);
+        for (k, cell) in out.iter_mut().enumerate().take(to).skip(from) {
+            let at = times[0] + k as f64 * dt;
+            while right + 1 < t.len() && t[right] < at {
                 right += 1;
             }
-            let (t0, t1) = (times[right - 1], times[right]);
-            let share = ((t - t0) / (t1 - t0)).clamp(0.0, 1.0);
-            if share < 1e-6 {
-                values[right - 1]
+            let left = right.saturating_sub(1);
+            let step = t[right] - t[left];
+            let share = if step > 0.0 { ((at - t[left]) / step).clamp(0.0, 1.0) } else { 1.0 };
+            *cell = if share < 1e-6 {
+                v[left]
             } else if share > 1.0 - 1e-6 {
-                values[right]
+                v[right]
             } else {
-                (1.0 - share) * values[right - 1] + share * values[right]
+                (1.0 - share) * v[left] + share * v[right]
+            };
+        }
+        for end in [0, t.len() - 1] {
+            let nearest = (place(t[end]).round().max(0.0) as usize).min(len - 1);
+            if out[nearest].is_nan() {
+                out[nearest] = v[end];
             }
-        })
-        .collect()
+        }
+    }
+    out
 }
 
 #[cfg(test)]

@@ -122,6 +122,25 @@ pub fn fill_missing(u: &[f64]) -> Vec<f64> {
     full
 }
 
+/// Fills missing samples (NaN) with the sample before, and the first ones with the first sample there is. A signal with no
+/// sample at all is returned as it is.
+///
+/// ```
+/// use greybox_recording::interpolate::hold_missing;
+/// let nan = f64::NAN;
+/// assert_eq!(hold_missing(&[nan, 1.0, nan, 4.0]), [1.0, 1.0, 1.0, 4.0]);
+/// ```
+pub fn hold_missing(u: &[f64]) -> Vec<f64> {
+    let mut last = u.iter().copied().find(|v| !v.is_nan()).unwrap_or(f64::NAN);
+    let held = u.iter().map(|&v| {
+        if !v.is_nan() {
+            last = v;
+        }
+        last
+    });
+    held.collect()
+}
+
 #[cfg(test)]
 mod tests {
     use super::*;

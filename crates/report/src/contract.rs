@@ -39,9 +39,16 @@ pub struct Report {
     /// The conclusion in plain language, one sentence per entry, most important first.
     #[serde(default)]
     pub summary: Vec<String>,
+    /// What the improved model rests on.
+    #[serde(default)]
+    pub basis: Basis,
     /// What the model leaves out, sorted by `share_explained`, largest first. Empty unless the verdict is
     /// `missing_physics`.
     pub mechanisms: Vec<Mechanism>,
+    /// What the improved model holds although it is not believed to be what is missing: it predicts recordings that it
+    /// was not fitted to. Sorted by `share_explained`; empty unless `basis` is `proposed`.
+    #[serde(default, skip_serializing_if = "Vec::is_empty")]
+    pub candidates: Vec<Mechanism>,
     /// What fewer of several mechanisms would leave: none, each alone, all but one, all. Empty where there is one, or
     /// none.
     #[serde(default, skip_serializing_if = "Vec::is_empty")]
@@ -102,6 +109,19 @@ pub enum Verdict {
     MissingPhysics,
     /// Something is missing, located and sized, but nothing in the library explains it.
     Unexplained,
+}
+
+/// What the improved model rests on. It is the best simulation that can be defended, whatever the verdict.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default, Serialize, Deserialize, JsonSchema)]
+#[serde(rename_all = "snake_case")]
+pub enum Basis {
+    /// The mechanisms listed, which are believed.
+    Named,
+    /// The candidates listed, which are not.
+    Proposed,
+    /// The given equations with refitted parameters.
+    #[default]
+    Calibrated,
 }
 
 /// Some of the mechanisms, and how well the model does with these alone.
@@ -350,12 +370,27 @@ pub struct Fit {
     /// Length in s after which the windowed simulations restart from the estimated state.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub window_s: Option<f64>,
+    /// Which figure judges the models: `nrmse`, or `nrmse_windowed` where a small error of the initial state grows
+    /// beyond the signal within a free run.
+    #[serde(default)]
+    pub criterion: Criterion,
     /// Where the held-out data came from, in plain language.
     #[serde(default)]
     pub holdout_source: String,
     /// The same by recording, by file name.
     #[serde(default, skip_serializing_if = "Ordered::is_empty")]
     pub recordings: Ordered<RecordingFit>,
+}
+
+/// Which figure judges a simulation.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default, Serialize, Deserialize, JsonSchema)]
+#[serde(rename_all = "snake_case")]
+pub enum Criterion {
+    /// `nrmse` of the simulation over the whole recording.
+    #[default]
+    FreeRun,
+    /// `nrmse_windowed`: the machine is unstable, chaotic or integrates.
+    Windowed,
 }
 
 impl Fit {

@@ -5,7 +5,9 @@ pub mod control;
 pub mod identification;
 
 use greybox_calibrate::{Data, FreeRun};
-use greybox_diagnose::diagnosis::{Estimate as Estimated, Finding as Found, Role as RoleRuns, Run};
+use greybox_diagnose::diagnosis::{
+    Basis as Ground, Estimate as Estimated, Finding as Found, Role as RoleRuns, Run,
+};
 use greybox_diagnose::locate::{Location as Located, spectrum};
 use greybox_diagnose::{Calibration, Diagnosis, Verdict as Answer};
 use greybox_model::{Dimension, Model, Unit, WriteOptions};
@@ -13,7 +15,7 @@ use greybox_recording::{Correlation, Recording, Severity as Level, health};
 
 use crate::contract::*;
 use crate::page::{self, Lagged, MechanismPlot, ModelTexts, Page, Residual, Spectrum, StateMap};
-use crate::suggest::{self, Basis, InputRange, Subject};
+use crate::suggest::{self, InputRange, Reach, Subject};
 
 /// What the conversion needs beside the diagnosis.
 pub struct Sources<'a> {
@@ -30,8 +32,8 @@ pub struct Sources<'a> {
 /// The contract's report.
 pub fn report(diagnosis: &Diagnosis, sources: &Sources<'_>) -> Report {
     let d = diagnosis;
-    let basis = basis(d);
-    let plan = remainder_plan(d, &basis);
+    let reach = reach(d);
+    let plan = remainder_plan(d, &reach);
     let mut report = Report {
         greybox: Producer { version: env!("CARGO_PKG_VERSION").to_string(), seed: d.seed },
         model: ModelId { name: d.nominal.name.clone(), file: sources.model_file.to_string() },
@@ -42,7 +44,13 @@ pub fn report(diagnosis: &Diagnosis, sources: &Sources<'_>) -> Report {
             Answer::Unexplained => Verdict::Unexplained,
         },
         summary: Vec::new(),
-        mechanisms: d.mechanisms.iter().map(|m| mechanism(m, &d.improved, &basis)).collect(),
+        basis: match d.basis {
+            Ground::Named => Basis::Named,
+            Ground::Proposed => Basis::Proposed,
+            Ground::Calibrated => Basis::Calibrated,
+        },
+        mechanisms: d.mechanisms.iter().map(|m| mechanism(m, &d.improved, &reach)).collect(),
+        candidates: d.candidates.iter().map(|m| mechanism(m, &d.improved, &reach)).collect(),
         subsets: d
             .subsets
             .iter()
@@ -94,7 +102,7 @@ fn equation_names(list: &[String]) -> Names {
 }
 
 /// What the training recordings reach.
-fn basis(d: &Diagnosis) -> Basis {
+fn reach(d: &Diagnosis) -> Reach {
     let data = &d.train.data;
     let inputs = d.nominal.inputs.iter().enumerate().map(|(u, input)| {
         let values = || data.pieces.iter().filter_map(move |p| p.inputs.get(u)).flatten();
@@ -120,7 +128,7 @@ fn basis(d: &Diagnosis) -> Basis {
         }
         first += state.order;
     }
-    Basis { inputs: inputs.collect(), coordinates, dt: data.pieces.iter().map(|p| p.dt).fold(0.0, f64::max) }
+    Reach { inputs: inputs.collect(), coordinates, dt: data.pieces.iter().map(|p| p.dt).fold(0.0, f64::max) }
 }
 
 /// The input that stands in the first of these equations that has one.
@@ -131,14 +139,14 @@ fn reaching<'a>(model: &'a Model, equations: &[String]) -> Option<&'a str> {
     })
 }
 
-fn remainder_plan(d: &Diagnosis, basis: &Basis) -> Option<Experiment> {
+fn remainder_plan(d: &Diagnosis, reach: &Reach) -> Option<Experiment> {
     let shape = d.remainder.shape.as_ref()?;
     let input = reaching(&d.nominal, &d.remainder.location.equations);
-    Some(suggest::for_remainder(&location(&d.remainder.location, &d.nominal), input, basis, shape))
+    Some(suggest::for_remainder(&location(&d.remainder.location, &d.nominal), input, reach, shape))
 }
 
 /// The experiment that separates a mechanism from its alternatives, if it has any.
-fn plan(found: &Found, improved: &Model, basis: &Basis) -> Option<Experiment> {
+fn plan(found: &Found, improved: &Model, reach: &Reach) -> Option<Experiment> {
     let told = found.alternatives.iter().find(|a| !a.separate.is_empty());
     let rival = told.or(found.alternatives.first())?;
     let value = |name: &str| {
@@ -165,7 +173,7 @@ fn plan(found: &Found, improved: &Model, basis: &Basis) -> Option<Experiment> {
             value: &scaled,
             separate: &rival.separate,
         },
-        basis,
+        reach,
     ))
 }
 
@@ -213,7 +221,7 @@ fn figure_unit(name: &str) -> &'static str {
     }
 }
 
-fn mechanism(found: &Found, improved: &Model, basis: &Basis) -> Mechanism {
+fn mechanism(found: &Found, improved: &Model, reach: &Reach) -> Mechanism {
     let figures =
         found.figures.iter().map(|(name, e)| (name.clone(), estimate(e, figure_unit(name).to_owned())));
     Mechanism {
@@ -251,7 +259,7 @@ fn mechanism(found: &Found, improved: &Model, basis: &Basis) -> Mechanism {
                 separate: (!a.separate.is_empty()).then(|| a.separate.clone()),
             })
             .collect(),
-        experiment: plan(found, improved, basis),
+        experiment: plan(found, improved, reach),
         location: location(&found.location, improved),
     }
 }
@@ -322,6 +330,14 @@ fn fit_set(role: &RoleRuns, of: impl Fn(&Run) -> Vec<greybox_calibrate::Score>) 
     }
 }
 
+/// The figure that judges simulations, in the contract's words.
+pub fn criterion(of: greybox_calibrate::Criterion) -> Criterion {
+    match of {
+        greybox_calibrate::Criterion::FreeRun => Criterion::FreeRun,
+        greybox_calibrate::Criterion::Windowed => Criterion::Windowed,
+    }
+}
+
 fn fit(d: &Diagnosis) -> Fit {
     let mut recordings: Ordered<RecordingFit> = Ordered::new();
     for (r, name) in d.train.data.recordings.iter().enumerate() {
@@ -336,6 +352,7 @@ fn fit(d: &Diagnosis) -> Fit {
         train: fit_set(&d.train, |run| run.scores.clone()),
         holdout: fit_set(&d.holdout, |run| run.scores.clone()),
         window_s: Some(d.window),
+        criterion: criterion(d.criterion),
         holdout_source: d.holdout_source.clone(),
         recordings,
     }
@@ -373,6 +390,20 @@ fn findings(d: &Diagnosis, sources: &Sources<'_>) -> Vec<Finding> {
                       explanations were not all tried"
                 .to_string(),
             mend: Some("give it more with `--work`, or a shorter recording".to_string()),
+        });
+    }
+    for &c in &d.unknown_noise {
+        let channel = &d.train.data.channels[c].name;
+        out.push(Finding {
+            severity: Severity::Info,
+            code: "noise".to_string(),
+            recording: None,
+            channel: Some(channel.clone()),
+            message: format!(
+                "the noise of `{channel}` is not known: the fast differences of the recording hold more than noise, \
+                 and the noise floor is what the best model leaves"
+            ),
+            mend: Some("record the channel at rest, or sample it faster".to_string()),
         });
     }
     out.extend(health_findings(&d.nominal, sources.train.iter().chain(sources.holdout)));
@@ -749,8 +780,8 @@ mod tests {
                     g = { value = 9.81, unit = \"m/s^2\" }\n[equations]\nfall = \"z'' = u - g\"\n";
         let model = Model::from_toml(text, "fall.toml").unwrap();
         let inputs = vec![InputRange { name: "u".into(), unit: "m/s^2".into(), rms: 0.5, largest: 1.0 }];
-        let basis = Basis { inputs, dt: 0.01, ..Basis::default() };
-        let told = mechanism(&found, &model, &basis);
+        let reach = Reach { inputs, dt: 0.01, ..Reach::default() };
+        let told = mechanism(&found, &model, &reach);
         assert_eq!(told.drifting.as_deref(), Some("g"));
         let units: Vec<(&str, &str)> =
             told.parameters.iter().map(|(n, e)| (n.as_str(), e.unit.as_str())).collect();

@@ -250,6 +250,8 @@ struct View {
     equations: Vec<EquationView>,
     shares: Vec<ShareView>,
     mechanisms: Vec<MechanismView>,
+    /// What the improved model holds without being believed: title, place, law.
+    candidates: Vec<(String, String, String)>,
     /// Which mechanisms, how many, and what is left with these alone.
     subsets: Vec<[String; 3]>,
     remainder: RemainderView,
@@ -436,6 +438,11 @@ impl View {
                 .iter()
                 .enumerate()
                 .map(|(index, mechanism)| mechanism_view(page, index, mechanism))
+                .collect(),
+            candidates: report
+                .candidates
+                .iter()
+                .map(|m| (format::kind(&m.kind), placed(m), law_html(m)))
                 .collect(),
             subsets: subsets(report),
             remainder: remainder_view(page),
@@ -1043,19 +1050,28 @@ fn rms(values: &[f64]) -> f64 {
 
 // -- mechanisms -------------------------------------------------------------------------------------------
 
-fn mechanism_view(page: &Page, index: usize, mechanism: &Mechanism) -> MechanismView {
+/// Where a mechanism acts, in words.
+fn placed(mechanism: &Mechanism) -> String {
     let place = match &mechanism.channel {
         Some(channel) => format!("in the measurement of {}", expression::text(channel)),
         None => sentence::equations(&mechanism.equation).trim_start().to_owned(),
     };
-    let place = match &mechanism.drifting {
+    match &mechanism.drifting {
         Some(parameter) => format!("of {} {place}", expression::text(parameter)),
         None => place,
-    };
-    let mut expression_html = expression::html(&mechanism.expression);
-    if let Some(replaced) = &mechanism.replaces {
-        expression_html = format!("{} → {expression_html}", expression::html(replaced));
     }
+}
+
+/// Its law, with what it replaces.
+fn law_html(mechanism: &Mechanism) -> String {
+    let law = expression::html(&mechanism.expression);
+    match &mechanism.replaces {
+        Some(replaced) => format!("{} → {law}", expression::html(replaced)),
+        None => law,
+    }
+}
+
+fn mechanism_view(page: &Page, index: usize, mechanism: &Mechanism) -> MechanismView {
     let parameters = mechanism.parameters.iter().map(|(name, estimate)| {
         [
             expression::html(name),
@@ -1073,8 +1089,8 @@ fn mechanism_view(page: &Page, index: usize, mechanism: &Mechanism) -> Mechanism
     });
     MechanismView {
         title: format::kind(&mechanism.kind),
-        place,
-        expression_html,
+        place: placed(mechanism),
+        expression_html: law_html(mechanism),
         states_html: mechanism.states.values().map(|equation| expression::html(equation)).collect(),
         share: format::probability(mechanism.share_explained),
         confidence: format::probability(mechanism.confidence),

@@ -6,7 +6,7 @@ pub mod control;
 pub mod identified;
 pub mod recordings;
 
-use crate::contract::{Fit, FitSet, Interval, Location, Mechanism, Names, Report, Verdict};
+use crate::contract::{Criterion, Fit, Interval, Location, Mechanism, Names, Report, Score, Verdict};
 use crate::{expression, format};
 
 /// Forces of free shape that explain less of the residual than this explain nothing.
@@ -28,7 +28,7 @@ pub fn summary(report: &Report) -> Vec<String> {
                  measurement noise is missing."
                     .to_owned(),
             );
-            out.extend(error_change(&report.fit.holdout, Baseline::Nominal).map(|change| {
+            out.extend(error_change(&report.fit, Baseline::Nominal).map(|change| {
                 format!(
                     "Calibration changes the held-out error{} from {} to {}.",
                     change.of, change.from, change.to
@@ -50,6 +50,7 @@ pub fn summary(report: &Report) -> Vec<String> {
                      makes up {share} of the residual."
                 )
             });
+            out.extend(proposed(report));
             out.extend(
                 report
                     .remainder
@@ -67,6 +68,13 @@ pub fn summary(report: &Report) -> Vec<String> {
             format::probability(report.remainder.share_of_residual)
         ));
     }
+    if let (Criterion::Windowed, Some(window)) = (report.fit.criterion, report.fit.window_s) {
+        out.push(format!(
+            "Small errors of the initial state grow beyond the signal within a free run of this machine: simulations \
+             restarted every {} s judge the models.",
+            format::significant(window, 3)
+        ));
+    }
     for (name, hold) in &report.inputs {
         if hold.hold_given != hold.hold_best {
             out.push(format!(
@@ -80,8 +88,30 @@ pub fn summary(report: &Report) -> Vec<String> {
     out
 }
 
+/// What the improved model holds where no name is believed.
+fn proposed(report: &Report) -> Vec<String> {
+    if report.candidates.is_empty() {
+        return Vec::new();
+    }
+    let laws: Vec<String> = report
+        .candidates
+        .iter()
+        .map(|c| format!("{} ({})", format::kind_in_sentence(&c.kind), expression::text(&c.expression)))
+        .collect();
+    let change = error_change(&report.fit, Baseline::Calibrated)
+        .map(|c| format!(": the held-out error{} falls from {} to {}", c.of, c.from, c.to))
+        .unwrap_or_default();
+    let mut out = vec![format!(
+        "The improved model has {} in its stead and predicts what it was not fitted to better than the calibrated \
+         one{change}. What is missing may be something else.",
+        joined(&laws, "and")
+    )];
+    out.extend(losses(&report.fit));
+    out
+}
+
 fn missing(report: &Report, out: &mut Vec<String>) {
-    let change = error_change(&report.fit.holdout, Baseline::Calibrated);
+    let change = error_change(&report.fit, Baseline::Calibrated);
     let single = report.mechanisms.len() == 1;
     for mechanism in &report.mechanisms {
         let mut sentence = mechanism_sentence(mechanism);
@@ -225,16 +255,21 @@ struct Change {
     to: String,
 }
 
-/// The channel whose free-run error changes most, from the baseline to the final model. Without a usable
+/// The channel whose error changes most, from the baseline to the final model. Without a usable
 /// improved fit the calibrated model is the final one.
-fn error_change(fit: &FitSet, baseline: Baseline) -> Option<Change> {
+fn error_change(fit: &Fit, baseline: Baseline) -> Option<Change> {
+    let set = &fit.holdout;
     let (before, after) = match baseline {
-        Baseline::Nominal => (&fit.nominal, &fit.calibrated),
-        Baseline::Calibrated => (&fit.calibrated, &fit.improved),
+        Baseline::Nominal => (&set.nominal, &set.calibrated),
+        Baseline::Calibrated => (&set.calibrated, &set.improved),
+    };
+    let error = |score: &Score| match fit.criterion {
+        Criterion::FreeRun => Some(score.nrmse),
+        Criterion::Windowed => score.nrmse_windowed,
     };
     let pairs = before.iter().filter_map(|(channel, from)| {
-        let to = after.get(channel)?;
-        (from.nrmse.is_finite() && to.nrmse.is_finite()).then_some((channel, from.nrmse, to.nrmse))
+        let (from, to) = (error(from)?, error(after.get(channel)?)?);
+        (from.is_finite() && to.is_finite()).then_some((channel, from, to))
     });
     let best = pairs.max_by(|a, b| (a.1 - a.2).total_cmp(&(b.1 - b.2)))?;
     if baseline == Baseline::Calibrated && best.2 >= best.1 {
@@ -250,7 +285,11 @@ fn losses(fit: &Fit) -> impl Iterator<Item = String> + '_ {
     let several = before.len() > 1;
     before.iter().filter_map(move |(channel, from)| {
         let to = fit.holdout.improved.get(channel)?;
-        if to.nrmse.is_nan() || to.nrmse <= LOSS * from.nrmse {
+        let judged = match fit.criterion {
+            Criterion::FreeRun => (from.nrmse, to.nrmse),
+            Criterion::Windowed => (from.nrmse_windowed.unwrap_or(f64::NAN), to.nrmse_windowed.unwrap_or(f64::NAN)),
+        };
+        if judged.1.is_nan() || judged.1 <= LOSS * judged.0 {
             return None;
         }
         let of = if several { format!(" of {}", expression::text(channel)) } else { String::new() };

@@ -1,7 +1,7 @@
 //! The experiment that separates an explanation from its rivals: which input, how large, at which
 //! frequencies, over which part of the state space.
 //!
-//! Every number is read off the recordings ([`Basis`]) or off the law that was found; a figure that neither
+//! Every number is read off the recordings ([`Reach`]) or off the law that was found; a figure that neither
 //! gives is left out.
 
 use std::f64::consts::PI;
@@ -14,7 +14,7 @@ const LOUDER: f64 = 1.5;
 
 /// What the present recordings reach.
 #[derive(Debug, Clone, PartialEq, Default)]
-pub struct Basis {
+pub struct Reach {
     /// Each input of the model with its unit, and its RMS and largest magnitude in that unit.
     pub inputs: Vec<InputRange>,
     /// Range of each simulated coordinate, in the units of [`Location::region`].
@@ -23,7 +23,7 @@ pub struct Basis {
     pub dt: f64,
 }
 
-impl Basis {
+impl Reach {
     /// The input of this name, else the only one.
     fn input(&self, name: Option<&str>) -> Option<&InputRange> {
         let only = || self.inputs.first().filter(|_| self.inputs.len() == 1);
@@ -125,8 +125,8 @@ fn way_of(kind: &str, subject: &Subject<'_>) -> Way {
 }
 
 /// The experiment for a mechanism.
-pub fn experiment(subject: &Subject<'_>, basis: &Basis) -> Experiment {
-    let input = basis.input(subject.input);
+pub fn experiment(subject: &Subject<'_>, reach: &Reach) -> Experiment {
+    let input = reach.input(subject.input);
     let way = way(subject);
     let largest = input.map_or(0.0, |i| i.largest);
     let amplitude = match way {
@@ -141,8 +141,8 @@ pub fn experiment(subject: &Subject<'_>, basis: &Basis) -> Experiment {
     // Time is not for the experimenter to pass through; with the input at zero nothing else is either.
     let region = subject.location.region.iter().next().filter(|(name, _)| *name != "t" && way != Way::Silent);
     let band = match way {
-        Way::Slow => slow_band(region, basis),
-        Way::Around(f) => decade(f, basis),
+        Way::Slow => slow_band(region, reach),
+        Way::Around(f) => decade(f, reach),
         Way::Loud | Way::AsNow => subject.location.band_hz.map(|b| [b.low, b.high]),
         Way::Wide | Way::Silent | Way::Again | Way::Ramp(_) | Way::Beyond(_) => None,
     };
@@ -160,13 +160,13 @@ pub fn experiment(subject: &Subject<'_>, basis: &Basis) -> Experiment {
 }
 
 /// The experiment for a remainder without a name: the recordings again, louder.
-pub fn for_remainder(location: &Location, input: Option<&str>, basis: &Basis, shape: &str) -> Experiment {
+pub fn for_remainder(location: &Location, input: Option<&str>, reach: &Reach, shape: &str) -> Experiment {
     let separate = format!(
         "the residual looks like {shape}: slow sweeps over the whole range of that variable, at two amplitudes"
     );
     let subject = Subject { kind: "", rival: "", input, location, value: &|_| None, separate: &separate };
-    let input = basis.input(subject.input);
-    let mut found = experiment(&subject, basis);
+    let input = reach.input(subject.input);
+    let mut found = experiment(&subject, reach);
     found.amplitude = input.and_then(|i| interval([i.largest, LOUDER * i.largest]));
     found.text = words(Way::Loud, &found, input, "", &separate);
     found
@@ -178,9 +178,9 @@ fn interval([low, high]: [f64; 2]) -> Option<Interval> {
 
 /// Up to where a sine over the present range would leave the region of rates: a sine of amplitude A and
 /// frequency f has the largest rate 2π f A. Nothing without such a region.
-fn slow_band(region: Option<(&String, &[Option<f64>; 2])>, basis: &Basis) -> Option<[f64; 2]> {
+fn slow_band(region: Option<(&String, &[Option<f64>; 2])>, reach: &Reach) -> Option<[f64; 2]> {
     let (name, [low, high]) = region?;
-    let range = basis.coordinates.get(name.strip_suffix('\'')?)?;
+    let range = reach.coordinates.get(name.strip_suffix('\'')?)?;
     let rate = match (low, high) {
         (Some(low), Some(high)) => low.abs().max(high.abs()),
         _ => return None,
@@ -190,9 +190,9 @@ fn slow_band(region: Option<(&String, &[Option<f64>; 2])>, basis: &Basis) -> Opt
 }
 
 /// The decade around a frequency, as far as the sample interval shows it.
-fn decade(frequency: f64, basis: &Basis) -> Option<[f64; 2]> {
+fn decade(frequency: f64, reach: &Reach) -> Option<[f64; 2]> {
     let half = 10f64.sqrt();
-    let nyquist = 0.5 / basis.dt;
+    let nyquist = 0.5 / reach.dt;
     let band = [frequency / half, (frequency * half).min(nyquist)];
     (band[0] < band[1]).then_some(band)
 }
@@ -245,8 +245,8 @@ fn words(way: Way, e: &Experiment, input: Option<&InputRange>, unit: &str, separ
 mod tests {
     use super::*;
 
-    fn basis() -> Basis {
-        Basis {
+    fn reach() -> Reach {
+        Reach {
             inputs: vec![InputRange { name: "v".into(), unit: "V".into(), rms: 1.0, largest: 2.0 }],
             coordinates: Ordered::from_iter([("theta".to_owned(), [-0.5, 0.5])]),
             dt: 0.01,
@@ -266,7 +266,7 @@ mod tests {
                 value: &value,
                 separate: "look.",
             },
-            &basis(),
+            &reach(),
         )
     }
 
@@ -312,7 +312,7 @@ mod tests {
 
     #[test]
     fn the_rival_says_what_to_do() {
-        let (location, b) = (Location::default(), basis());
+        let (location, b) = (Location::default(), reach());
         let subject = |kind, rival| {
             experiment(
                 &Subject { kind, rival, input: None, location: &location, value: &|_| None, separate: "" },
@@ -334,10 +334,10 @@ mod tests {
             value: &|_| None,
             separate: "turn it.",
         };
-        let mut two = basis();
+        let mut two = reach();
         two.inputs.push(InputRange { name: "w".into(), ..two.inputs[0].clone() });
-        for basis in [Basis::default(), two] {
-            let e = experiment(&subject, &basis);
+        for reach in [Reach::default(), two] {
+            let e = experiment(&subject, &reach);
             assert_eq!((e.text.as_str(), e.input, e.amplitude), ("turn it", None, None));
         }
     }

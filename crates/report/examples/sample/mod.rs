@@ -5,9 +5,9 @@ use std::f64::consts::TAU;
 
 use greybox_recording::Correlation;
 use greybox_report::contract::{
-    Alternative, Estimate, Experiment, Finding, Fit, FitSet, InputHold, Interval, Location, Mechanism,
-    ModelId, Ordered, Parameter, Producer, RecordingFit, Remainder, Report, Samples, Score, Severity,
-    Verdict,
+    Alternative, Basis, Criterion, Estimate, Experiment, Finding, Fit, FitSet, InputHold, Interval, Location,
+    Mechanism, ModelId, Ordered, Parameter, Producer, RecordingFit, Remainder, Report, Samples, Score,
+    Severity, Verdict,
 };
 use greybox_report::page::{
     Channel, Input, Lagged, MechanismPlot, ModelTexts, Page, Recording, Residual, Role, Spectrum, StateMap,
@@ -415,7 +415,9 @@ pub(crate) fn page() -> Page {
         samples: Samples { train: train.recording.t.len(), holdout: test.recording.t.len() },
         verdict: Verdict::MissingPhysics,
         summary: Vec::new(),
+        basis: Basis::Named,
         mechanisms: vec![mechanism(windows.clone())],
+        candidates: Vec::new(),
         subsets: Vec::new(),
         remainder: Remainder {
             significant: false,
@@ -429,6 +431,7 @@ pub(crate) fn page() -> Page {
             train: train_fit.clone(),
             holdout: test_fit.clone(),
             window_s: Some(WINDOW),
+            criterion: Criterion::FreeRun,
             holdout_source: "test.csv, a recording of its own".to_owned(),
             recordings: map([
                 ("train.csv", RecordingFit { train: Some(train_fit), holdout: None }),

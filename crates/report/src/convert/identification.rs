@@ -11,7 +11,9 @@ use super::{
     coherent, correlations, health_findings, interval, names, recordings, residual, scores, spectra,
     state_map, times,
 };
-use crate::contract::{Finding, Fit, FitSet, InputHold, ModelId, Ordered, Producer, RecordingFit, Severity};
+use crate::contract::{
+    Criterion, Finding, Fit, FitSet, InputHold, ModelId, Ordered, Producer, RecordingFit, Severity,
+};
 use crate::format;
 use crate::identified::{
     Blocks, Delay, Doubtful, Equation, IdentifyReport, Order, OrderValue, Term, Variable, VariableRole,
@@ -243,6 +245,7 @@ fn fit(found: &Identification) -> Fit {
         train: fit_set(&found.train, &found.train.scores),
         holdout: found.holdout.as_ref().map(|role| fit_set(role, &role.scores)).unwrap_or_default(),
         window_s: Some(found.window),
+        criterion: Criterion::FreeRun,
         holdout_source: match (&found.holdout, found.holdout_source) {
             (Some(role), HoldoutSource::Given) => {
                 format!("recordings held out: {}", role.data.recordings.join(", "))

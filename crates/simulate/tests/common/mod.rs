@@ -43,6 +43,7 @@ pub fn model(
                 unit: Some(unit()),
                 std: None,
                 fixed: false,
+                positive: None,
             })
             .collect(),
         equations: equations

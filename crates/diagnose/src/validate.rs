@@ -1,0 +1,209 @@
+//! Cross-validation: how well a model simulates what it was not fitted to.
+//!
+//! Recordings are left out one by one. A single one is cut into contiguous blocks, and each but the first is predicted from
+//! those before it: what is asked of a model is the next experiment, and blocks on both sides of a gap tell more of it than
+//! any past does (rolling origin; Hyndman and Athanasopoulos, *Forecasting: Principles and Practice*, section 5.10). The
+//! parameters are refitted without the fold, which is then simulated from a state estimated on its first quarter (Stone, *Cross-validatory choice and
+//! assessment of statistical predictions*, J. R. Stat. Soc. B 36, 1974; contiguous folds since neighbouring samples tell
+//! of each other).
+
+use std::ops::Range;
+
+use greybox_calibrate::{Criterion, Data, Level, Limits, Point, Segment, Setup};
+use rayon::prelude::*;
+
+use crate::search::Fitted;
+
+/// Most folds, and how many a single recording is cut into.
+const FOLDS: usize = 5;
+/// Shortest stretch that is fitted, samples.
+const SHORTEST: usize = 8;
+/// Steps of a refit.
+const REFIT: Limits = Limits { iterations: 10, tolerance: 1e-5 };
+
+/// What is left out together: stretches of pieces.
+type Fold = Vec<(usize, Range<usize>)>;
+
+/// The folds of the training data.
+pub(crate) fn folds(data: &Data) -> Vec<Fold> {
+    let recordings = data.recordings.len();
+    if recordings > 1 {
+        let mut folds = vec![Fold::new(); recordings.min(FOLDS)];
+        let count = folds.len();
+        for (i, piece) in data.pieces.iter().enumerate() {
+            folds[piece.recording % count].push((i, 0..piece.len));
+        }
+        folds.retain(|f| !f.is_empty());
+        return folds;
+    }
+    let total = data.samples();
+    (1..FOLDS)
+        .map(|k| {
+            let wanted = k * total / FOLDS..(k + 1) * total / FOLDS;
+            let mut before = 0;
+            let mut fold = Fold::new();
+            for (i, piece) in data.pieces.iter().enumerate() {
+                let from = wanted.start.clamp(before, before + piece.len) - before;
+                let to = wanted.end.clamp(before, before + piece.len) - before;
+                if to >= from + SHORTEST {
+                    fold.push((i, from..to));
+                }
+                before += piece.len;
+            }
+            fold
+        })
+        .filter(|f| !f.is_empty())
+        .collect()
+}
+
+/// The mean over the channels of ln(RMS error / spread) on each fold, left out of the fit; infinite where the simulation
+/// diverges.
+pub(crate) fn errors(fitted: &Fitted, scale: &[f64], criterion: Criterion, window: f64) -> Vec<f64> {
+    let setup = &fitted.setup;
+    let run = setup.free_run(&fitted.fit.point.parameters, scale);
+    let window = match criterion {
+        Criterion::FreeRun => f64::INFINITY,
+        Criterion::Windowed => window,
+    };
+    folds(&setup.data)
+        .par_iter()
+        .map(|fold| {
+            let level = without(setup, fold, longest(&fitted.level));
+            let parameters = if level.segments.is_empty() || setup.free.is_empty() {
+                fitted.fit.point.parameters.clone()
+            } else {
+                let point: Point = setup.stitch(&fitted.level, &fitted.fit.point, &level, scale);
+                setup.fit(&level, scale, &[point], REFIT).point.parameters
+            };
+            let ny = setup.system.ny;
+            let (mut squares, mut counts) = (vec![0.0; ny], vec![0usize; ny]);
+            for (piece, range) in fold {
+                let y = setup.restarted(*piece, range.clone(), &run.x[*piece], &parameters, window);
+                for c in 0..ny {
+                    let measured = &setup.data.pieces[*piece].measured[c][range.clone()];
+                    for (m, s) in measured.iter().zip(&y[c * range.len()..(c + 1) * range.len()]) {
+                        if !m.is_nan() {
+                            squares[c] += (m - s).powi(2);
+                            counts[c] += 1;
+                        }
+                    }
+                }
+            }
+            let of = |c: usize| {
+                let mean = squares[c] / counts[c].max(1) as f64;
+                0.5 * (mean / setup.data.spread[c].powi(2)).max(f64::MIN_POSITIVE).ln()
+            };
+            let seen: Vec<usize> = (0..ny).filter(|&c| counts[c] > 0).collect();
+            seen.iter().map(|&c| of(c)).sum::<f64>() / seen.len().max(1) as f64
+        })
+        .collect()
+}
+
+fn longest(level: &Level) -> usize {
+    level.segments.iter().map(|s| s.range.len()).max().unwrap_or(SHORTEST).max(SHORTEST)
+}
+
+/// Segments of at most this length over all that a fold leaves.
+fn without(setup: &Setup, fold: &Fold, length: usize) -> Level {
+    let single = setup.data.recordings.len() == 1;
+    let last = fold.iter().map(|f| f.0).max().unwrap_or(0);
+    let mut segments = Vec::new();
+    for (piece, data) in setup.data.pieces.iter().enumerate() {
+        let mut from = 0;
+        let mut gaps: Vec<Range<usize>> = fold.iter().filter(|f| f.0 == piece).map(|f| f.1.clone()).collect();
+        gaps.sort_by_key(|r| r.start);
+        if single && piece > last {
+            break;
+        }
+        gaps.push(data.len..data.len);
+        for gap in gaps {
+            let stretch = gap.start.saturating_sub(from);
+            if stretch >= SHORTEST {
+                let parts = stretch.div_ceil(length);
+                for i in 0..parts {
+                    let (a, b) = (from + i * stretch / parts, from + (i + 1) * stretch / parts);
+                    segments.push(Segment { piece, range: a..b });
+                }
+            }
+            // Of the recording itself only what was before.
+            from = if single { data.len } else { gap.end };
+        }
+    }
+    let priors = segments.iter().map(|s| setup.start_prior(s.piece, s.range.start)).collect();
+    Level { segments, priors }
+}
+
+/// What cross-validation says of a model beside a simpler one.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub(crate) struct Gain {
+    /// Mean over the folds of ln(error of the simpler model / error of this one).
+    pub(crate) mean: f64,
+    /// Mean over standard error.
+    pub(crate) t: f64,
+    /// The gain on the fold that loses most.
+    pub(crate) worst: f64,
+}
+
+impl Gain {
+    /// From the errors of both on the same folds. Where the simpler model diverges and this one does not, the gain is as
+    /// large as can be.
+    pub(crate) fn of(simpler: &[f64], model: &[f64]) -> Gain {
+        /// ln of the largest ratio that counts.
+        const MOST: f64 = 7.0;
+        let gains: Vec<f64> = simpler
+            .iter()
+            .zip(model)
+            .map(|(a, b)| match (a.is_finite(), b.is_finite()) {
+                (true, true) => (a - b).clamp(-MOST, MOST),
+                (false, true) => MOST,
+                (true, false) => -MOST,
+                (false, false) => 0.0,
+            })
+            .collect();
+        let n = gains.len().max(1) as f64;
+        let mean = gains.iter().sum::<f64>() / n;
+        let variance = gains.iter().map(|g| (g - mean).powi(2)).sum::<f64>() / (n - 1.0).max(1.0);
+        let t = mean / (variance / n).sqrt().max(1e-12);
+        Gain { mean, t, worst: gains.iter().copied().fold(f64::INFINITY, f64::min) }
+    }
+
+    /// Whether the model is no worse than the simpler one on data left out of its fit: better on average, and on no fold
+    /// clearly worse.
+    pub(crate) fn is_safe(&self) -> bool {
+        self.mean > 0.0 && self.worst > -WORST.ln()
+    }
+
+    /// Whether the model predicts what it was not fitted to better than chance.
+    pub(crate) fn is_beyond_chance(&self) -> bool {
+        self.is_safe() && self.mean > CLEAR && self.t > STEADY
+    }
+}
+
+/// Largest ratio of errors on a fold that a model may lose.
+const WORST: f64 = 1.25;
+/// Gain in ln(error) that counts, and its mean over its standard error.
+const CLEAR: f64 = 0.05;
+const STEADY: f64 = 1.5;
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_gain_is_safe_where_no_fold_loses() {
+        let even = Gain::of(&[0.0, 0.0, 0.0, 0.0, 0.0], &[-0.5, -0.6, -0.4, -0.5, -0.5]);
+        assert!(even.is_safe() && even.is_beyond_chance(), "{even:?}");
+        let lost = Gain::of(&[0.0; 5], &[-2.0, -2.0, -2.0, -2.0, 0.5]);
+        assert!(lost.mean > 0.0 && !lost.is_safe(), "{lost:?}");
+        let chance = Gain::of(&[0.0; 5], &[-0.2, 0.1, 0.1, -0.1, 0.0]);
+        assert!(!chance.is_beyond_chance(), "{chance:?}");
+    }
+
+    #[test]
+    fn what_diverges_has_lost() {
+        let gain = Gain::of(&[0.0; 5], &[-1.0, -1.0, -1.0, -1.0, f64::INFINITY]);
+        assert!(!gain.is_safe(), "{gain:?}");
+        let gain = Gain::of(&[f64::INFINITY; 2], &[0.0; 2]);
+        assert!(gain.is_safe(), "{gain:?}");
+    }
+}
