@@ -292,7 +292,7 @@ fn with_delays(e: &Expr, delays: &[(Expr, Expr)]) -> Expr {
             _ => None,
         };
         match index.and_then(|i| delays.get(i)) {
-            Some((signal, lag)) => Expr::Call(Func::Delay, vec![signal.clone(), lag.clone()].into()),
+            Some((signal, lag)) => Expr::Call(Func::Delay, vec![signal.clone(), lag.clone()]),
             None => node,
         }
     })

@@ -754,9 +754,9 @@ const HORIZON: Limits = Limits { iterations: 30, tolerance: 1e-6 };
 const FURTHER: Limits = Limits { iterations: 100, tolerance: 1e-6 };
 
 /// Takes mechanisms away until what is left can be handed back: every one is determined, no inertia is negative, and the
-/// model is no worse than the calibrated one, neither in training nor (unless it leaves nothing but noise) on data left
-/// out of its fit. Nothing is left but the calibrated model where that takes all of them; what no round believed
-/// (`named` false) has to predict such data better than chance.
+/// model is no worse than the calibrated one in training. Where it leaves more than noise, or where no round believed it
+/// (`named` false), it also has to predict data left out of its fit better than chance. Nothing is left but the calibrated
+/// model where that takes all mechanisms.
 fn defend(
     search: &Search<'_>,
     found: &mut Found,
@@ -787,7 +787,7 @@ fn defend(
                 return false; // the likelihood has spoken
             }
             let gain = Gain::of(&simpler, &errors(&polished, &scale));
-            !(if named { gain.is_safe() } else { gain.is_beyond_chance() })
+            !gain.is_beyond_chance()
         };
         let fails = undetermined.is_some()
             || worse
@@ -828,7 +828,7 @@ fn defend(
 /// The improved model refitted at growing horizons.
 fn polish(fitted: &Fitted, scale: &[f64], judge: &Judge) -> Polished {
     let own = residual_scale(fitted, scale);
-    best_horizon(fitted, &[fitted.fit.point.clone()], &own, scale, judge)
+    best_horizon(fitted, std::slice::from_ref(&fitted.fit.point), &own, scale, judge)
 }
 
 /// Residual sum of squares with each part alone, refitted; `without` is that without each part, `base` that without all.

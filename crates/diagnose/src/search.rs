@@ -30,6 +30,9 @@ const CLEAR: f64 = 1.35;
 /// Residual over innovations up to which a correlated residual passes for noise: slower ones (a pole beyond
 /// 0.995) are what a model leaves over.
 const SLOWEST: f64 = 10.0;
+/// Correlation times that recordings must hold for a correlated residual to pass for noise: of fewer, any slow misfit
+/// looks the same.
+const INDEPENDENT: f64 = 20.0;
 /// Most samples that a level of the search looks at; longer recordings are seen through windows.
 const MOST_SAMPLES: usize = 5000;
 /// Work after which nothing more is looked for: laws that the library lacks are pieced together from mechanisms with
@@ -221,7 +224,7 @@ fn lengths(setup: &Setup) -> Vec<usize> {
         }
     }
     let piece = setup.data.lengths().into_iter().max().unwrap_or(0);
-    let longest = piece.min(MOST_SAMPLES).max(SHORTEST);
+    let longest = piece.clamp(SHORTEST, MOST_SAMPLES);
     let first = ((PERIODS * period) as usize).min(total / SEGMENTS).max(SHORTEST).min(longest);
     let mut out = vec![first];
     while let Some(&last) = out.last()
@@ -939,15 +942,18 @@ impl<'a> Search<'a> {
                 let index = fitted.setup.model.parameter(name)?;
                 let at = fitted.setup.free.iter().position(|f| f.index == index)?;
                 let value = fitted.fit.point.parameters[index].abs();
-                Some(if value > 0.0 { value / widths[at] } else { 0.0 })
+                let ratio = value / widths[at];
+                Some(if ratio.is_nan() || value == 0.0 { 0.0 } else { ratio })
             };
             let names = mechanism.parameters().zip(&part.instance.names);
             let known = names.filter(|(plain, _)| counts(plain)).filter_map(|(_, name)| ratio(name));
             known.fold(f64::NEG_INFINITY, f64::max)
         };
-        let ratios = fitted.parts.iter().map(known).enumerate();
-        let least = ratios.filter(|(_, ratio)| !(*ratio >= 1.0)).min_by(|a, b| a.1.total_cmp(&b.1));
-        least.filter(|(_, ratio)| *ratio != f64::NEG_INFINITY).map(|(index, _)| index)
+        // A part without strengths of its own shows nothing of the kind.
+        let ratios =
+            fitted.parts.iter().map(known).enumerate().filter(|(_, ratio)| *ratio != f64::NEG_INFINITY);
+        let least = ratios.filter(|(_, ratio)| *ratio < 1.0).min_by(|a, b| a.1.total_cmp(&b.1));
+        least.map(|(index, _)| index)
     }
 
     /// Whether the mechanisms turn the sign of the mass matrix's determinant somewhere along the recordings: a negative
@@ -985,8 +991,7 @@ impl<'a> Search<'a> {
     /// leaves nothing but white noise.
     fn search_long(&self, calibrated: &Fitted, state: &mut State) {
         let single = state.current.parts.len() <= 1;
-        if (single && state.current.leaves_white_noise(&state.scale))
-            || state.misfit() < STUCK && single
+        if (single && (state.current.leaves_white_noise(&state.scale) || state.misfit() < STUCK))
             || self.lengths.len() < 2
             || self.is_spent()
         {
@@ -2109,12 +2114,22 @@ pub fn coloured_channels(f: &Fitted, scale: &[f64]) -> Vec<bool> {
     noise
         .iter()
         .zip(&f.setup.data.sigma)
-        .zip(raw_rms(f, scale))
-        .map(|((a, sigma), rms)| {
+        .zip(raw_rms(f, scale).into_iter().zip(&f.fit.count))
+        .map(|((a, sigma), (rms, count))| {
             let innovation = a.variance().sqrt();
-            a.order() > 0 && innovation > CLEAR * sigma && rms < SLOWEST * innovation
+            a.order() > 0
+                && innovation > CLEAR * sigma
+                && rms < SLOWEST * innovation
+                && is_long(*count, rms / innovation)
         })
         .collect()
+}
+
+/// Whether so many samples tell coloured noise from what a model leaves over: they hold [`INDEPENDENT`] correlation times.
+/// Noise with a pole ρ, whose RMS is 1/√(1 − ρ²) of its innovations, remembers (1 + ρ)/(1 − ρ) samples (Bartlett): for a
+/// long memory 4 times the square of that ratio.
+fn is_long(samples: usize, ratio: f64) -> bool {
+    samples as f64 > INDEPENDENT * 4.0 * ratio * ratio
 }
 
 /// Whether the likelihood can be taken at its word: of innovations, and of a residual that is white and no
@@ -2161,4 +2176,18 @@ fn determinant_sign(a: &mut [f64], n: usize) -> f64 {
 
 fn calibrated_rss(calibrated: &Fitted, scale: &[f64]) -> f64 {
     raw_rss(calibrated, scale).iter().sum()
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_slow_residual_is_noise_only_where_the_recordings_outlast_its_memory() {
+        // ρ = 0.97 remembers 66 samples.
+        let ratio = 1.0 / (1.0f64 - 0.97 * 0.97).sqrt();
+        assert!(is_long(2000, ratio) && !is_long(700, ratio));
+        // A few runs of 15 s with a residual that hardly changes within one.
+        assert!(!is_long(733, 7.0));
+    }
 }

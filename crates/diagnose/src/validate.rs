@@ -11,6 +11,7 @@ use std::ops::Range;
 
 use greybox_calibrate::{Criterion, Data, Level, Limits, Point, Segment, Setup};
 use rayon::prelude::*;
+use statrs::distribution::{ContinuousCDF, StudentsT};
 
 use crate::search::Fitted;
 
@@ -140,6 +141,9 @@ pub(crate) struct Gain {
     pub(crate) mean: f64,
     /// Mean over standard error.
     pub(crate) t: f64,
+    /// What `t` stays below by chance, in 95 of a hundred cases, where the model gains nothing: Student's quantile for so
+    /// many folds.
+    pub(crate) by_chance: f64,
     /// The gain on the fold that loses most.
     pub(crate) worst: f64,
 }
@@ -164,7 +168,9 @@ impl Gain {
         let mean = gains.iter().sum::<f64>() / n;
         let variance = gains.iter().map(|g| (g - mean).powi(2)).sum::<f64>() / (n - 1.0).max(1.0);
         let t = mean / (variance / n).sqrt().max(1e-12);
-        Gain { mean, t, worst: gains.iter().copied().fold(f64::INFINITY, f64::min) }
+        let by_chance = StudentsT::new(0.0, 1.0, (n - 1.0).max(1.0))
+            .map_or(f64::INFINITY, |s| s.inverse_cdf(1.0 - CHANCE));
+        Gain { mean, t, by_chance, worst: gains.iter().copied().fold(f64::INFINITY, f64::min) }
     }
 
     /// Whether the model is no worse than the simpler one on data left out of its fit: better on average, and on no fold
@@ -175,19 +181,28 @@ impl Gain {
 
     /// Whether the model predicts what it was not fitted to better than chance.
     pub(crate) fn is_beyond_chance(&self) -> bool {
-        self.is_safe() && self.mean > CLEAR && self.t > STEADY
+        self.is_safe() && self.mean > CLEAR && self.t > self.by_chance
     }
 }
 
 /// Largest ratio of errors on a fold that a model may lose.
 const WORST: f64 = 1.25;
-/// Gain in ln(error) that counts, and its mean over its standard error.
+/// Gain in ln(error) that counts.
 const CLEAR: f64 = 0.05;
-const STEADY: f64 = 1.5;
+/// Probability of a gain by chance alone that is taken for none.
+const CHANCE: f64 = 0.05;
 
 #[cfg(test)]
 mod tests {
     use super::*;
+
+    /// Four folds of a room's temperature gained by a constant alone, and not in another month: gains that are positive
+    /// in three of four are chance.
+    #[test]
+    fn three_gains_of_four_are_chance() {
+        let gain = Gain::of(&[0.0; 4], &[-0.9, -0.6, -0.35, 0.06]);
+        assert!(gain.is_safe() && gain.t > 1.5 && !gain.is_beyond_chance(), "{gain:?}");
+    }
 
     #[test]
     fn a_gain_is_safe_where_no_fold_loses() {
@@ -197,6 +212,16 @@ mod tests {
         assert!(lost.mean > 0.0 && !lost.is_safe(), "{lost:?}");
         let chance = Gain::of(&[0.0; 5], &[-0.2, 0.1, 0.1, -0.1, 0.0]);
         assert!(!chance.is_beyond_chance(), "{chance:?}");
+    }
+
+    #[test]
+    fn few_folds_must_agree_more_than_many() {
+        let gains = |n: usize| -> Vec<f64> { (0..n).map(|k| -[0.05, 0.4, 0.6, 0.2][k % 4]).collect() };
+        let few = Gain::of(&[0.0; 2], &gains(2));
+        assert!((few.by_chance - 6.314).abs() < 1e-3, "Student's t of one degree of freedom: {few:?}");
+        assert!(!few.is_beyond_chance());
+        let many = Gain::of(&[0.0; 8], &gains(8));
+        assert!((many.by_chance - 1.895).abs() < 1e-3 && many.is_beyond_chance(), "{many:?}");
     }
 
     #[test]

@@ -249,7 +249,7 @@ fn parts(grid: &Grid, time: &[f64], channels: &[Channel]) -> Vec<Range<usize>> {
     let observed: Vec<usize> =
         (0..time.len()).filter(|&row| channels.iter().any(|c| !c.values[row].is_nan())).collect();
     let (Some(&first), Some(&last)) = (observed.first(), observed.last()) else {
-        return vec![0..time.len()];
+        return std::iter::once(0..time.len()).collect();
     };
     let span = time[last] - time[first];
     let longest_step = 1.5 * grid.dt;
