@@ -71,6 +71,9 @@ fn start_samples(n: usize, share: f64) -> usize {
     ((n as f64 * share) as usize).clamp(2.min(n), n)
 }
 
+/// Information on an initial state that is given, more than any samples hold.
+const GIVEN: f64 = 1e100;
+
 /// Samples from which an initial state is estimated first, and fewest that tell states no sensor sees.
 const FIRST_HORIZON: usize = 15;
 const LEAST_UNMEASURED: usize = 60;
@@ -114,9 +117,11 @@ impl Setup {
     /// Which figure judges simulations with these parameters, by the machine's own growth of errors, and the longest
     /// window (s) over which it can be predicted.
     ///
-    /// The tangents of a free run carry an error of the start, one standard deviation of what the smoothed measurements
-    /// say of it, to every sample. Where it outgrows the spread of a channel (an unstable or a chaotic machine, an
-    /// integrating one on a long record), or the run diverges, restarted windows judge; they are no longer than that.
+    /// The start of a free run is estimated on its first quarter. Its covariance there, P = (Σ JᵀJ/s² + P₀⁻¹)⁻¹ with
+    /// the tangents J of the outputs, the residual s and what the smoothed measurements say, P₀, is carried on by the
+    /// tangents: √(J P Jᵀ) is the error of the output at every later sample. Where it outgrows the spread of a channel (an
+    /// unstable or a chaotic machine, an integrating one on a long record), or the run diverges, restarted windows judge;
+    /// they are no longer than that.
     pub fn criterion(&self, parameters: &[f64], scale: &[f64]) -> (Criterion, f64) {
         let reach: Vec<f64> = (0..self.data.pieces.len())
             .into_par_iter()
@@ -138,15 +143,42 @@ impl Setup {
         let x0 = self.estimate_start(piece, parameters, scale);
         let run =
             integrate(&self.system, &self.environments[piece], parameters, &x0, 0..n, self.method, &seeds);
-        let std: Vec<f64> =
-            self.start_prior(piece, 0).iter().map(|p| if p.1.is_finite() { p.1 } else { 0.0 }).collect();
+        let tangent = |c: usize, k: usize, l: usize| run.dy[(l * ny + c) * n + k];
+        let end = run.diverged.unwrap_or(n);
+        let mut information = vec![0.0; nx * nx];
+        for (l, (_, std)) in self.start_prior(piece, 0).iter().enumerate() {
+            // (An initial state that is given is known.)
+            information[l * nx + l] = if *std > 0.0 { std.powi(-2) } else { GIVEN };
+        }
+        for c in 0..ny {
+            let seen = |k: &usize| !data.measured[c][*k].is_nan();
+            for k in (0..start_samples(n, START_SHARE).min(end)).filter(seen) {
+                for i in 0..nx {
+                    for j in 0..nx {
+                        information[i * nx + j] += tangent(c, k, i) * tangent(c, k, j) / scale[c].powi(2);
+                    }
+                }
+            }
+        }
+        // What neither the prior nor the first quarter knows of has no part in the outputs there.
+        for l in 0..nx {
+            if information[l * nx + l] == 0.0 {
+                information[l * nx + l] = 1.0;
+            }
+        }
+        let mut pivots = vec![0; nx];
+        if !greybox_simulate::small::factor(&mut information, &mut pivots, nx) {
+            return 0.0;
+        }
         let outgrown = |k: usize| {
             (0..ny).any(|c| {
-                let error = |l: usize| run.dy[(l * ny + c) * n + k] * std[l];
-                (0..nx).map(|l| error(l).powi(2)).sum::<f64>().sqrt() > self.data.spread[c]
+                let own: Vec<f64> = (0..nx).map(|l| tangent(c, k, l)).collect();
+                let mut carried = own.clone();
+                greybox_simulate::small::solve(&information, &pivots, nx, &mut carried, 1);
+                let variance: f64 = own.iter().zip(&carried).map(|(a, b)| a * b).sum();
+                !variance.is_finite() || variance > self.data.spread[c].powi(2)
             })
         };
-        let end = run.diverged.unwrap_or(n);
         match (0..end).find(|&k| outgrown(k)).or(run.diverged) {
             Some(k) => k as f64 * data.dt,
             None => f64::INFINITY,

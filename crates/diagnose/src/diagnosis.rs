@@ -259,7 +259,8 @@ pub struct Diagnosis {
     pub improved: Model,
     /// What `improved` rests on.
     pub basis: Basis,
-    /// By which figure simulations were judged.
+    /// By which figure simulations are judged: windowed where free runs of the training or the held-out recordings
+    /// cannot tell.
     pub criterion: Criterion,
     /// Mechanisms, largest share first.
     pub mechanisms: Vec<Finding>,
@@ -486,6 +487,11 @@ fn conclude(
     follows([&train_role.calibrated.run, &train_role.improved.run], &train)?;
     let holdout_role = role(&holdout, true);
 
+    // The machine may be predictable where it was recorded to learn from, and not where it is held out.
+    let held = improved.setup.for_simulations_of(holdout.clone(), &improved.fit.point.parameters, &scale);
+    let (elsewhere, _) = held.criterion(&improved.fit.point.parameters, &scale);
+    let criterion = if elsewhere == Criterion::Windowed { elsewhere } else { judge.criterion };
+
     // Mechanisms, remainder, verdict.
     // Where nothing was found, what the search's own noise model leaves white.
     let surface = if found.improved.parts.is_empty() && found.improved.setup.noise.is_some() {
@@ -583,7 +589,7 @@ fn conclude(
     Ok(Diagnosis {
         verdict,
         basis,
-        criterion: judge.criterion,
+        criterion,
         nominal: nominal.model.clone(),
         improved: improved_model,
         calibrated: calibrated_model,

@@ -130,7 +130,9 @@ pub(crate) fn pieces(grid: &Grid, time: &[f64], channels: &[Channel]) -> (Vec<Pi
 
     for rows in &parts {
         let observed = |row: &usize| channels.iter().any(|c| !c.values[*row].is_nan());
-        if rows.len() < MIN_SAMPLES || rows.clone().filter(observed).count() < MIN_SAMPLES {
+        if rows.len() < MIN_SAMPLES
+            || (parts.len() > 1 && rows.clone().filter(observed).count() < MIN_SAMPLES)
+        {
             short.push(rows.clone());
             short_rows += rows.len();
             continue;

@@ -29,21 +29,77 @@ fn codes(recording: &Recording) -> Vec<&'static str> {
 }
 
 #[test]
-fn gaps_split_and_short_pieces_go() {
-    let kept = |k: usize| !(100..130).contains(&k) && !(135..140).contains(&k);
+fn long_gaps_split_and_short_pieces_go() {
+    let kept = |k: usize| !(100..140).contains(&k) && !(145..190).contains(&k);
     let time: Vec<f64> = (0..300).filter(|&k| kept(k)).map(|k| 5.0 + 0.01 * k as f64).collect();
     let values: Vec<f64> = time.iter().map(|t| t.sin()).collect();
     let recording = Recording::from_columns("g.csv", time, vec![channel(values.clone())]).unwrap();
     assert_eq!(codes(&recording), ["gap", "short_piece"]);
     let rows: Vec<_> = recording.pieces.iter().map(|p| p.rows.clone()).collect();
-    assert_eq!(rows, [0..100, 105..265]);
-    assert_eq!(recording.warnings[0].value, Some(35.0));
-    assert!(recording.warnings[0].message.contains("from t = 5.99 s to 6.3 s"), "{}", recording.warnings[0]);
+    assert_eq!(rows, [0..100, 105..215]);
+    assert_eq!(recording.warnings[0].value, Some(85.0));
+    assert!(recording.warnings[0].message.contains("from t = 5.99 s to 6.4 s"), "{}", recording.warnings[0]);
     for piece in &recording.pieces {
         assert_eq!((piece.dt, piece.resampled, piece.len), (0.01, false, piece.rows.len()));
         assert_eq!(piece.columns[0], values[piece.rows.clone()]);
     }
-    assert!((recording.pieces[1].start - 1.4).abs() < 1e-12);
+    assert!((recording.pieces[1].start - 1.9).abs() < 1e-12);
+}
+
+/// Rows that were left out of a log, and the same rows with empty cells, are the same recording; whatever the gaps.
+#[test]
+fn rows_left_out_are_rows_with_empty_cells() {
+    let mut rng = Pcg64Mcg::seed_from_u64(11);
+    for (share, long) in [(0.2, 0), (0.02, 20), (0.0, 90)] {
+        let lost: Vec<bool> = (0..600)
+            .map(|k| {
+                (k > 0 && k < 599 && rng.random_range(0.0..1.0) < share) || (200..200 + long).contains(&k)
+            })
+            .collect();
+        let (t, y) = (|k: usize| 0.01 * k as f64, |k: usize| (0.05 * k as f64).sin());
+        let left = || (0..600).filter(|&k| !lost[k]);
+        let without =
+            Recording::from_columns("g", left().map(t).collect(), vec![channel(left().map(y).collect())])
+                .unwrap();
+        let cells: Vec<f64> = (0..600).map(|k| if lost[k] { f64::NAN } else { y(k) }).collect();
+        let with = Recording::from_columns("g", (0..600).map(t).collect(), vec![channel(cells)]).unwrap();
+        assert_eq!(without.pieces.len(), if long > 60 { 2 } else { 1 });
+        assert_eq!(without.pieces.len(), with.pieces.len());
+        for (a, b) in without.pieces.iter().zip(&with.pieces) {
+            assert_eq!((a.len, a.dt), (b.len, b.dt));
+            assert!((a.start - b.start).abs() < 1e-9);
+            let bits =
+                |p: &greybox_recording::Piece| p.columns[0].iter().map(|v| v.to_bits()).collect::<Vec<_>>();
+            assert_eq!(bits(a), bits(b));
+        }
+    }
+}
+
+/// A logger that writes a row every second while something happens and every minute at rest, faster in a pulse.
+#[test]
+fn an_event_driven_log_is_one_piece() {
+    let mut time = Vec::new();
+    let mut t: f64 = 0.0;
+    for burst in 0..20 {
+        for k in 0..120 {
+            t += if burst == 7 && k < 40 { 0.1 } else { 1.0 };
+            time.push(t);
+        }
+        for k in 0..30 {
+            t += if k == 3 { 24.6 } else { 60.0 };
+            time.push(t);
+        }
+    }
+    let values: Vec<f64> = time.iter().map(|t| (0.001 * t).sin()).collect();
+    let recording = Recording::from_columns("e.csv", time.clone(), vec![channel(values)]).unwrap();
+    assert_eq!((recording.pieces.len(), recording.dt()), (1, 1.0));
+    let piece = &recording.pieces[0];
+    let seen: Vec<usize> = (0..piece.len).filter(|&k| !piece.columns[0][k].is_nan()).collect();
+    assert!(seen.len() > 20 * (80 + 30), "{}", seen.len());
+    for k in seen {
+        // Rows off the grid stand at most half a step beside their time.
+        assert!((piece.columns[0][k] - (0.001 * (time[0] + piece.time(k))).sin()).abs() < 0.6e-3);
+    }
 }
 
 #[test]
