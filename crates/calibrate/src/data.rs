@@ -3,7 +3,7 @@
 use std::ops::Range;
 use std::sync::OnceLock;
 
-use greybox_model::{Hold, Model, nearest};
+use greybox_model::{Dimension, Hold, Input, Model, Unit, nearest};
 use greybox_recording::{Recording, SIZES, smooth::Smoothed};
 use greybox_simulate::{Environment, FINE, Signal};
 
@@ -75,6 +75,20 @@ pub enum DataError {
         /// Its largest magnitude, SI.
         largest: f64,
     },
+    /// The derivative of a channel that has none.
+    #[error("{file}: input `{input}` is the derivative of channel `{channel}`, {reason}. {mend}")]
+    Derivative {
+        /// File.
+        file: String,
+        /// Input of the model.
+        input: String,
+        /// The channel.
+        channel: String,
+        /// Why there is none.
+        reason: String,
+        /// What to do instead.
+        mend: String,
+    },
     /// The model measures nothing.
     #[error("the model has no measured state: give one a channel, or add [measurements]")]
     NothingMeasured,
@@ -145,12 +159,7 @@ impl Data {
             };
             let mut inputs = Vec::new();
             for input in &model.inputs {
-                inputs.push(find(
-                    &input.channel,
-                    format!("input `{}`", input.name),
-                    Some(&input.name),
-                    &input.unit,
-                )?);
+                inputs.push(find_input(model, input, recording)?);
             }
             let mut measured = Vec::new();
             for m in &model.measurements {
@@ -180,7 +189,13 @@ impl Data {
                     inputs: inputs
                         .iter()
                         .zip(&model.inputs)
-                        .map(|(&i, input)| filled(&scaled(i, piece), input.hold))
+                        .map(|(found, input)| {
+                            let values = scaled((found.column, found.factor), piece);
+                            match found.differentiated {
+                                true => derivative(&filled(&values, Hold::Linear), piece.dt, input.hold),
+                                false => filled(&values, input.hold),
+                            }
+                        })
                         .collect(),
                     measured: ys,
                     smooth,
@@ -256,6 +271,20 @@ impl Data {
             .collect()
     }
 
+    /// Whether an input moves within a piece. One that does not is a known constant: nothing in these data tells what the
+    /// model does with its changes.
+    pub fn input_moves(&self, input: usize) -> bool {
+        let moves = |u: &Vec<f64>| u.iter().any(|v| *v != u[0]);
+        self.pieces.iter().filter_map(|p| p.inputs.get(input)).any(moves)
+    }
+
+    /// Whether an input has more than one value, in one piece or in several.
+    pub fn input_varies(&self, input: usize) -> bool {
+        let first = self.pieces.first().and_then(|p| p.inputs.get(input)?.first());
+        let differs = |u: &Vec<f64>| u.first() != first;
+        self.input_moves(input) || self.pieces.iter().filter_map(|p| p.inputs.get(input)).any(differs)
+    }
+
     /// Number of samples of each channel, over all pieces.
     pub fn samples(&self) -> usize {
         self.pieces.iter().map(|p| p.len).sum()
@@ -297,8 +326,9 @@ impl Data {
     }
 }
 
-/// How to give the model, which looks for `channel`, one that the recording has.
-fn mend(channel: &str, name: Option<&str>, recording: &Recording) -> String {
+/// How to give the model, which looks for `channel`, one that the recording has; `name` is that of the input or state, with
+/// the primes of its channel.
+fn mend(channel: &str, name: Option<(&str, &str)>, recording: &Recording) -> String {
     let there = recording.channels.iter().map(|c| c.name.as_str());
     // Of a name of one or two letters, any other is a slip away.
     let near = nearest(channel, there).filter(|_| channel.chars().count() > 2);
@@ -307,12 +337,113 @@ fn mend(channel: &str, name: Option<&str>, recording: &Recording) -> String {
         None => (String::new(), "…"),
     };
     let in_model = match name {
-        Some(name) => format!("`{name} = {{ channel = \"{column}\" }}`"),
+        Some((name, primes)) => format!("`{name} = {{ channel = \"{column}{primes}\" }}`"),
         None => format!("`{column}` in the place of `{channel}` under `[measurements]`"),
     };
     format!(
         "{slip}Name the column on the command line, `--map {channel}={column}`, or in the model, {in_model}"
     )
+}
+
+/// Where an input is found.
+struct FoundInput {
+    column: usize,
+    /// To SI, before it is differentiated.
+    factor: f64,
+    differentiated: bool,
+}
+
+/// Where a recording has an input of the model: in the channel of its name, or in that whose derivative it is.
+fn find_input(model: &Model, input: &Input, recording: &Recording) -> Result<FoundInput, DataError> {
+    let role = format!("input `{}`", input.name);
+    let base = input.derivative_of().filter(|_| recording.channel(&input.channel).is_none());
+    let Some(base) = base else {
+        let (column, factor) = find_channel(recording, &input.channel, role, Some(&input.name), &input.unit)?;
+        return Ok(FoundInput { column, factor, differentiated: false });
+    };
+    let refused = |reason: &str, mend: String| DataError::Derivative {
+        file: recording.name.clone(),
+        input: input.name.clone(),
+        channel: base.to_owned(),
+        reason: reason.to_owned(),
+        mend,
+    };
+    if base.ends_with('\'') {
+        return Err(refused(
+            "and only the first derivative of a channel is taken",
+            format!("Record it as a channel `{}`", input.channel),
+        ));
+    }
+    let itself = model.inputs.iter().find(|other| other.channel == base);
+    if let Some(held) = itself.filter(|other| other.hold == Hold::Zero) {
+        return Err(refused(
+            &format!(
+                "which input `{}` keeps between its samples (`hold = \"zero\"`), so that it jumps",
+                held.name
+            ),
+            format!(
+                "If the channel is a measured signal, write `hold = \"linear\"` at input `{}`; else record its derivative \
+                 as a channel `{}`",
+                held.name, input.channel
+            ),
+        ));
+    }
+    // A column without a unit is in that of the model: of the input or the measurement that it also is.
+    let measured = model.measurements.iter().find(|m| m.channel == base).map(|m| &m.unit);
+    let mut unit = match itself.map(|other| &other.unit).or(measured) {
+        Some(unit) => unit.clone(),
+        None => {
+            let dimension = input.unit.dimension * Dimension::TIME;
+            Unit { factor: input.unit.factor, ..Unit::si(dimension) }
+        }
+    };
+    let known = unit.dimension / Dimension::TIME;
+    if (itself.is_some() || measured.is_some()) && !known.same(&input.unit.dimension) {
+        return Err(refused(
+            &format!("which the model has in `{}`, but its own unit is `{}`", unit.text, input.unit.text),
+            format!("Write `unit = \"{}/s\"` at input `{}`", unit.text, input.name),
+        ));
+    }
+    unit.dimension = input.unit.dimension * Dimension::TIME;
+    let role = format!("{role} (its derivative)");
+    let (column, factor) = find_channel(recording, base, role, None, &unit).map_err(|error| match error {
+        DataError::MissingChannel { file, channel, role, available, .. } => {
+            let mend = mend(base, Some((&input.name, "'")), recording);
+            DataError::MissingChannel { file, channel, role, available, mend }
+        }
+        other => other,
+    })?;
+    Ok(FoundInput { column, factor, differentiated: true })
+}
+
+/// Samples of the derivative of a signal without missing samples. What stays constant between samples is the slope of the
+/// straight lines; the others go through the derivative at the samples.
+pub(crate) fn derivative(u: &[f64], dt: f64, hold: Hold) -> Vec<f64> {
+    let n = u.len();
+    if n < 2 {
+        return vec![0.0; n];
+    }
+    match hold {
+        Hold::Zero => (0..n).map(|k| k.min(n - 2)).map(|k| (u[k + 1] - u[k]) / dt).collect(),
+        Hold::Linear => (0..n)
+            .map(|k| {
+                let (a, b) = (k.saturating_sub(1), (k + 1).min(n - 1));
+                (u[b] - u[a]) / ((b - a) as f64 * dt)
+            })
+            .collect(),
+        Hold::BandLimited => {
+            let fine = greybox_recording::interpolate::upsample_band_limited(u, FINE);
+            let (h, last) = (dt / FINE as f64, fine.len() - 1);
+            let at = |k: usize| match (k.checked_sub(2), k + 2 <= last) {
+                (Some(_), true) => {
+                    (8.0 * (fine[k + 1] - fine[k - 1]) - (fine[k + 2] - fine[k - 2])) / (12.0 * h)
+                }
+                (None, _) => (4.0 * fine[1] - 3.0 * fine[0] - fine[2]) / (2.0 * h),
+                _ => (3.0 * fine[last] - 4.0 * fine[last - 1] + fine[last - 2]) / (2.0 * h),
+            };
+            (0..n).map(|k| at(k * FINE)).collect()
+        }
+    }
 }
 
 /// Column and factor to SI of a channel. `name` is that of the input or the state which it feeds alone.
@@ -331,7 +462,7 @@ fn find_channel(
             channel: channel.to_string(),
             role,
             available: greybox_recording::told(available),
-            mend: mend(channel, name, recording),
+            mend: mend(channel, name.map(|name| (name, "")), recording),
         });
     };
     let found = &recording.channels[index];

@@ -9,6 +9,7 @@ pub mod data;
 pub mod free;
 pub mod free_run;
 pub mod horizon;
+pub mod input_noise;
 pub mod noise_model;
 pub mod problem;
 pub mod qr;

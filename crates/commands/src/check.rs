@@ -98,7 +98,7 @@ pub fn check_for_model(recording: &Recording, model: &Model) -> Vec<Finding> {
 
 /// The channels that a model takes as inputs, and as measurements.
 fn roles(model: &Model) -> (Vec<&str>, Vec<&str>) {
-    let inputs = model.inputs.iter().map(|i| i.channel.as_str()).collect();
+    let inputs = model.inputs.iter().map(|i| i.column()).collect();
     let outputs = model.measurements.iter().map(|m| m.channel.as_str()).collect();
     (inputs, outputs)
 }
@@ -122,10 +122,13 @@ fn check_with_inputs(recording: &Recording, inputs: &[String]) -> Vec<Finding> {
 
 /// What the channel feeds in the model, in words.
 fn feeds(model: &Model, channel: &str, header: Option<&str>) -> Option<String> {
-    let input = model.inputs.iter().filter(|i| i.channel == channel);
+    let input = model.inputs.iter().filter(|i| i.column() == channel);
     let measured = model.measurements.iter().filter(|m| m.channel == channel);
     let uses: Vec<String> = input
-        .map(|i| format!("input {} ({}, {} hold)", i.name, conversion(header, &i.unit), i.hold.name()))
+        .map(|i| match i.derivative_of() {
+            Some(_) => format!("input {} (its derivative, in {})", i.name, i.unit.text),
+            None => format!("input {} ({}, {} hold)", i.name, conversion(header, &i.unit), i.hold.name()),
+        })
         .chain(measured.map(|m| format!("measurement of {} ({})", m.expr, conversion(header, &m.unit))))
         .collect();
     (!uses.is_empty()).then(|| uses.join(" and "))

@@ -3,7 +3,7 @@
 
 use std::sync::Arc;
 
-use greybox_calibrate::{Data, FreeRun, Setup};
+use greybox_calibrate::{Data, FreeRun, Setup, input_noise};
 use greybox_model::{Measurement, Model, Unit};
 use greybox_recording::{Channel, Finding, Recording, Severity};
 use greybox_report::format;
@@ -61,7 +61,11 @@ pub(crate) fn findings(model: &Model, recording: &Recording) -> Vec<Finding> {
         let stated = recording.channel(&measurement.channel)?.unit.is_some();
         sized(measurement, stated, motion(data, &run, c)?)
     });
-    compared.collect()
+    let mut found: Vec<Finding> = compared.collect();
+    if !run.diverged {
+        found.extend(input_noise::findings(&setup, &setup.values(), &run, false));
+    }
+    found
 }
 
 /// The first rows of a recording.

@@ -93,6 +93,20 @@ fn level(m: &Motion, primes: u8) -> Option<Expr> {
     }
 }
 
+/// What becomes of the inputs that are the derivative of an input's channel where `law` takes the input's place; `states`
+/// are those of the law.
+fn rates_of_input(model: &Model, input: usize, states: &[String], law: &Expr) -> Vec<(String, Expr)> {
+    let (name, channel) = (&model.inputs[input].name, &model.inputs[input].channel);
+    let derivatives = model.inputs.iter().filter(|d| d.derivative_of() == Some(channel));
+    derivatives
+        .map(|d| {
+            let rate = law.time_derivative(&|n| n == name || states.iter().any(|s| s == n));
+            let raw = |n: &str, primes: u8| (n == name && primes == 1).then(|| Expr::var(&d.name));
+            (d.name.clone(), rate.substitute(&raw).simplify())
+        })
+        .collect()
+}
+
 /// A weight in front of a law: `w*law`.
 fn weighted(w: f64, law: Expr) -> Expr {
     if w == 1.0 {
@@ -302,7 +316,11 @@ impl Candidate {
             Place::Equation(e) => model.add_term(*e, law.clone()),
             Place::Input(i) => {
                 let name = model.inputs[*i].name.clone();
+                // Raw inputs stand in what takes their place, hence the input first.
                 model.replace(&name, 0, &law);
+                for (derivative, rate) in rates_of_input(model, *i, &states, &law) {
+                    model.replace(&derivative, 0, &rate);
+                }
             }
             Place::Measurement(c) => model.measurements[*c].expr = law.clone(),
             Place::Parameter(p) => {

@@ -8,7 +8,7 @@ use greybox_calibrate::{
     Criterion, Data, DataError, Ending, Fit, FreeRun, Horizon, Level, Limits, Point, Score, Setup,
     SetupError, Work, free_parameters, window_length, window_of,
 };
-use greybox_model::{Expr, Func, Hold, Model};
+use greybox_model::{Expr, Func, Hold, Input, Model};
 use greybox_recording::Recording;
 use rayon::prelude::*;
 
@@ -1316,7 +1316,9 @@ fn twins(
     };
     // Where the input enters linearly, both make the same constant in the equation.
     let equations = candidate.place.equations(&setup.model);
-    let linear = setup.model.inputs.iter().any(|input| {
+    let inputs = setup.model.inputs.iter().enumerate();
+    let driven = |(u, input): &(usize, &Input)| setup.data.input_moves(*u) && input.derivative_of().is_none();
+    let linear = inputs.filter(driven).any(|(_, input)| {
         setup.model.equations.iter().any(|e| {
             equations.contains(&e.name)
                 && e.residual().mentions(&input.name)

@@ -305,6 +305,10 @@ impl<'a> Search<'a> {
         all.retain(|c| samples >= MEMORY_SAMPLES || library[c.mechanism].states.is_empty());
         // Time begins anew with every recording, and no drift does.
         all.retain(|c| nominal.data.recordings.len() < 2 || !is_drift(&library[c.mechanism]));
+        // Of an input that is constant, nothing tells what becomes of its changes; a derivative goes with its channel.
+        let drives =
+            |i: usize| nominal.data.input_moves(i) && nominal.model.inputs[i].derivative_of().is_none();
+        all.retain(|c| !matches!(c.place, Place::Input(i) if !drives(i)));
         let (all, doubts) = all.into_iter().partition(|c| library[c.mechanism].doubts.is_empty());
         let lengths = lengths(&nominal);
         Search {
@@ -670,6 +674,9 @@ impl<'a> Search<'a> {
             }
         }
         for i in 0..fitted.setup.holds.len() {
+            if self.nominal.model.inputs[i].derivative_of().is_some() || !fitted.setup.data.input_moves(i) {
+                continue;
+            }
             for hold in [Hold::Zero, Hold::Linear, Hold::BandLimited] {
                 if hold == best.setup.holds[i] {
                     continue;

@@ -114,6 +114,8 @@ pub fn test(setup: &Setup, level: &Level, scale: &[f64], point: &Point) -> Optio
     let mut columns: Vec<(Vec<f64>, Vec<Vec<f64>>)> = Vec::new();
     let mut groups: Vec<(Variable, std::ops::Range<usize>)> = Vec::new();
     let pieces = &setup.data.pieces;
+    // A constant has no shape, and its products repeat what they are made of.
+    let inputs: Vec<usize> = (0..setup.system.nu).filter(|u| setup.data.input_varies(*u)).collect();
     for motion in &motions {
         let eval = |e: &Option<greybox_model::Expr>| {
             e.as_ref().and_then(|e| along.eval(std::slice::from_ref(e), &[])?.pop())
@@ -170,7 +172,7 @@ pub fn test(setup: &Setup, level: &Level, scale: &[f64], point: &Point) -> Optio
                 push(Variable::Product(motion.clone(), other.clone()), shapes(&times_series(d, &o), 9));
             }
         }
-        for u in 0..setup.system.nu {
+        for &u in &inputs {
             let series: Vec<Vec<f64>> = pieces.iter().map(|p| p.inputs[u].clone()).collect();
             push(Variable::Input(u, motion.clone()), shapes(&series, 7));
             for of in [&d, &v].into_iter().flatten() {
@@ -184,8 +186,7 @@ pub fn test(setup: &Setup, level: &Level, scale: &[f64], point: &Point) -> Optio
         let mut factors: Vec<Option<Vec<Vec<f64>>>> = vec![None];
         factors.extend([&d, &v].into_iter().flatten().cloned().map(Some));
         factors.extend(d.iter().map(|d| Some(times_series(d, d))));
-        factors
-            .extend((0..setup.system.nu).map(|u| Some(pieces.iter().map(|p| p.inputs[u].clone()).collect())));
+        factors.extend(inputs.iter().map(|&u| Some(pieces.iter().map(|p| p.inputs[u].clone()).collect())));
         for factor in factors {
             let gains = slow.iter().map(|shape| match &factor {
                 None => shape.clone(),

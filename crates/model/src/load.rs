@@ -445,8 +445,12 @@ fn read_input(name: &str, value: &Spanned<DeValue<'_>>) -> Result<(Input, bool),
     let table =
         table_of(value, &["unit", "hold", "channel"], &item, &format!("{name} = {{ unit = \"V\" }}"))?;
     let unit = read_unit(table, &item)?;
+    let channel = match table.get("channel") {
+        None => name.to_owned(),
+        Some(value) => string(value, &item)?.to_owned(),
+    };
     let hold = match table.get("hold") {
-        None => Hold::default(),
+        None => Input::usual_hold(&channel),
         Some(value) => {
             let text = string(value, &item)?;
             Hold::from_name(text).ok_or_else(|| {
@@ -454,10 +458,6 @@ fn read_input(name: &str, value: &Spanned<DeValue<'_>>) -> Result<(Input, bool),
                 bad(&item, format!("unknown hold \"{text}\""), value.span(), known)
             })?
         }
-    };
-    let channel = match table.get("channel") {
-        None => name.to_owned(),
-        Some(value) => string(value, &item)?.to_owned(),
     };
     let stated = unit.is_some();
     let unit = unit.unwrap_or_else(Unit::dimensionless);
@@ -542,14 +542,14 @@ fn check_names(model: &Model, place: &Place, source: &Source, parsed: &Parsed) -
         let reason = if model.state(name).is_some() {
             continue;
         } else if model.parameter(name).is_some() {
-            ("a parameter is constant, its derivative is zero", "remove the term, or declare a state")
-        } else if model.input(name).is_some() {
             (
-                "an input is known by its samples only, it has no derivative here",
-                "declare the measured derivative as an input of its own, or a state that follows this input",
+                "a parameter is constant, its derivative is zero",
+                "remove the term, or declare a state".to_owned(),
             )
+        } else if let Some(i) = model.input(name) {
+            ("an input has no primes", instead_of_primes(model, &model.inputs[i], *primes))
         } else if matches!(&**name, "t" | "pi") {
-            ("it has no derivative here", "write the derivative as a number")
+            ("it has no derivative here", "write the derivative as a number".to_owned())
         } else {
             return Err(undefined(model, place, name, at));
         };
@@ -559,6 +559,38 @@ fn check_names(model: &Model, place: &Place, source: &Source, parsed: &Parsed) -
         }
     }
     Ok(())
+}
+
+/// How to have the derivative of an input: as an input of its own, which is taken from the same channel.
+fn instead_of_primes(model: &Model, input: &Input, primes: u8) -> String {
+    let (name, column) = (&input.name, input.column());
+    if primes > 1 || input.derivative_of().is_some() {
+        return "record this derivative as a channel and declare it as an input of its own, or integrate the equation \
+                until no more than the first derivative of an input is left"
+            .to_owned();
+    }
+    let channel = format!("{column}'");
+    if let Some(known) = model.inputs.iter().find(|i| i.channel == channel) {
+        return format!("`{}` is this derivative: write `{}`", known.name, known.name);
+    }
+    let mut own = format!("d{name}");
+    while names(model).any(|n| *n == own) {
+        own.push('_');
+    }
+    let hold = match input.hold {
+        Hold::Zero => format!(
+            " (and `hold = \"linear\"` for `{name}` if it is a measured signal: one that is kept between its samples jumps)"
+        ),
+        Hold::Linear => String::new(),
+        Hold::BandLimited => ", with `hold = \"band_limited\"`".to_owned(),
+    };
+    // A unit that is not stated is not known yet.
+    let text = &input.unit.text;
+    let unit = if text == "1" { String::new() } else { format!("unit = \"{text}/s\", ") };
+    format!(
+        "declare the derivative of the channel in [inputs], `{own} = {{ {unit}channel = \"{channel}\" }}`{hold}, and write \
+         `{own}`"
+    )
 }
 
 fn undefined(model: &Model, place: &Place, name: &str, at: Range<usize>) -> Located {

@@ -41,12 +41,49 @@ pub enum Hold {
 pub struct Input {
     /// Name in the equations.
     pub name: String,
-    /// Channel of the recording.
+    /// Channel of the recording; `u'` is the derivative of the channel `u` with respect to time, unless the recording
+    /// has a channel of that very name.
     pub channel: String,
     /// Unit of the signal in the equations.
     pub unit: Unit,
     /// Behaviour between samples.
     pub hold: Hold,
+}
+
+impl Input {
+    /// The channel whose derivative this input is, where its channel is called `u'`.
+    ///
+    /// ```
+    /// # use greybox_model::Model;
+    /// let model = Model::from_toml(r#"
+    ///     [inputs]
+    ///     u  = { unit = "m" }
+    ///     du = { unit = "m/s", channel = "u'" }
+    ///     [states]
+    ///     x = { unit = "m" }
+    ///     [parameters]
+    ///     c = { value = 2, unit = "1/s" }
+    ///     [equations]
+    ///     base = "x'' + c*(x' - du) + c^2*(x - u) = 0"
+    /// "#, "base.toml")?;
+    /// assert_eq!(model.inputs[0].derivative_of(), None);
+    /// assert_eq!(model.inputs[1].derivative_of(), Some("u"));
+    /// # Ok::<(), greybox_model::ModelError>(())
+    /// ```
+    pub fn derivative_of(&self) -> Option<&str> {
+        self.channel.strip_suffix('\'').filter(|base| !base.is_empty())
+    }
+
+    /// The column of the recording that it is read from.
+    pub fn column(&self) -> &str {
+        self.derivative_of().unwrap_or(&self.channel)
+    }
+
+    /// The hold of an input that states none: the slope of the straight lines between the samples of a channel is
+    /// constant from each sample to the next.
+    pub(crate) fn usual_hold(channel: &str) -> Hold {
+        if channel.ends_with('\'') { Hold::Zero } else { Hold::default() }
+    }
 }
 
 /// A coordinate (or any other state) with its time derivatives up to `order - 1`.

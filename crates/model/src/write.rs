@@ -240,7 +240,8 @@ fn write_input(old: Option<&Item>, input: &Input) -> Item {
         if old.is_none() || table.get("unit").is_some() || input.unit.factor != 1.0 {
             write_unit(table, &input.unit);
         }
-        let hold = old_str(table, "hold").and_then(Hold::from_name).unwrap_or_default();
+        let usual = Input::usual_hold(&input.channel);
+        let hold = old_str(table, "hold").and_then(Hold::from_name).unwrap_or(usual);
         if hold != input.hold {
             set(table, "hold", Value::from(input.hold.name()));
         }

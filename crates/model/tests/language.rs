@@ -202,7 +202,12 @@ fn bad_files_name_place_and_mend() {
         ),
         ("ks*alpha = kt*v", "ks*alpa = kt*v", (19, 35), &["did you mean `alpha`?"]),
         ("B*theta'", "B*theta_dot", (19, 23), &["primes: `theta'`"]),
-        ("kt*v", "kt*v'", (19, 46), &["an input is known by its samples only"]),
+        (
+            "kt*v",
+            "kt*v'",
+            (19, 46),
+            &["an input has no primes", "`dv = { unit = \"V/s\", channel = \"v'\" }`", "and write `dv`"],
+        ),
         ("kt*v", "kt'*v", (19, 43), &["a parameter is constant"]),
         // syntax
         (hub, "J*theta'' + B*theta' - ks*alpha", (19, 40), &["equation \"hub\"", "needs one `=`", "`= 0`"]),

@@ -29,13 +29,15 @@ pub fn check(recording: &Recording, inputs: &[&str], outputs: &[&str]) -> Vec<Fi
     let mut findings = vec![sampling(recording)];
     findings.extend(recording.warnings.iter().cloned());
     findings.extend(unknown_channels(recording, inputs, outputs));
+    let moves = |name: &&str| recording.channel(name).is_some_and(|c| range_of_motion(&c.values).is_some());
+    let driven = inputs.iter().any(moves);
     for (c, channel) in recording.channels.iter().enumerate() {
         let role = match (inputs.contains(&channel.name.as_str()), outputs.contains(&channel.name.as_str())) {
             (true, false) => Role::Input,
             (false, true) => Role::Output,
             _ => Role::Unknown,
         };
-        findings.extend(check_channel(recording, c, role));
+        findings.extend(check_channel(recording, c, role, driven));
     }
     for input in inputs {
         for output in outputs {
@@ -45,14 +47,15 @@ pub fn check(recording: &Recording, inputs: &[&str], outputs: &[&str]) -> Vec<Fi
     findings
 }
 
-fn check_channel(recording: &Recording, c: usize, role: Role) -> Vec<Finding> {
+/// `driven`: some input of the recording moves.
+fn check_channel(recording: &Recording, c: usize, role: Role, driven: bool) -> Vec<Finding> {
     let channel = &recording.channels[c];
     let present: Vec<f64> = channel.values.iter().copied().filter(|v| !v.is_nan()).collect();
     let mut findings: Vec<Finding> = missing(channel, &recording.time).into_iter().collect();
     if present.is_empty() {
         return findings;
     }
-    if let Some(found) = flat(channel, &present, role) {
+    if let Some(found) = flat(channel, &present, role, driven) {
         findings.push(found);
         return findings;
     }
@@ -134,13 +137,27 @@ fn missing(channel: &Channel, time: &[f64]) -> Option<Finding> {
     Some(Finding::new(severity, "missing", message).on(&channel.name).value(count as f64, None))
 }
 
-fn flat(channel: &Channel, present: &[f64], role: Role) -> Option<Finding> {
-    let (low, high) = finite_range(present)?;
-    if high - low > 1e-12 * low.abs().max(high.abs()) {
+/// Smallest and largest value of a channel that moves.
+fn range_of_motion(values: &[f64]) -> Option<(f64, f64)> {
+    finite_range(values).filter(|(low, high)| high - low > 1e-12 * low.abs().max(high.abs()))
+}
+
+fn flat(channel: &Channel, present: &[f64], role: Role, driven: bool) -> Option<Finding> {
+    let (low, _) = finite_range(present)?;
+    if range_of_motion(present).is_some() {
         return None;
     }
     let value = quantity(low, channel.unit.as_deref());
     let finding = match role {
+        Role::Input if driven => Finding::new(
+            Severity::Info,
+            "constant_input",
+            format!(
+                "The input is a known constant here ({value}): what it multiplies cannot be told from a parameter by \
+                 this recording alone."
+            ),
+        )
+        .mend("If its effect matters, add a recording in which it has another value."),
         Role::Input => Finding::new(
             Severity::Warning,
             "excitation",

@@ -4,7 +4,7 @@
 pub mod control;
 pub mod identification;
 
-use greybox_calibrate::{Data, FreeRun};
+use greybox_calibrate::{Data, FreeRun, Setup, input_noise};
 use greybox_diagnose::diagnosis::{
     Basis as Ground, Estimate as Estimated, Finding as Found, Role as RoleRuns, Run,
 };
@@ -104,7 +104,9 @@ fn equation_names(list: &[String]) -> Names {
 /// What the training recordings reach.
 fn reach(d: &Diagnosis) -> Reach {
     let data = &d.train.data;
-    let inputs = d.nominal.inputs.iter().enumerate().map(|(u, input)| {
+    // What can be driven: no known constants, and no derivatives of other inputs.
+    let drives = |u: usize| data.input_moves(u) && d.nominal.inputs[u].derivative_of().is_none();
+    let inputs = d.nominal.inputs.iter().enumerate().filter(|(u, _)| drives(*u)).map(|(u, input)| {
         let values = || data.pieces.iter().filter_map(move |p| p.inputs.get(u)).flatten();
         let count = values().count().max(1) as f64;
         InputRange {
@@ -406,31 +408,40 @@ fn findings(d: &Diagnosis, sources: &Sources<'_>) -> Vec<Finding> {
             mend: Some("record the channel at rest, or sample it faster".to_string()),
         });
     }
+    if let Ok(setup) = Setup::new(&d.improved, d.train.data.clone(), Vec::new()) {
+        let run = &d.train.improved.run;
+        let found = input_noise::findings(&setup, &setup.values(), run, true);
+        out.extend(found.into_iter().map(|f| health_finding(f, None)));
+    }
     out.extend(health_findings(&d.nominal, sources.train.iter().chain(sources.holdout)));
     out
 }
 
+fn health_finding(f: greybox_recording::Finding, recording: Option<String>) -> Finding {
+    Finding {
+        severity: match f.severity {
+            Level::Info => Severity::Info,
+            Level::Warning => Severity::Warning,
+            Level::Problem => Severity::Error,
+        },
+        code: f.code.to_string(),
+        recording,
+        channel: f.channel,
+        message: f.message,
+        mend: f.mend,
+    }
+}
+
 /// What the health checks say about the channels that `model` uses.
 fn health_findings<'a>(model: &Model, recordings: impl Iterator<Item = &'a Recording>) -> Vec<Finding> {
-    let inputs: Vec<&str> = model.inputs.iter().map(|i| i.channel.as_str()).collect();
+    let inputs: Vec<&str> = model.inputs.iter().map(|i| i.column()).collect();
     let outputs: Vec<&str> = model.measurements.iter().map(|m| m.channel.as_str()).collect();
     let mut out = Vec::new();
     for recording in recordings {
         for f in health::check(recording, &inputs, &outputs) {
             let used = f.channel.as_deref().is_none_or(|c| inputs.contains(&c) || outputs.contains(&c));
             if used {
-                out.push(Finding {
-                    severity: match f.severity {
-                        Level::Info => Severity::Info,
-                        Level::Warning => Severity::Warning,
-                        Level::Problem => Severity::Error,
-                    },
-                    code: f.code.to_string(),
-                    recording: Some(recording.name.clone()),
-                    channel: f.channel,
-                    message: f.message,
-                    mend: f.mend,
-                });
+                out.push(health_finding(f, Some(recording.name.clone())));
             }
         }
     }

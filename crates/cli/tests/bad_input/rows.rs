@@ -654,6 +654,26 @@ fn equations() -> Vec<Row> {
         altered!(S, "a character of no meaning", "k*x = f", "k*x $ = f"),
         altered!(S, "an empty equation", "m*x'' + b*x' + k*x = f", ""),
         altered!(S, "a derivative of a parameter", "k*x = f", "k'*x = f"),
+        altered!(S, "a derivative of an input", "k*x = f", "k*x = f + b*f'"),
+        altered!(S, "a second derivative of an input", "k*x = f", "k*x = f + m*f''"),
+        altered!(
+            S,
+            "a derivative of an input that is kept between its samples",
+            "f = { unit = \"N\" }",
+            "f = { unit = \"N\", hold = \"zero\" }\ndf = { unit = \"N/s\", channel = \"f'\" }"
+        ),
+        altered!(
+            S,
+            "a derivative in the unit of what it is the derivative of",
+            "f = { unit = \"N\" }",
+            "f = { unit = \"N\" }\ndf = { unit = \"N\", channel = \"f'\" }"
+        ),
+        altered!(
+            S,
+            "a second derivative of a channel",
+            "f = { unit = \"N\" }",
+            "f = { unit = \"N\" }\nddf = { unit = \"N/s^2\", channel = \"f''\" }"
+        ),
         altered!(S, "more equations than states", "body =", "more = \"x' = 0\"\nbody ="),
         altered!(S, "an equation without a derivative", "m*x'' + b*x' + k*x = f", "k*x = f"),
         Row::new(
