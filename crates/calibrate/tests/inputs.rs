@@ -126,7 +126,8 @@ fn a_derivative_is_right_under_every_hold() {
     // The slope of a straight line is that of its middle.
     assert!(worst(run(""), 0.5 * DT) < 7.0 * (7.0 * DT).powi(2) / 20.0);
     assert!(worst(run(", hold = \"linear\""), 0.0) < 7.0 * (7.0 * DT).powi(2) / 5.0);
-    assert!(worst(run(", hold = \"band_limited\""), 0.0) < 7e-4);
+    let smooth = worst(run(", hold = \"band_limited\""), 0.0);
+    assert!(smooth < 2e-3, "{smooth}");
 }
 
 fn refusal(text: &str, run: &Recording) -> String {
@@ -317,8 +318,8 @@ mass = "m*x'' + b*x' + k*x = f"
         assert!(worst(&full_input, &input) < 1e-9, "{hold}");
         assert!(worst(&full, &simulated) < 1e-9, "{hold}: {}", worst(&full, &simulated));
         assert!(worst(&full, &y) < 2e-4, "{hold}: {}", worst(&full, &y));
-        // Whole rows left out: the grid is that of the shortest interval.
-        let rows = |k: usize| changes(k) || k < 60 || k % 7 == 3;
+        // Whole rows left out: half of each stretch between two changes.
+        let rows = |k: usize| k % 20 < 8 || k % 20 > 17 || k == n - 1;
         let (input, simulated) = run(log(&rows, false));
         assert_eq!(input.len(), n, "{hold}");
         assert!(worst(&full_input, &input) < 1e-9, "{hold}");

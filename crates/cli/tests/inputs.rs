@@ -232,3 +232,81 @@ fn check_takes_folders_and_finds_clocks_that_disagree() {
     bench
         .refuses(&["check", "runs", "runs/one_clock.csv"], &["one_clock.csv: this recording is named twice"]);
 }
+
+/// The cells of a recording of the spring written anew: row, time, f and x of a line.
+fn rewritten(header: &str, row: impl Fn(usize, &str, &str, &str) -> String) -> String {
+    let mut text = format!("{header}\n");
+    for (k, line) in recording(600, 0.0).lines().skip(1).enumerate() {
+        let cells: Vec<&str> = line.split(',').collect();
+        writeln!(text, "{}", row(k, cells[0], cells[1], cells[2])).unwrap();
+    }
+    text
+}
+
+/// Codes, channels and severities of the findings.
+fn codes(findings: &Value) -> Vec<(String, String, String)> {
+    let text = |f: &Value, key: &str| f[key].as_str().unwrap_or_default().to_owned();
+    let findings = findings.as_array().unwrap().iter();
+    findings.map(|f| (text(f, "code"), text(f, "channel"), text(f, "severity"))).collect()
+}
+
+#[test]
+fn a_noisy_input_is_told_and_a_command_is_not() {
+    let bench = bench();
+    let mut noise = spring::noise::Noise(7);
+    let errors: Vec<f64> = (0..600).map(|_| 0.1 * noise.normal()).collect();
+    let noisy = rewritten("t,f [N],x [mm]", |k, t, f, x| {
+        format!("{t},{:.6},{x}", f.parse::<f64>().unwrap() + errors[k])
+    });
+    bench.write("noisy.csv", &noisy);
+    let check = |file: &str| {
+        let outcome = bench.greybox(&["check", file, "--model", "model.toml", "--json"]);
+        assert_eq!(outcome.code, 0, "{}", outcome.stderr);
+        let document: Value = serde_json::from_str(&outcome.stdout).unwrap();
+        codes(&document["recordings"][0]["findings"])
+    };
+    let told = |severity: &str| ("input_noise".to_owned(), "f".to_owned(), severity.to_owned());
+    assert!(check("noisy.csv").contains(&told("info")));
+    assert!(!check("run.csv").iter().any(|(code, ..)| code == "input_noise"));
+    for command in [&["calibrate"] as &[&str], &["diagnose", "--work", "1"]] {
+        let findings = |file: &str| {
+            let outcome = bench.greybox(&[command, &["model.toml", file, "--out", "out"]].concat());
+            assert_eq!(outcome.code, 0, "{}", outcome.stderr);
+            codes(&serde_json::from_str::<Value>(&bench.read("out/report.json")).unwrap()["findings"])
+        };
+        assert!(findings("noisy.csv").contains(&told("warning")), "{command:?}");
+        assert!(!findings("run.csv").iter().any(|(code, ..)| code == "input_noise"), "{command:?}");
+    }
+}
+
+#[test]
+fn a_derivative_and_a_constant_are_inputs_as_any_other() {
+    let bench = bench();
+    let model = MODEL
+        .replace(
+            "f = { unit = \"N\" }",
+            "f = { unit = \"N\" }\ndf = { unit = \"N/s\", channel = \"f'\" }\nmp = { unit = \"kg\" }",
+        )
+        .replace("[equations]", "td = { value = 0.01, unit = \"s\" }\n[equations]")
+        .replace("m*x''", "(m + mp)*x''")
+        .replace("= f\"", "= f + td*df\"");
+    bench.write("lead.toml", &model);
+    bench.write("loaded.csv", &rewritten("t,f [N],mp [g],x [mm]", |_, t, f, x| format!("{t},{f},50,{x}")));
+    let outcome = bench.greybox(&["check", "loaded.csv", "--model", "lead.toml"]);
+    assert_eq!(outcome.code, 0, "{}", outcome.stderr);
+    for told in [
+        "input f (N, linear hold) and input df (its derivative, in N/s)",
+        "mp: The input is a known constant here (50 g)",
+    ] {
+        assert!(outcome.stdout.contains(told), "{}", outcome.stdout);
+    }
+    assert!(!outcome.stdout.contains("no channel of this name"), "{}", outcome.stdout);
+    // What is written is read again, the line of the derivative as it was.
+    let outcome = bench.greybox(&["calibrate", "lead.toml", "loaded.csv", "--out", "out"]);
+    assert_eq!(outcome.code, 0, "{}", outcome.stderr);
+    assert!(bench.read("out/model.toml").contains("df = { unit = \"N/s\", channel = \"f'\" }\n"));
+    let outcome = bench.greybox(&["simulate", "out/model.toml", "loaded.csv", "--out", "out.csv"]);
+    assert_eq!(outcome.code, 0, "{}", outcome.stderr);
+    let outcome = bench.greybox(&["diagnose", "lead.toml", "loaded.csv", "--work", "1", "--out", "found"]);
+    assert_eq!(outcome.code, 0, "{}", outcome.stderr);
+}

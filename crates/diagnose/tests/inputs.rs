@@ -85,12 +85,12 @@ fn constant_inputs_leave_a_calibration_and_a_diagnosis_finite() {
     let calibration = calibrate(&model, &train, &held, &Quiet).unwrap();
     let scores = [&calibration.train.0, &calibration.train.1, &calibration.holdout.1];
     assert!(scores.into_iter().flatten().all(|s| s.nrmse.is_finite()));
-    assert!(calibration.parameters.iter().all(|p| p.value.is_finite()));
+    assert!(calibration.parameters.iter().all(|p| p.calibrated.value.is_finite()));
     let d = diagnose(&model, &train, &held, &Options::default(), &Quiet).unwrap();
     let kinds: Vec<&str> = d.mechanisms.iter().map(|m| m.kind.as_str()).collect();
     assert_eq!(kinds, ["cubic_stiffness"]);
-    let m = d.parameters.iter().find(|p| p.name == "m").unwrap();
-    assert!((m.value - 1.0).abs() < 0.02, "{}", m.value);
+    let m = d.parameters.iter().find(|p| p.index == 0).unwrap();
+    assert!((m.improved.value - 1.0).abs() < 0.02, "{}", m.improved.value);
     assert!(d.remainder.share_of_residual.is_finite());
 }
 

@@ -187,6 +187,14 @@ fn poor_excitation_is_named() {
         constant.severity == Severity::Warning && constant.message.contains("constant (1.5 V)"),
         "{constant}"
     );
+    // Beside an input that moves it is a known constant.
+    let run = recording(&[("u", white(4, 2.0)), ("V", vec![7.4; N]), ("y", noisy_multisine())]);
+    let findings = check(&run, &["u", "V"], &["y"]);
+    let of_supply: Vec<&Finding> = findings.iter().filter(|f| f.channel.as_deref() == Some("V")).collect();
+    assert_eq!(
+        (of_supply.len(), of_supply[0].code, of_supply[0].severity),
+        (1, "constant_input", Severity::Info)
+    );
     let sine = input((0..N).map(|k| (2.0 * PI * 1.7 * DT * k as f64).sin()).collect());
     assert!(sine.severity == Severity::Warning && sine.message.contains("single sine of 1.7 Hz"), "{sine}");
     let sweep = input((0..N).map(|k| (2.0 * PI * 0.05 * (DT * k as f64).powi(2)).sin()).collect());
