@@ -109,7 +109,7 @@ fn told(setup: &Setup, found: &InputNoise, fitted: bool) -> Finding {
          what drives it, make it a state that this channel measures."
     };
     Finding::new(severity, "input_noise", message)
-        .on(input.column())
+        .on(&input.channel)
         .mend(mend)
         .value(found.sigma / input.unit.factor, Some(&input.unit.text))
 }

@@ -53,8 +53,9 @@ pub fn check(
         .iter()
         .map(|recording| match model {
             Some(model) => {
-                let feeds = |name: &str, unit: Option<&str>| feeds(model, name, unit);
-                let (inputs, outputs) = roles(model);
+                let has = |name: &str| recording.channel(name).is_some();
+                let feeds = |name: &str, unit: Option<&str>| feeds(model, name, unit, &has);
+                let (inputs, outputs) = roles(model, recording);
                 let mut findings = findings(recording, &inputs, &outputs);
                 findings.extend(plausible::findings(model, recording));
                 describe(recording, findings, feeds)
@@ -92,13 +93,13 @@ fn known(recording: &Recording, inputs: &[String]) -> Result<(), Failure> {
 
 /// The health of a recording, its channels in the roles that the model gives them.
 pub fn check_for_model(recording: &Recording, model: &Model) -> Vec<Finding> {
-    let (inputs, outputs) = roles(model);
+    let (inputs, outputs) = roles(model, recording);
     health::check(recording, &inputs, &outputs)
 }
 
-/// The channels that a model takes as inputs, and as measurements.
-fn roles(model: &Model) -> (Vec<&str>, Vec<&str>) {
-    let inputs = model.inputs.iter().map(|i| i.column()).collect();
+/// The channels of a recording that a model takes as inputs, and as measurements.
+fn roles<'a>(model: &'a Model, recording: &Recording) -> (Vec<&'a str>, Vec<&'a str>) {
+    let inputs = model.input_columns(|name| recording.channel(name).is_some());
     let outputs = model.measurements.iter().map(|m| m.channel.as_str()).collect();
     (inputs, outputs)
 }
@@ -121,13 +122,13 @@ fn check_with_inputs(recording: &Recording, inputs: &[String]) -> Vec<Finding> {
 }
 
 /// What the channel feeds in the model, in words.
-fn feeds(model: &Model, channel: &str, header: Option<&str>) -> Option<String> {
-    let input = model.inputs.iter().filter(|i| i.column() == channel);
+fn feeds(model: &Model, channel: &str, header: Option<&str>, has: &dyn Fn(&str) -> bool) -> Option<String> {
+    let input = model.inputs.iter().filter(|i| i.column(has) == channel);
     let measured = model.measurements.iter().filter(|m| m.channel == channel);
     let uses: Vec<String> = input
         .map(|i| match i.derivative_of() {
-            Some(_) => format!("input {} (its derivative, in {})", i.name, i.unit.text),
-            None => format!("input {} ({}, {} hold)", i.name, conversion(header, &i.unit), i.hold.name()),
+            Some(base) if base == channel => format!("input {} (its derivative, in {})", i.name, i.unit.text),
+            _ => format!("input {} ({}, {} hold)", i.name, conversion(header, &i.unit), i.hold.name()),
         })
         .chain(measured.map(|m| format!("measurement of {} ({})", m.expr, conversion(header, &m.unit))))
         .collect();

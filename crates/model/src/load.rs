@@ -563,7 +563,7 @@ fn check_names(model: &Model, place: &Place, source: &Source, parsed: &Parsed) -
 
 /// How to have the derivative of an input: as an input of its own, which is taken from the same channel.
 fn instead_of_primes(model: &Model, input: &Input, primes: u8) -> String {
-    let (name, column) = (&input.name, input.column());
+    let (name, column) = (&input.name, &input.channel);
     if primes > 1 || input.derivative_of().is_some() {
         return "record this derivative as a channel and declare it as an input of its own, or integrate the equation \
                 until no more than the first derivative of an input is left"

@@ -74,9 +74,10 @@ impl Input {
         self.channel.strip_suffix('\'').filter(|base| !base.is_empty())
     }
 
-    /// The column of the recording that it is read from.
-    pub fn column(&self) -> &str {
-        self.derivative_of().unwrap_or(&self.channel)
+    /// The column that it is read from in a recording with columns of which `has` tells: that of its channel, else that
+    /// whose derivative it is.
+    pub fn column(&self, has: impl Fn(&str) -> bool) -> &str {
+        self.derivative_of().filter(|_| !has(&self.channel)).unwrap_or(&self.channel)
     }
 
     /// The hold of an input that states none: the slope of the straight lines between the samples of a channel is
@@ -157,6 +158,18 @@ impl Model {
     /// Index of the input called `name`.
     pub fn input(&self, name: &str) -> Option<usize> {
         self.inputs.iter().position(|s| s.name == name)
+    }
+
+    /// The columns of a recording that the inputs are read from ([`Input::column`]), each once.
+    pub fn input_columns(&self, has: impl Fn(&str) -> bool) -> Vec<&str> {
+        let mut columns: Vec<&str> = Vec::with_capacity(self.inputs.len());
+        for input in &self.inputs {
+            let column = input.column(&has);
+            if !columns.contains(&column) {
+                columns.push(column);
+            }
+        }
+        columns
     }
 
     /// Index of the parameter called `name`.

@@ -434,10 +434,10 @@ fn health_finding(f: greybox_recording::Finding, recording: Option<String>) -> F
 
 /// What the health checks say about the channels that `model` uses.
 fn health_findings<'a>(model: &Model, recordings: impl Iterator<Item = &'a Recording>) -> Vec<Finding> {
-    let inputs: Vec<&str> = model.inputs.iter().map(|i| i.column()).collect();
     let outputs: Vec<&str> = model.measurements.iter().map(|m| m.channel.as_str()).collect();
     let mut out = Vec::new();
     for recording in recordings {
+        let inputs = model.input_columns(|name| recording.channel(name).is_some());
         for f in health::check(recording, &inputs, &outputs) {
             let used = f.channel.as_deref().is_none_or(|c| inputs.contains(&c) || outputs.contains(&c));
             if used {
