@@ -25,8 +25,9 @@ const DRAWS: u64 = 3;
 const SIGNAL: f64 = 0.3;
 /// So many of its samples are equal to the one before: an input that is kept, or rounded coarsely.
 const KEPT: f64 = 0.4;
-/// A simulation that leaves less than this part of what the noise would make of it shows that there is none.
-const REFUTED: f64 = 0.7;
+/// A simulation that leaves less than this part of what the noise would make of it shows that there is none. (A fit takes up
+/// some of it, and of a slow answer a recording holds few.)
+const REFUTED: f64 = 0.5;
 /// The noise explains a good part of what the simulation leaves.
 const LARGE: f64 = 0.5;
 
