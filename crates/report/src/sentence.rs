@@ -145,16 +145,18 @@ fn missing(report: &Report, out: &mut Vec<String>) {
 /// What the recordings cannot separate from a mechanism: each name once, and none that is its own.
 fn inseparable(mechanism: &Mechanism) -> Option<String> {
     let equivalent = || mechanism.alternatives.iter().filter(|alternative| alternative.equivalent);
-    let own = match equivalent().any(|a| a.kind == mechanism.kind) {
-        true => own_name(mechanism),
-        false => format::kind_in_sentence(&mechanism.kind),
-    };
-    let mut twins: Vec<String> = Vec::new();
-    for twin in equivalent().map(|alternative| alternative_name(alternative, mechanism)) {
-        if twin != own && !twins.contains(&twin) {
+    let kind = format::kind_in_sentence(&mechanism.kind);
+    let placed = own_name(mechanism);
+    let (mut twins, mut elsewhere): (Vec<String>, bool) = (Vec::new(), false);
+    for alternative in equivalent() {
+        let twin = alternative_name(alternative, mechanism);
+        // Of its own kind, one at another place says something.
+        if twin != kind && twin != placed && !twins.contains(&twin) {
             twins.push(twin);
+            elsewhere |= alternative.kind == mechanism.kind;
         }
     }
+    let own = if elsewhere { placed } else { kind };
     (!twins.is_empty())
         .then(|| format!("These recordings cannot separate {own} from {}.", joined(&twins, "or")))
 }
