@@ -201,11 +201,14 @@ pub fn experiment(subject: &Subject<'_>, reach: &Reach) -> Experiment {
 
 /// The experiment for a remainder without a name: the recordings again, louder.
 pub fn for_remainder(location: &Location, input: Option<&str>, reach: &Reach, shape: &str) -> Experiment {
-    let separate = format!(
-        "the residual looks like {shape}: slow sweeps over the whole range of that variable, at two amplitudes"
-    );
+    // Nobody sweeps time.
+    let (way, ask) = match shape.ends_with("with time") {
+        true => (Way::Again, "the same short experiment at the beginning and at the end of a long run"),
+        false => (Way::Loud, "slow sweeps over the whole range of that variable, at two amplitudes"),
+    };
+    let separate = format!("the residual looks like {shape}: {ask}");
     let subject = Subject { kind: "", rival: "", input, location, value: &|_| None, separate: &separate };
-    planned(Way::Loud, &subject, reach)
+    planned(way, &subject, reach)
 }
 
 fn planned(way: Way, subject: &Subject<'_>, reach: &Reach) -> Experiment {
@@ -497,6 +500,21 @@ mod tests {
         };
         assert_eq!(subject("step_disturbance", "periodic_disturbance").text, "record with v at zero");
         assert_eq!(subject("step_disturbance", "my_own").text, "record the same again, v up to 2 V");
+    }
+
+    #[test]
+    fn a_remainder_asks_for_its_variable_or_for_time() {
+        let told = |shape| for_remainder(&Location::default(), Some("v"), &reach(), shape).text;
+        assert_eq!(
+            told("a term that depends on h"),
+            "drive v as now, 2 V, and at up to 3 V: the residual looks like a term that depends on h: slow sweeps \
+             over the whole range of that variable, at two amplitudes"
+        );
+        assert_eq!(
+            told("a term that changes slowly with time"),
+            "record the same again, v up to 2 V: the residual looks like a term that changes slowly with time: the \
+             same short experiment at the beginning and at the end of a long run"
+        );
     }
 
     #[test]
