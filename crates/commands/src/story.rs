@@ -135,7 +135,8 @@ fn mechanism_in_words(number: usize, mechanism: &Mechanism) -> String {
             true => "these data cannot tell it apart".to_owned(),
             false => format!("confidence {}", format::probability(other.confidence)),
         };
-        let _ = write!(text, "   or {} ({standing})", format::kind_in_sentence(&other.kind));
+        let name = sentence::alternative_name(other, mechanism);
+        let _ = write!(text, "   or {name} ({standing})");
         if let Some(separate) = other.separate.as_deref().filter(|s| !s.is_empty()) {
             let _ = write!(text, "; to tell: {}", separate.trim_end_matches('.'));
         }

@@ -57,7 +57,11 @@ pub fn candidates(model: &Model, library: &[Mechanism], places: &[Place]) -> Vec
                 _ => false,
             };
             let candidate = Candidate { mechanism: i, place: place.clone(), mirrored: false };
-            if fits && candidate.has_units(model, mechanism) && !candidate.duplicates(model, mechanism) {
+            if fits
+                && place.admits(mechanism.domain, model)
+                && candidate.has_units(model, mechanism)
+                && !candidate.duplicates(model, mechanism)
+            {
                 let mirror = mechanism.mirror.then(|| Candidate { mirrored: true, ..candidate.clone() });
                 out.push(candidate);
                 out.extend(mirror);

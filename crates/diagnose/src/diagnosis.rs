@@ -21,6 +21,7 @@ use crate::search::{
     Fitted, Found, MOST_WORK, Part, Rival, Search, UNDECIDED, log_likelihood_gain, raw_rms, raw_rss, rms,
 };
 use crate::surface::{Surface, Variable, held_out};
+use crate::twins::{Twin, twins};
 use crate::uncertainty::Uncertainty;
 use crate::validate::Gain;
 use crate::{Observer, Stage};
@@ -148,6 +149,71 @@ pub struct Alternative {
     pub expression: String,
     /// The recording that would.
     pub separate: String,
+    /// Where it would act.
+    pub site: Site,
+}
+
+/// Where a mechanism acts, in the names of the model. Several channels, or several equations of one that acts on whole
+/// equations, are meant together.
+#[derive(Debug, Clone, PartialEq, Eq, Default)]
+pub struct Site {
+    /// Equations, the one that the report names first.
+    pub equations: Vec<String>,
+    /// Channels, for faults of sensors.
+    pub channels: Vec<String>,
+    /// Input, for a fault of the actuation.
+    pub input: Option<String>,
+    /// Parameter, for one that drifts.
+    pub drifting: Option<String>,
+}
+
+impl Site {
+    /// Of places that are meant together.
+    fn of(places: &[Place], model: &Model) -> Site {
+        let mut site = Site::default();
+        for place in places {
+            for name in place.equations(model) {
+                if !site.equations.contains(&name) {
+                    site.equations.push(name);
+                }
+            }
+            match place {
+                Place::Measurement(c) => site.channels.push(model.measurements[*c].channel.clone()),
+                Place::Input(u) => site.input = Some(model.inputs[*u].name.clone()),
+                Place::Parameter(p) => site.drifting = Some(model.parameters[*p].name.clone()),
+                _ => {}
+            }
+        }
+        site
+    }
+
+    /// Whether a reader takes the two for one place.
+    fn is(&self, other: &Site) -> bool {
+        let sorted = |names: &[String]| {
+            let mut names = names.to_vec();
+            names.sort();
+            names
+        };
+        sorted(&self.equations) == sorted(&other.equations)
+            && sorted(&self.channels) == sorted(&other.channels)
+            && self.input == other.input
+            && self.drifting == other.drifting
+    }
+}
+
+/// One entry per kind and place, the likeliest, and none that is the finding itself under its own name: those that the
+/// data cannot separate first.
+fn distinct(mut alternatives: Vec<Alternative>, kind: &str, site: &Site) -> Vec<Alternative> {
+    alternatives.sort_by(|a, b| b.equivalent.cmp(&a.equivalent).then(b.confidence.total_cmp(&a.confidence)));
+    let mut out: Vec<Alternative> = Vec::new();
+    for a in alternatives {
+        let known = (a.kind == kind && a.site.is(site))
+            || out.iter().any(|other| other.kind == a.kind && other.site.is(&a.site));
+        if !known {
+            out.push(a);
+        }
+    }
+    out
 }
 
 /// A mechanism that was found.
@@ -1211,30 +1277,49 @@ fn findings(
                     } else {
                         (weight(r.evidence.score) / (1.0 + others + nothing)).clamp(0.0, 0.99)
                     };
+                    let place = &r.candidate.place;
                     Alternative {
                         kind: m.kind.clone(),
                         confidence: probability,
                         equivalent: r.equivalent,
                         expression: r.instance.expression.to_string(),
-                        separate: m.about.separate.clone(),
+                        separate: m.separate(place.moves(nominal)).to_string(),
+                        site: Site::of(std::slice::from_ref(place), nominal),
                     }
                 })
                 .filter(|a| a.equivalent || a.confidence > 0.001)
                 .collect();
-            twins(&mut alternatives, mechanism, part.candidate.clone(), &setup, confidence);
+            let site = Site::of(std::slice::from_ref(&part.candidate.place), nominal);
+            let moves = part.candidate.place.moves(nominal);
+            declare_twins(
+                &mut alternatives,
+                twins(&setup.model, nominal, library, &part.candidate),
+                |twin| {
+                    let m = &library[twin.mechanism];
+                    let moves = twin.places.iter().any(|place| place.moves(nominal));
+                    Alternative {
+                        kind: m.kind.clone(),
+                        confidence,
+                        equivalent: true,
+                        expression: String::new(),
+                        separate: m.separate(moves).to_string(),
+                        site: Site::of(&twin.places, nominal),
+                    }
+                },
+            );
             for kind in mechanism.wider() {
                 alternatives.retain(|a| a.kind != kind);
-                let separate = library.iter().find(|m| m.kind == kind).map(|m| m.about.separate.clone());
+                let separate = library.iter().find(|m| m.kind == kind).map(|m| m.separate(moves).to_string());
                 alternatives.push(Alternative {
                     kind: kind.to_string(),
                     confidence,
                     equivalent: true,
                     expression: part.instance.expression.to_string(),
                     separate: separate.unwrap_or_default(),
+                    site: site.clone(),
                 });
             }
-            alternatives
-                .sort_by(|a, b| b.equivalent.cmp(&a.equivalent).then(b.confidence.total_cmp(&a.confidence)));
+            let alternatives = distinct(alternatives, &mechanism.kind, &site);
             let parameters = part
                 .instance
                 .names
@@ -1247,13 +1332,6 @@ fn findings(
                     Some((name.clone(), index, estimate))
                 })
                 .collect();
-            let (mut channel, mut input, mut drifting) = (None, None, None);
-            match &part.candidate.place {
-                Place::Measurement(c) => channel = Some(setup.model.measurements[*c].channel.clone()),
-                Place::Input(u) => input = Some(setup.model.inputs[*u].name.clone()),
-                Place::Parameter(p) => drifting = Some(setup.model.parameters[*p].name.clone()),
-                _ => {}
-            }
             let figures = mechanism
                 .report
                 .iter()
@@ -1262,7 +1340,7 @@ fn findings(
                 })
                 .collect();
             // Where the data cannot tell at which of several places it acts, all are named.
-            let mut places = part.candidate.place.equations(nominal);
+            let mut places = site.equations.clone();
             for rival in rivals.iter().filter(|r| r.equivalent) {
                 if library[rival.candidate.mechanism].kind == mechanism.kind {
                     for name in rival.candidate.place.equations(nominal) {
@@ -1277,9 +1355,9 @@ fn findings(
                 family: mechanism.family.clone(),
                 signature: mechanism.about.signature.clone(),
                 equations: places,
-                channel,
-                input,
-                drifting,
+                channel: site.channels.first().cloned(),
+                input: site.input.clone(),
+                drifting: site.drifting.clone(),
                 figures,
                 expression: part.instance.expression.to_string(),
                 parameters,
@@ -1287,7 +1365,7 @@ fn findings(
                 confidence,
                 alternatives,
                 location: crate::locate::Location {
-                    equations: part.candidate.place.equations(nominal),
+                    equations: site.equations,
                     ..locate(&setup, &along, mechanism, &part.instance)
                 },
                 evidence,
@@ -1297,54 +1375,20 @@ fn findings(
         .collect()
 }
 
-/// Algebraic twins that no recording of this kind can tell apart are declared even when they were not
-/// tried: an input offset and a constant force where the input enters linearly.
-fn twins(
+/// Algebraic twins that no recording of this kind can tell apart are declared even where they were not tried.
+fn declare_twins(
     alternatives: &mut Vec<Alternative>,
-    mechanism: &Mechanism,
-    candidate: crate::candidate::Candidate,
-    setup: &Setup,
-    confidence: f64,
+    twins: Vec<Twin>,
+    declared: impl Fn(&Twin) -> Alternative,
 ) {
-    let (twin, separate) = match mechanism.kind.as_str() {
-        "constant_offset" => (
-            "input_offset",
-            "another gain of the amplifier: an input offset scales with it, a constant force does not",
-        ),
-        "input_offset" => ("constant_offset", "the input switched off with the machine free to move"),
-        _ => return,
-    };
-    // Where the input enters linearly, both make the same constant in the equation.
-    let equations = candidate.place.equations(&setup.model);
-    let inputs = setup.model.inputs.iter().enumerate();
-    let driven = |(u, input): &(usize, &Input)| setup.data.input_moves(*u) && input.derivative_of().is_none();
-    let linear = inputs.filter(driven).any(|(_, input)| {
-        setup.model.equations.iter().any(|e| {
-            equations.contains(&e.name)
-                && e.residual().mentions(&input.name)
-                && e.residual()
-                    .derivative(&input.name, 0)
-                    .simplify()
-                    .variables()
-                    .iter()
-                    .all(|(n, _)| setup.model.parameter(n).is_some())
-        })
-    });
-    if !linear {
-        return;
-    }
-    match alternatives.iter_mut().find(|a| a.kind == twin) {
-        Some(a) => {
-            a.equivalent = true;
-            a.confidence = confidence;
+    for twin in twins.iter().map(declared) {
+        match alternatives.iter_mut().find(|a| a.kind == twin.kind && a.site.is(&twin.site)) {
+            Some(known) => {
+                known.equivalent = true;
+                known.confidence = twin.confidence;
+            }
+            None => alternatives.push(twin),
         }
-        None => alternatives.push(Alternative {
-            kind: twin.to_string(),
-            confidence,
-            equivalent: true,
-            expression: String::new(),
-            separate: separate.to_string(),
-        }),
     }
 }
 
@@ -1420,28 +1464,34 @@ fn remainder(improved: &Fitted, surface: Option<Surface>, significant: bool, lef
     let mut location = Location::default();
     let mut shape = None;
     let share = surface.as_ref().map_or(0.0, |s| s.gain.clamp(0.0, 1.0) * left.min(1.0));
+    let force = |m: &Motion| match Place::Motion(m.clone()).moves(model) {
+        true => "a force",
+        false => "a term",
+    };
     if significant && let Some(Surface { variable: Some((variable, _)), .. }) = &surface {
         let (motion, text) = match variable {
-            Variable::Position(m) => (m, m.position.as_ref().map(|e| format!("a force that depends on {e}"))),
-            Variable::Rate(m) => (m, m.rate.as_ref().map(|e| format!("a force that depends on {e}"))),
+            Variable::Position(m) => {
+                (m, m.position.as_ref().map(|e| format!("{} that depends on {e}", force(m))))
+            }
+            Variable::Rate(m) => (m, m.rate.as_ref().map(|e| format!("{} that depends on {e}", force(m)))),
             Variable::Both(m) => (
                 m,
                 match (&m.position, &m.rate) {
-                    (Some(d), Some(v)) => Some(format!("a force that depends on {d} and {v} together")),
+                    (Some(d), Some(v)) => Some(format!("{} that depends on {d} and {v} together", force(m))),
                     _ => None,
                 },
             ),
             Variable::Product(m, o) => (
                 m,
                 match (&m.position, &o.position) {
-                    (Some(d), Some(o)) => Some(format!("a force that depends on {d} and {o} together")),
+                    (Some(d), Some(o)) => Some(format!("{} that depends on {d} and {o} together", force(m))),
                     _ => None,
                 },
             ),
             Variable::Input(u, m) => {
-                (m, Some(format!("a force that depends on the input {}", model.inputs[*u].name)))
+                (m, Some(format!("{} that depends on the input {}", force(m), model.inputs[*u].name)))
             }
-            Variable::Time(m) => (m, Some("a force that changes slowly with time".to_string())),
+            Variable::Time(m) => (m, Some(format!("{} that changes slowly with time", force(m)))),
         };
         location.equations = Place::Motion(motion.clone()).equations(model);
         shape = text;
@@ -1547,4 +1597,66 @@ pub fn calibrate(
         train_runs,
         holdout_runs,
     })
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn alternative(kind: &str, equations: &[&str], confidence: f64, equivalent: bool) -> Alternative {
+        let equations = equations.iter().map(|e| (*e).to_string()).collect();
+        Alternative {
+            kind: kind.into(),
+            confidence,
+            equivalent,
+            expression: String::new(),
+            separate: String::new(),
+            site: Site { equations, ..Site::default() },
+        }
+    }
+
+    #[test]
+    fn alternatives_are_listed_once_by_kind_and_place() {
+        let input = |name: &str| Alternative {
+            site: Site { input: Some(name.into()), ..Site::default() },
+            ..alternative("input_offset", &[], 0.3, true)
+        };
+        let all = vec![
+            alternative("viscous_friction", &["hub"], 0.1, false),
+            alternative("presliding_friction", &["hub"], 0.4, true),
+            alternative("presliding_friction", &["link"], 0.2, true),
+            alternative("viscous_friction", &["hub"], 0.2, false),
+            alternative("coupling", &["link", "hub"], 0.1, true),
+            alternative("coupling", &["hub", "link"], 0.3, false),
+            input("u"),
+            input("v"),
+        ];
+        let own = Site { equations: vec!["hub".into()], ..Site::default() };
+        let left = distinct(all, "presliding_friction", &own);
+        let told: Vec<(&str, f64)> = left.iter().map(|a| (a.kind.as_str(), a.confidence)).collect();
+        assert_eq!(
+            told,
+            [
+                ("input_offset", 0.3),
+                ("input_offset", 0.3),
+                ("presliding_friction", 0.2),
+                ("coupling", 0.1),
+                ("viscous_friction", 0.2),
+            ]
+        );
+        assert_eq!(left[2].site.equations, ["link"], "the finding's own name and place are not listed again");
+    }
+
+    #[test]
+    fn twins_that_were_tried_become_equivalent_and_the_others_are_added() {
+        let mut all = vec![alternative("sensor_offset", &["hub"], 0.1, false)];
+        let twin = |e| Twin { mechanism: 0, places: vec![Place::Equation(e)] };
+        declare_twins(&mut all, vec![twin(0), twin(1)], |twin| {
+            let name = if twin.places == [Place::Equation(0)] { "hub" } else { "link" };
+            alternative("sensor_offset", &[name], 0.6, true)
+        });
+        let told: Vec<(&str, f64, bool)> =
+            all.iter().map(|a| (a.site.equations[0].as_str(), a.confidence, a.equivalent)).collect();
+        assert_eq!(told, [("hub", 0.6, true), ("link", 0.6, true)]);
+    }
 }

@@ -3,6 +3,7 @@
 //! ```toml
 //! kind   = "presliding_friction"
 //! family = "friction"
+//! domain = "mechanical"          # optional: makes no sense in a thermal or an electrical equation
 //! on     = "motion"              # motion | equation | input | measurement | parameter | spring | …
 //! force  = "s0*z"                # `replace = "…"` for an input (u), measurement (y), parameter (p), spring (k*d)
 //! linear = ["s0"]                # enter linearly: the score test gives their first values
@@ -24,6 +25,7 @@
 //! signature = "…"
 //! confused_with = ["…"]
 //! separate = "…"
+//! elsewhere = "…"                # optional: the same where nothing moves (a temperature, a level, a voltage)
 //! physics = "…"                  # optional, for the book: where it comes from
 //! parameters = { s0 = "…" }      # optional: what each parameter is
 //! ```
@@ -108,6 +110,14 @@ impl On {
     pub fn replaces(self) -> bool {
         matches!(self, On::Input | On::Measurement | On::Parameter | On::Spring | On::Feedback)
     }
+}
+
+/// The physics to which a mechanism belongs.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Deserialize)]
+#[serde(rename_all = "lowercase")]
+pub enum Domain {
+    /// Bodies that move: it is no candidate where the units show a thermal or an electrical equation.
+    Mechanical,
 }
 
 /// A parameter that does not enter linearly.
@@ -211,6 +221,9 @@ pub struct About {
     pub confused_with: Vec<String>,
     /// The recording that would separate them.
     pub separate: String,
+    /// The same where nothing moves: for the equation of a temperature, a level, a voltage.
+    #[serde(default)]
+    pub elsewhere: String,
     /// Where it comes from, and its source in the field.
     #[serde(default)]
     pub physics: String,
@@ -226,6 +239,8 @@ pub struct Mechanism {
     pub kind: String,
     /// Family of kinds.
     pub family: String,
+    /// The only physics in which it makes sense, if there is one.
+    pub domain: Option<Domain>,
     /// What it acts on.
     pub on: On,
     /// The force, or the replacement.
@@ -332,6 +347,7 @@ fn line_of(text: &str, section: &str, key: &str) -> Option<usize> {
 struct File {
     kind: String,
     family: String,
+    domain: Option<Domain>,
     on: On,
     force: Option<String>,
     reaction: Option<String>,
@@ -462,6 +478,7 @@ impl Mechanism {
         let mut mechanism = Mechanism {
             kind: raw.kind,
             family: raw.family,
+            domain: raw.domain,
             on: raw.on,
             law,
             reaction: raw.reaction.as_deref().map(|t| expression(t, "", "reaction")).transpose()?,
@@ -500,6 +517,28 @@ impl Mechanism {
         mechanism.check_data()?;
         mechanism.check_linear()?;
         Ok(mechanism)
+    }
+
+    /// The recording that separates it from others, in the words of what moves or of what does not.
+    pub fn separate(&self, moves: bool) -> &str {
+        if moves || self.about.elsewhere.is_empty() { &self.about.separate } else { &self.about.elsewhere }
+    }
+
+    /// Whether it is a constant and nothing else: a force, or what is added to an input or a measurement.
+    pub fn is_constant(&self) -> bool {
+        let [own] = &self.own[..] else { return false };
+        let added = |name: &str| {
+            let (symbol, own) = (Expr::var(name), Expr::var(own));
+            self.law == symbol.clone() + own.clone() || self.law == own + symbol
+        };
+        self.states.is_empty()
+            && self.doubts.is_empty()
+            && match self.on {
+                On::Equation => self.law == Expr::var(own),
+                On::Input => added("u"),
+                On::Measurement => added("y"),
+                _ => false,
+            }
     }
 
     /// Every name given to a parameter or a shape.
@@ -1206,6 +1245,37 @@ mod tests {
         assert_eq!(Mechanism::from_toml(&text, "x.toml").unwrap().parameters().collect::<Vec<_>>(), ["fc"]);
     }
 
+    #[test]
+    fn words_and_domain_are_those_of_the_file() {
+        let read = |text: &str| Mechanism::from_toml(text, "x.toml").unwrap();
+        let body = "force = \"kx*d\"\nlinear = [\"kx\"]";
+        let plain = read(&format!("{HEAD}{body}{TAIL}"));
+        assert_eq!((plain.domain, plain.separate(true), plain.separate(false)), (None, "e", "e"));
+        let both = read(&format!("{HEAD}domain = \"mechanical\"\n{body}{TAIL}elsewhere = \"s\"\n"));
+        assert_eq!(both.domain, Some(Domain::Mechanical));
+        assert_eq!((both.separate(true), both.separate(false)), ("e", "s"));
+    }
+
+    #[test]
+    fn constants_are_told_by_their_law() {
+        let constants: Vec<String> =
+            built_in().unwrap().into_iter().filter(Mechanism::is_constant).map(|m| m.kind).collect();
+        assert_eq!(constants, ["constant_offset", "input_offset", "sensor_offset"]);
+    }
+
+    /// What is said where nothing moves names nothing that moves.
+    #[test]
+    fn words_elsewhere_are_not_those_of_mechanics() {
+        for mechanism in built_in().unwrap() {
+            let words = &mechanism.about.elsewhere;
+            for mechanical in
+                ["motion", "resonance", "travel", "speed", "machine", "friction", "gravity", "turn"]
+            {
+                assert!(!words.contains(mechanical), "{}: {words}", mechanism.kind);
+            }
+        }
+    }
+
     /// Every way to be wrong, the line it is found on (three stand before the text), and what must be said.
     #[test]
     fn wrong_files_are_refused_with_line_and_mend() {
@@ -1216,6 +1286,7 @@ mod tests {
             ("force = \"d", 4, "invalid basic string"),
             ("force = \"d\"\ncolour = 1", 5, "unknown field `colour`, expected one of"),
             ("force = \"d\"\nlinear = \"fc\"", 5, "expected a sequence"),
+            ("force = \"d\"\ndomain = \"thermal\"", 5, "unknown variant `thermal`, expected `mechanical`"),
             ("force = \"d\"\n[about]\nseperate = \"\"", 6, "unknown field `seperate`"),
             ("force = \"d\"\n[location]\nwhere = \"d\"", 6, "unknown field `where`"),
             // the law

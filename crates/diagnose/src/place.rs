@@ -12,6 +12,8 @@
 
 use greybox_model::{Dimension, Expr, Model};
 
+use crate::library::Domain;
+
 /// A place of the model.
 #[derive(Debug, Clone, PartialEq)]
 pub enum Place {
@@ -101,6 +103,66 @@ impl Place {
                     }
                 }
                 names
+            }
+        }
+    }
+}
+
+/// What an equation is about, as far as its order and its units show.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+enum Realm {
+    /// Something moves: its coordinate is of second order, or a velocity.
+    Motion,
+    /// Heat or electricity: of first order, with the units of either.
+    ThermalOrElectrical,
+    /// Something else of first order, or unknown.
+    Other,
+}
+
+fn realm(model: &Model, equation: usize, own: Option<usize>) -> Realm {
+    let Some(state) = own.map(|j| &model.states[j]) else { return Realm::Other };
+    let unit = state.unit.dimension;
+    if state.order > 1 || is_velocity(&unit) {
+        return Realm::Motion;
+    }
+    // The exponents of A and K.
+    let shows = |d: &Dimension| d.0[3] != 0.0 || d.0[4] != 0.0;
+    let length = Dimension([1.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0]);
+    let power = Dimension([2.0, 1.0, -3.0, 0.0, 0.0, 0.0, 0.0]);
+    // A position or an angle may be driven by a voltage.
+    let position = unit.is_none() || unit.same(&length);
+    let balance = || model.dimension_of(&model.equations[equation].residual()).ok();
+    match shows(&unit) || (!position && balance().is_some_and(|d| shows(&d) || d.same(&power))) {
+        true => Realm::ThermalOrElectrical,
+        false => Realm::Other,
+    }
+}
+
+impl Place {
+    fn realms(&self, model: &Model) -> Vec<Realm> {
+        let own = own_coordinates(model);
+        let names = self.equations(model);
+        let of = |name: &String| {
+            let e = model.equation(name)?;
+            Some(realm(model, e, own.get(e).copied().flatten()))
+        };
+        names.iter().filter_map(of).collect()
+    }
+
+    /// Whether something moves in one of its equations, or nothing is known of them.
+    pub fn moves(&self, model: &Model) -> bool {
+        let realms = self.realms(model);
+        realms.is_empty() || realms.contains(&Realm::Motion)
+    }
+
+    /// Whether a mechanism of this domain makes sense there: bodies do not rub in a thermal or an electrical equation.
+    /// Where units do not show what an equation is about, everything does.
+    pub fn admits(&self, domain: Option<Domain>, model: &Model) -> bool {
+        match domain {
+            None => true,
+            Some(Domain::Mechanical) => {
+                let realms = self.realms(model);
+                realms.is_empty() || realms.iter().any(|r| *r != Realm::ThermalOrElectrical)
             }
         }
     }
@@ -424,4 +486,65 @@ fn is_velocity(d: &Dimension) -> bool {
     // m/s, or 1/s (rad/s)
     let d = d.0;
     d[2] == -1.0 && d[1] == 0.0 && d[3..].iter().all(|v| *v == 0.0) && (d[0] == 1.0 || d[0] == 0.0)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    const ROOM: &str = r#"
+        [inputs]
+        P = { unit = "W" }
+        [states]
+        T = { unit = "K" }
+        h = { unit = "m" }
+        q = { unit = "C" }
+        x = { unit = "m" }
+        w = { unit = "rad/s" }
+        s = { unit = "m" }
+        [parameters]
+        C = { value = 1.0, unit = "J/K" }
+        G = { value = 1.0, unit = "W/K" }
+        A = { value = 1.0, unit = "m^2" }
+        r = { value = 1.0, unit = "m^2/s" }
+        R = { value = 1.0, unit = "Ohm" }
+        D = { value = 1.0, unit = "F" }
+        m = { value = 1.0, unit = "kg" }
+        k = { value = 1.0, unit = "N/m" }
+        J = { value = 1.0, unit = "kg m^2" }
+        b = { value = 1.0, unit = "N m s" }
+        E = { value = 1.0, unit = "V s/m" }
+        e = { value = 1.0, unit = "V/m" }
+        [equations]
+        room    = "C*T' + G*T = P"
+        tank    = "A*h' + r*h = 0"
+        circuit = "R*q' + q/D = 0"
+        slide   = "m*x'' + k*x = 0"
+        rotor   = "J*w' + b*w = 0"
+        servo   = "E*s' + e*s = 0"
+    "#;
+
+    #[test]
+    fn units_and_order_show_what_an_equation_is_about() {
+        let model = Model::from_toml(ROOM, "room.toml").unwrap();
+        let own = own_coordinates(&model);
+        let realms: Vec<Realm> = own.iter().enumerate().map(|(e, own)| realm(&model, e, *own)).collect();
+        use Realm::{Motion, Other, ThermalOrElectrical};
+        assert_eq!(realms, [ThermalOrElectrical, Other, ThermalOrElectrical, Motion, Motion, Other]);
+        let moves: Vec<bool> = (0..6).map(|e| Place::Equation(e).moves(&model)).collect();
+        assert_eq!(moves, [false, false, false, true, true, false]);
+        let admits = |e| Place::Equation(e).admits(Some(Domain::Mechanical), &model);
+        assert_eq!((0..6).map(admits).collect::<Vec<bool>>(), [false, true, false, true, true, true]);
+        assert!((0..6).all(|e| Place::Equation(e).admits(None, &model)));
+        // Without units nothing is known, and nothing is left out.
+        let bare: String = ROOM
+            .lines()
+            .map(|line| match line.split_once("unit = ") {
+                Some((before, _)) => format!("{}}}\n", before.trim_end_matches([',', ' '])),
+                None => format!("{line}\n"),
+            })
+            .collect();
+        let bare = Model::from_toml(&bare, "bare.toml").unwrap();
+        assert!((0..6).all(|e| Place::Equation(e).admits(Some(Domain::Mechanical), &bare)));
+    }
 }

@@ -425,7 +425,7 @@ impl Recall {
                 .iter()
                 .map(|(n, p)| {
                     let name = signal(n, *p);
-                    Input { channel: name.clone(), name, unit: none(), hold: Hold::Linear }
+                    Input { channel: name.clone(), name, unit: none(), hold: Hold::Linear, range: None }
                 })
                 .collect(),
             states: mechanism

@@ -252,7 +252,7 @@ fn tank(seed: u64) -> Recording {
         .unwrap()
 }
 
-/// A root is no sum of springs, however well three of them follow it: what is missing is a force that depends on the
+/// A root is no sum of springs, however well three of them follow it: what is missing is a term that depends on the
 /// level, all of it.
 #[test]
 fn a_law_that_can_be_pieced_together_is_not() {
@@ -263,7 +263,7 @@ fn a_law_that_can_be_pieced_together_is_not() {
         found.verdict == Verdict::Unexplained
             && found.remainder.significant
             && found.remainder.share_of_residual > 0.9
-            && found.remainder.shape.as_deref() == Some("a force that depends on h")
+            && found.remainder.shape.as_deref() == Some("a term that depends on h")
     });
     let unexplained = unexplained.count();
     assert!(unexplained >= 3, "{unexplained} of 4");

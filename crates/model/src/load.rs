@@ -442,8 +442,12 @@ fn declare(
 
 fn read_input(name: &str, value: &Spanned<DeValue<'_>>) -> Result<(Input, bool), Located> {
     let item = format!("input `{name}`");
-    let table =
-        table_of(value, &["unit", "hold", "channel"], &item, &format!("{name} = {{ unit = \"V\" }}"))?;
+    let table = table_of(
+        value,
+        &["unit", "hold", "channel", "range"],
+        &item,
+        &format!("{name} = {{ unit = \"V\" }}"),
+    )?;
     let unit = read_unit(table, &item)?;
     let channel = match table.get("channel") {
         None => name.to_owned(),
@@ -461,7 +465,22 @@ fn read_input(name: &str, value: &Spanned<DeValue<'_>>) -> Result<(Input, bool),
     };
     let stated = unit.is_some();
     let unit = unit.unwrap_or_else(Unit::dimensionless);
-    Ok((Input { name: name.to_owned(), channel, unit, hold }, stated))
+    let range = table.get("range").map(|given| read_range(given, unit.factor, &item)).transpose()?;
+    Ok((Input { name: name.to_owned(), channel, unit, hold, range }, stated))
+}
+
+/// `[low, high]` in the unit of the input.
+fn read_range(given: &Spanned<DeValue<'_>>, factor: f64, item: &str) -> Result<[f64; 2], Located> {
+    let wrong = |found: String| {
+        let help = "write the lowest and the highest value that the actuator can make: `range = [-10, 10]`";
+        bad(item, format!("`range` must be two rising numbers, found {found}"), given.span(), help)
+    };
+    let DeValue::Array(list) = given.get_ref() else { return Err(wrong(kind(given.get_ref()))) };
+    let [low, high] = list.iter().collect::<Vec<_>>()[..] else {
+        return Err(wrong(format!("{} in a list", list.len())));
+    };
+    let range = [quantity(factor, low, "range", item)?, quantity(factor, high, "range", item)?];
+    if range[0] < range[1] { Ok(range) } else { Err(wrong("one that is not below the other".to_owned())) }
 }
 
 fn read_state(name: &str, value: &Spanned<DeValue<'_>>) -> Result<(State, bool), Located> {

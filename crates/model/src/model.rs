@@ -48,6 +48,8 @@ pub struct Input {
     pub unit: Unit,
     /// Behaviour between samples.
     pub hold: Hold,
+    /// Lowest and highest value that the actuator can make, SI, if stated.
+    pub range: Option<[f64; 2]>,
 }
 
 impl Input {

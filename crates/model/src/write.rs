@@ -248,6 +248,22 @@ fn write_input(old: Option<&Item>, input: &Input) -> Item {
         if old_str(table, "channel").unwrap_or(&input.name) != input.channel {
             set(table, "channel", Value::from(input.channel.as_str()));
         }
+        let factor = input.unit.factor;
+        let old = table.get("range").and_then(Item::as_array).map(|list| {
+            list.iter()
+                .map(|v| v.as_float().or_else(|| v.as_integer().map(|i| i as f64)).map(|v| v * factor))
+                .collect::<Option<Vec<f64>>>()
+        });
+        match input.range {
+            Some(range) if old.flatten().is_some_and(|old| old == range) => {}
+            Some(range) => {
+                let list: Array = range.iter().map(|v| decimal(v / factor)).collect();
+                set(table, "range", Value::Array(list));
+            }
+            None => {
+                table.remove("range");
+            }
+        }
     })
 }
 

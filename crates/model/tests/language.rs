@@ -54,7 +54,7 @@ fn reads_the_flexible_link() {
 fn values_become_si_at_the_edge() {
     let text = r#"
         [inputs]
-        u = { unit = "mA", channel = "current", hold = "zero" }
+        u = { unit = "mA", channel = "current", hold = "zero", range = [-250, 500] }
         [states]
         y = { unit = "deg", initial = [90, 180] }
         i = { unit = "A", measured = false, initial = 1 }
@@ -72,6 +72,7 @@ fn values_become_si_at_the_edge() {
     "#;
     let model = Model::from_toml(text, "si.toml").unwrap();
     assert_eq!(model.inputs[0].hold, Hold::Zero);
+    assert_eq!(model.inputs[0].range, Some([-0.25, 0.5]));
     assert_eq!(
         model.states[0].initial,
         [90.0 * (std::f64::consts::PI / 180.0), 180.0 * (std::f64::consts::PI / 180.0)]
@@ -180,6 +181,15 @@ fn bad_files_name_place_and_mend() {
         // keys and values
         ("[parameters]", "[paramters]", (10, 2), &["unknown key `paramters`", "did you mean `parameters`"]),
         ("hold = \"linear\"", "hold = \"spline\"", (4, 26), &["unknown hold \"spline\"", "band_limited"]),
+        (
+            "hold = \"linear\"",
+            "range = 10",
+            (4, 27),
+            &["`range` must be two rising numbers", "range = [-10, 10]"],
+        ),
+        ("hold = \"linear\"", "range = [1, 2, 3]", (4, 27), &["input `v`", "found 3 in a list"]),
+        ("hold = \"linear\"", "range = [5, -5]", (4, 27), &["found one that is not below the other"]),
+        ("hold = \"linear\"", "range = [-5, \"a\"]", (4, 32), &["`range` must be a number"]),
         ("hold = \"linear\"", "holds = \"linear\"", (4, 19), &["unknown key `holds` in input `v`", "`hold`"]),
         ("std = 0.0002", "std = -1", (11, 47), &["parameter `J`", "`std` must be positive, found -1"]),
         ("value = 0.0021", "value = nan", (11, 16), &["finite", "nan"]),

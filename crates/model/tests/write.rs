@@ -103,6 +103,20 @@ fn only_what_changed_is_rewritten() {
 }
 
 #[test]
+fn a_range_stays_as_written_until_it_changes() {
+    let (text, _) = drive();
+    let text = text.replace("{unit=\"V\"}", "{unit=\"mV\", range = [-1_000, 2.5e3]}");
+    let mut model = load(&text);
+    assert_eq!(write(&model, &text), text);
+    model.inputs[0].range = Some([-1.0, 2.0]);
+    let changed = write(&model, &text);
+    assert_eq!(changed, text.replace("[-1_000, 2.5e3]", "[-1000.0, 2000.0]"));
+    assert_eq!(load(&changed).inputs[0].range, Some([-1.0, 2.0]));
+    model.inputs[0].range = None;
+    assert!(!write(&model, &text).contains("range"));
+}
+
+#[test]
 fn new_states_come_with_their_equations() {
     let (text, mut model) = drive();
     model.replace("u", 0, &Expr::var("ua"));

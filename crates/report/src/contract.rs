@@ -294,7 +294,7 @@ pub struct Parameter {
 }
 
 /// An explanation that was considered beside the reported one.
-#[derive(Debug, Clone, PartialEq, Serialize, Deserialize, JsonSchema)]
+#[derive(Debug, Clone, PartialEq, Default, Serialize, Deserialize, JsonSchema)]
 pub struct Alternative {
     /// Kind of the mechanism library.
     pub kind: String,
@@ -311,6 +311,18 @@ pub struct Alternative {
     /// The recording that would separate the two, in plain language.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub separate: Option<String>,
+    /// Equation or equations in which it would act.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub equation: Option<Names>,
+    /// Channel of the recording, for a fault of a sensor; several where only their faults together are the alternative.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub channel: Option<Names>,
+    /// Input that it would stand in for.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub replaces: Option<String>,
+    /// Parameter that would drift.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub drifting: Option<String>,
 }
 
 /// Where something acts: in which equation, when, in which part of the state space, at which frequencies.

@@ -10,7 +10,7 @@ use greybox_diagnose::diagnosis::{
 };
 use greybox_diagnose::locate::{Location as Located, spectrum};
 use greybox_diagnose::{Calibration, Diagnosis, Verdict as Answer};
-use greybox_model::{Dimension, Model, Unit, WriteOptions};
+use greybox_model::{Dimension, Expr, Func, Model, Unit, WriteOptions};
 use greybox_recording::{Correlation, Recording, Severity as Level, health};
 
 use crate::contract::*;
@@ -101,6 +101,10 @@ fn equation_names(list: &[String]) -> Names {
     }
 }
 
+fn some_names(list: &[String]) -> Option<Names> {
+    (!list.is_empty()).then(|| equation_names(list))
+}
+
 /// What the training recordings reach.
 fn reach(d: &Diagnosis) -> Reach {
     let data = &d.train.data;
@@ -108,12 +112,19 @@ fn reach(d: &Diagnosis) -> Reach {
     let drives = |u: usize| data.input_moves(u) && d.nominal.inputs[u].derivative_of().is_none();
     let inputs = d.nominal.inputs.iter().enumerate().filter(|(u, _)| drives(*u)).map(|(u, input)| {
         let values = || data.pieces.iter().filter_map(move |p| p.inputs.get(u)).flatten();
-        let count = values().count().max(1) as f64;
+        let known = || values().filter(|v| v.is_finite());
+        let count = known().count().max(1) as f64;
+        let ends = known().fold(None, |ends: Option<[f64; 2]>, v| {
+            Some(ends.map_or([*v, *v], |[low, high]| [low.min(*v), high.max(*v)]))
+        });
+        let reached = ends.unwrap_or([0.0, 0.0]);
+        let factor = input.unit.factor;
         InputRange {
             name: input.name.clone(),
             unit: input.unit.text.clone(),
-            rms: (values().map(|v| v * v).sum::<f64>() / count).sqrt() / input.unit.factor,
-            largest: values().fold(0.0f64, |m, v| m.max(v.abs())) / input.unit.factor,
+            rms: (known().map(|v| v * v).sum::<f64>() / count).sqrt() / factor,
+            reached: reached.map(|v| v / factor),
+            stated: stated(&d.nominal, u, reached).map(|ends| ends.map(|v| v / factor)),
         }
     });
     let mut coordinates = Ordered::new();
@@ -131,6 +142,59 @@ fn reach(d: &Diagnosis) -> Reach {
         first += state.order;
     }
     Reach { inputs: inputs.collect(), coordinates, dt: data.pieces.iter().map(|p| p.dt).fold(0.0, f64::max) }
+}
+
+/// How far the actuator of an input goes as the model has it: as stated, else up to where the equations limit it, or as
+/// far as it was seen to go. Nothing where the model says neither.
+fn stated(model: &Model, input: usize, reached: [f64; 2]) -> Option<[f64; 2]> {
+    let input = &model.inputs[input];
+    if input.range.is_some() {
+        return input.range;
+    }
+    let mut limits = None;
+    for equation in &model.equations {
+        for side in [&equation.lhs, &equation.rhs] {
+            side.walk(&mut |e| {
+                let found = limited(model, &input.name, e).filter(|ends| ends.iter().any(|v| v.is_finite()));
+                // What stands outside limits most.
+                limits = limits.or(found);
+            });
+        }
+    }
+    let [low, high] = limits?;
+    let end = |limit: f64, reached: f64, further: fn(f64, f64) -> f64| {
+        if limit.is_finite() { further(limit, reached) } else { reached }
+    };
+    Some([end(low, reached[0], f64::min), end(high, reached[1], f64::max)])
+}
+
+/// The ends of an expression that is nothing but an input with limits.
+fn limited(model: &Model, input: &str, e: &Expr) -> Option<[f64; 2]> {
+    let number = |e: &Expr| {
+        e.eval(&|name, _| model.parameter(name).map(|p| model.parameters[p].value)).filter(|v| v.is_finite())
+    };
+    let ends = match e {
+        Expr::Var { name, primes: 0 } if **name == *input => [f64::NEG_INFINITY, f64::INFINITY],
+        Expr::Call(Func::Saturate, args) => {
+            let [low, high] = limited(model, input, args.first()?)?;
+            let limit = number(args.get(1)?)?;
+            [low.max(-limit), high.min(limit)]
+        }
+        Expr::Call(of @ (Func::Min | Func::Max), args) => {
+            let (a, b) = (args.first()?, args.get(1)?);
+            let ([low, high], limit) = match limited(model, input, a) {
+                Some(ends) => (ends, number(b)?),
+                None => (limited(model, input, b)?, number(a)?),
+            };
+            if *of == Func::Min {
+                [low.min(limit), high.min(limit)]
+            } else {
+                [low.max(limit), high.max(limit)]
+            }
+        }
+        _ => return None,
+    };
+    (ends[0] < ends[1]).then_some(ends)
 }
 
 /// The input that stands in the first of these equations that has one.
@@ -259,6 +323,10 @@ fn mechanism(found: &Found, improved: &Model, reach: &Reach) -> Mechanism {
                 equivalent: a.equivalent,
                 expression: (!a.expression.is_empty()).then(|| a.expression.clone()),
                 separate: (!a.separate.is_empty()).then(|| a.separate.clone()),
+                equation: some_names(&a.site.equations),
+                channel: some_names(&a.site.channels),
+                replaces: a.site.input.clone(),
+                drifting: a.site.drifting.clone(),
             })
             .collect(),
         experiment: plan(found, improved, reach),
@@ -782,6 +850,11 @@ mod tests {
                 equivalent: false,
                 expression: String::new(),
                 separate: "a sine sweep".into(),
+                site: greybox_diagnose::diagnosis::Site {
+                    equations: vec!["fall".into()],
+                    input: Some("u".into()),
+                    ..Default::default()
+                },
             }],
             location: Located::default(),
             evidence: greybox_diagnose::evidence::Evidence::NONE,
@@ -790,7 +863,13 @@ mod tests {
         let text = "[inputs]\nu = { unit = \"m/s^2\" }\n[states]\nz = { unit = \"m\" }\n[parameters]\n\
                     g = { value = 9.81, unit = \"m/s^2\" }\n[equations]\nfall = \"z'' = u - g\"\n";
         let model = Model::from_toml(text, "fall.toml").unwrap();
-        let inputs = vec![InputRange { name: "u".into(), unit: "m/s^2".into(), rms: 0.5, largest: 1.0 }];
+        let inputs = vec![InputRange {
+            name: "u".into(),
+            unit: "m/s^2".into(),
+            rms: 0.5,
+            reached: [-1.0, 1.0],
+            stated: None,
+        }];
         let reach = Reach { inputs, dt: 0.01, ..Reach::default() };
         let told = mechanism(&found, &model, &reach);
         assert_eq!(told.drifting.as_deref(), Some("g"));
@@ -798,10 +877,37 @@ mod tests {
             told.parameters.iter().map(|(n, e)| (n.as_str(), e.unit.as_str())).collect();
         assert_eq!(units, [("g", "m/s^2"), ("f0", "Hz"), ("zeta", "1")]);
         assert_eq!(told.parameters["f0"].ci95, Some(Interval::new(3.6, 4.4)));
+        let rival = &told.alternatives[0];
+        assert_eq!((&rival.equation, &rival.channel), (&Some("fall".into()), &None));
+        assert_eq!(rival.replaces.as_deref(), Some("u"));
         let experiment = told.experiment.unwrap();
         assert_eq!(experiment.input.as_deref(), Some("u"), "the input of the equation");
         let band = experiment.band_hz.unwrap();
         assert!(band.low < 4.0 && 4.0 < band.high, "around f0: {band:?}");
+    }
+
+    #[test]
+    fn a_model_states_what_its_actuators_can_do() {
+        let of = |input: &str, law: &str| {
+            let text = format!(
+                "[inputs]\nu = {{ unit = \"mV\"{input} }}\n[states]\nx = {{ unit = \"V\" }}\n[parameters]\n\
+                 T = {{ value = 1.0, unit = \"s\" }}\nlim = {{ value = 3.0, unit = \"V\" }}\n\
+                 top = {{ value = 5.0, unit = \"V\" }}\n[equations]\nlag = \"T*x' + x = {law}\"\n"
+            );
+            stated(&Model::from_toml(&text, "m.toml").unwrap(), 0, [-1.0, 4.0])
+        };
+        assert_eq!(
+            of(", range = [-2e3, 7e3]", "saturate(u, lim)"),
+            Some([-2.0, 7.0]),
+            "what is stated counts"
+        );
+        assert_eq!(of("", "2*saturate(u, lim)"), Some([-3.0, 4.0]), "what was reached is possible");
+        assert_eq!(of("", "x + min(max(u, -lim), 2*top)"), Some([-3.0, 10.0]));
+        assert_eq!(of("", "min(top, u)"), Some([-1.0, 5.0]));
+        for none in ["u", "saturate(2*u, lim)", "saturate(x, lim) + u", "max(u, x)", "saturate(u, lim - top)"]
+        {
+            assert_eq!(of("", none), None, "{none}");
+        }
     }
 
     #[test]

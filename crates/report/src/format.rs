@@ -226,8 +226,12 @@ pub fn with_unit(value: &str, unit_text: &str) -> String {
 
 /// A snake_case kind as words: `coulomb_friction` → `Coulomb friction`, `dead_zone` → `Dead zone`.
 pub fn kind(name: &str) -> String {
-    let lower = kind_in_sentence(name);
-    let mut chars = lower.chars();
+    capital(&kind_in_sentence(name))
+}
+
+/// The text with a capital at its beginning.
+pub(crate) fn capital(text: &str) -> String {
+    let mut chars = text.chars();
     match chars.next() {
         Some(first) => first.to_uppercase().chain(chars).collect(),
         None => String::new(),

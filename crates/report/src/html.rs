@@ -1081,7 +1081,7 @@ fn mechanism_view(page: &Page, index: usize, mechanism: &Mechanism) -> Mechanism
         ]
     });
     let alternatives = mechanism.alternatives.iter().map(|alternative| AlternativeView {
-        title: format::kind(&alternative.kind),
+        title: format::capital(&crate::sentence::alternative_name(alternative, mechanism)),
         expression_html: alternative.expression.as_deref().map(expression::html).unwrap_or_default(),
         confidence: format::probability(alternative.confidence),
         equivalent: alternative.equivalent,

@@ -6,7 +6,9 @@ pub mod control;
 pub mod identified;
 pub mod recordings;
 
-use crate::contract::{Criterion, Fit, Interval, Location, Mechanism, Names, Report, Score, Verdict};
+use crate::contract::{
+    Alternative, Criterion, Fit, Interval, Location, Mechanism, Names, Report, Score, Verdict,
+};
 use crate::{expression, format};
 
 /// Forces of free shape that explain less of the residual than this explain nothing.
@@ -136,19 +138,67 @@ fn missing(report: &Report, out: &mut Vec<String>) {
     }
     out.extend(losses(&report.fit));
     for mechanism in &report.mechanisms {
-        let twins: Vec<String> = mechanism
-            .alternatives
-            .iter()
-            .filter(|alternative| alternative.equivalent)
-            .map(|alternative| format::kind_in_sentence(&alternative.kind))
-            .collect();
-        if !twins.is_empty() {
-            out.push(format!(
-                "These recordings cannot separate {} from {}.",
-                format::kind_in_sentence(&mechanism.kind),
-                joined(&twins, "or")
-            ));
+        out.extend(inseparable(mechanism));
+    }
+}
+
+/// What the recordings cannot separate from a mechanism: each name once, and none that is its own.
+fn inseparable(mechanism: &Mechanism) -> Option<String> {
+    let equivalent = || mechanism.alternatives.iter().filter(|alternative| alternative.equivalent);
+    let kind = format::kind_in_sentence(&mechanism.kind);
+    let placed = own_name(mechanism);
+    let (mut twins, mut elsewhere): (Vec<String>, bool) = (Vec::new(), false);
+    for alternative in equivalent() {
+        let twin = alternative_name(alternative, mechanism);
+        // Of its own kind, one at another place says something.
+        if twin != kind && twin != placed && !twins.contains(&twin) {
+            twins.push(twin);
+            elsewhere |= alternative.kind == mechanism.kind;
         }
+    }
+    let own = if elsewhere { placed } else { kind };
+    (!twins.is_empty())
+        .then(|| format!("These recordings cannot separate {own} from {}.", joined(&twins, "or")))
+}
+
+/// The kind of a mechanism with its place, for the middle of a sentence.
+fn own_name(mechanism: &Mechanism) -> String {
+    let channel = mechanism.channel.clone().map(Names::One);
+    let symbol = mechanism.replaces.as_ref().or(mechanism.drifting.as_ref());
+    let equation = mechanism.location.equation.as_ref().unwrap_or(&mechanism.equation);
+    named(&mechanism.kind, channel.as_ref(), symbol, Some(equation))
+}
+
+/// The name of an alternative of a mechanism for the middle of a sentence: with the channel, the input or the parameter
+/// that it is about, and with its equation where that, or the kind, does not say enough: `input offset of v`, `viscous
+/// friction in the hub equation`.
+pub fn alternative_name(alternative: &Alternative, mechanism: &Mechanism) -> String {
+    let a = alternative;
+    let symbol = a.replaces.as_ref().or(a.drifting.as_ref());
+    let is = |names: &Names| {
+        let mut sorted: [Vec<&String>; 2] =
+            [a.equation.iter().flat_map(Names::as_slice).collect(), names.as_slice().iter().collect()];
+        sorted.iter_mut().for_each(|names| names.sort());
+        sorted[0] == sorted[1]
+    };
+    let elsewhere = !is(&mechanism.equation) && !mechanism.location.equation.as_ref().is_some_and(is);
+    let same_kind = |other: &&Alternative| other.kind == a.kind && other.equation != a.equation;
+    let ambiguous = a.kind == mechanism.kind || mechanism.alternatives.iter().any(|other| same_kind(&other));
+    let equation = a.equation.as_ref().filter(|_| elsewhere || ambiguous);
+    named(&a.kind, a.channel.as_ref(), symbol, equation)
+}
+
+/// A kind and its place: the symbol that it is about says more than the equations.
+fn named(kind: &str, channel: Option<&Names>, symbol: Option<&String>, equation: Option<&Names>) -> String {
+    let kind = format::kind_in_sentence(kind);
+    match (channel.map(Names::as_slice), symbol) {
+        (Some([one]), _) => format!("{kind} of {}", expression::text(one)),
+        (Some(many), _) if !many.is_empty() => {
+            let names: Vec<String> = many.iter().map(|name| expression::text(name)).collect();
+            format!("{kind} of {} together", joined(&names, "and"))
+        }
+        (_, Some(symbol)) => format!("{kind} of {}", expression::text(symbol)),
+        _ => format!("{kind}{}", equation.map(equations).unwrap_or_default()),
     }
 }
 
@@ -346,6 +396,76 @@ mod tests {
             ..Location::default()
         };
         assert_eq!(region(&location), ["θ > 1 rad", "v < 2"]);
+    }
+
+    fn mechanism(kind: &str, equation: &str, alternatives: Vec<Alternative>) -> Mechanism {
+        Mechanism {
+            kind: kind.to_owned(),
+            family: String::new(),
+            equation: equation.into(),
+            channel: None,
+            expression: String::new(),
+            replaces: None,
+            states: Default::default(),
+            drifting: None,
+            parameters: Default::default(),
+            share_explained: 1.0,
+            confidence: 0.9,
+            alternatives,
+            experiment: None,
+            location: Location::default(),
+        }
+    }
+
+    fn equal(kind: &str) -> Alternative {
+        Alternative { kind: kind.to_owned(), confidence: 0.9, equivalent: true, ..Alternative::default() }
+    }
+
+    #[test]
+    fn what_cannot_be_separated_is_listed_once_by_distinct_names() {
+        let at = |kind: &str, equation: &str| Alternative { equation: Some(equation.into()), ..equal(kind) };
+        let input = |name: &str| Alternative { replaces: Some(name.to_owned()), ..at("input_offset", "hub") };
+        let sensors = |names: &[&str]| {
+            let names: Vec<String> = names.iter().map(|n| (*n).to_owned()).collect();
+            Alternative { channel: Some(names.into()), ..equal("sensor_offset") }
+        };
+        let told = |kind, alternatives| inseparable(&mechanism(kind, "hub", alternatives));
+        // As a report without places has it.
+        assert_eq!(told("presliding_friction", vec![equal("presliding_friction")]), None);
+        assert_eq!(
+            told(
+                "presliding_friction",
+                vec![at("presliding_friction", "hub"), at("presliding_friction", "link")]
+            )
+            .as_deref(),
+            Some(
+                "These recordings cannot separate presliding friction in the hub equation from presliding friction \
+                 in the link equation."
+            )
+        );
+        assert_eq!(
+            told("constant_offset", vec![input("u1"), input("u2"), sensors(&["x1"]), sensors(&["x1", "x2"])])
+                .as_deref(),
+            Some(
+                "These recordings cannot separate constant offset from input offset of u₁, input offset of u₂, sensor \
+                 offset of x₁ or sensor offset of x₁ and x₂ together."
+            )
+        );
+        assert_eq!(
+            told(
+                "coulomb_friction",
+                vec![
+                    at("stribeck_friction", "hub"),
+                    at("stribeck_friction", "hub"),
+                    at("viscous_friction", "link")
+                ]
+            )
+            .as_deref(),
+            Some(
+                "These recordings cannot separate Coulomb friction from Stribeck friction or viscous friction in the \
+                 link equation."
+            )
+        );
     }
 
     #[test]

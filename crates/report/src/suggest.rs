@@ -2,20 +2,24 @@
 //! frequencies, over which part of the state space.
 //!
 //! Every number is read off the recordings ([`Reach`]) or off the law that was found; a figure that neither
-//! gives is left out.
+//! gives is left out. No experiment asks for more than the input reached in the recordings, which is known to be
+//! possible, unless the model states that the actuator can do more.
 
 use std::f64::consts::PI;
 
 use crate::contract::{Experiment, Interval, Location, Ordered};
 use crate::{expression, format};
 
-/// How far beyond the present recordings an experiment may go.
+/// How far beyond the present recordings an experiment goes, where the actuator can.
 const LOUDER: f64 = 1.5;
+
+/// An amplitude that is larger by less than this is the same.
+const MORE: f64 = 1.02;
 
 /// What the present recordings reach.
 #[derive(Debug, Clone, PartialEq, Default)]
 pub struct Reach {
-    /// Each input of the model with its unit, and its RMS and largest magnitude in that unit.
+    /// Each input of the model with its unit, and what it reached in that unit.
     pub inputs: Vec<InputRange>,
     /// Range of each simulated coordinate, in the units of [`Location::region`].
     pub coordinates: Ordered<[f64; 2]>,
@@ -40,8 +44,34 @@ pub struct InputRange {
     pub unit: String,
     /// Root mean square.
     pub rms: f64,
-    /// Largest magnitude.
-    pub largest: f64,
+    /// Lowest and highest value.
+    pub reached: [f64; 2],
+    /// Lowest and highest value that the model says the actuator can make.
+    pub stated: Option<[f64; 2]>,
+}
+
+impl InputRange {
+    fn is_negative(&self) -> bool {
+        self.reached[1] <= 0.0 && self.reached[0] < 0.0 && self.stated.is_none_or(|s| s[1] <= 0.0)
+    }
+
+    /// The same with the sign turned.
+    fn turned(&self) -> InputRange {
+        let turn = |[low, high]: [f64; 2]| [-high, -low];
+        InputRange { reached: turn(self.reached), stated: self.stated.map(turn), ..self.clone() }
+    }
+
+    /// Where an experiment may go.
+    fn allowed(&self) -> [f64; 2] {
+        self.stated.unwrap_or(self.reached)
+    }
+
+    /// Largest magnitude of an experiment, and of the recordings as far as it is allowed.
+    fn largest(&self) -> (f64, f64) {
+        let size = |[low, high]: [f64; 2]| low.abs().max(high.abs());
+        let top = size(self.allowed());
+        (top, size(self.reached).min(top))
+    }
 }
 
 /// What is known of the mechanism.
@@ -124,20 +154,66 @@ fn way_of(kind: &str, subject: &Subject<'_>) -> Way {
     }
 }
 
+/// The part of an experiment that is about the input.
+#[derive(Debug, Clone, Copy, PartialEq)]
+struct Drive {
+    /// From and to, in the input's unit.
+    amplitude: [f64; 2],
+    /// It would go further if the input could.
+    clipped: bool,
+}
+
+/// How far an experiment drives the input.
+fn drive(way: Way, input: &InputRange) -> Drive {
+    if input.is_negative() {
+        let Drive { amplitude: [low, high], clipped } = drive(way, &input.turned());
+        return Drive { amplitude: [-low, -high], clipped };
+    }
+    let (top, largest) = input.largest();
+    let louder = (LOUDER * largest).min(top);
+    let more = louder > MORE * largest;
+    let (amplitude, clipped) = match way {
+        Way::Slow => ([0.0, largest], false),
+        Way::Wide if more => ([largest, louder], false),
+        Way::Wide => ([0.0, largest], true),
+        Way::Loud if more => ([largest, louder], false),
+        Way::Loud => ([0.5 * largest, largest], true),
+        Way::Around(_) | Way::AsNow => ([input.rms.min(largest), largest], false),
+        Way::Silent => ([0.0, 0.0], false),
+        Way::Again => ([largest, largest], false),
+        Way::Ramp(end) => ([0.0, end.min(top)], end > top),
+        Way::Beyond(start) => {
+            let wanted = LOUDER * start.max(largest);
+            let end = wanted.min(top);
+            let start = if start < end { start } else { 0.5 * end };
+            ([start, end], wanted > MORE * end)
+        }
+    };
+    // An input that is never zero stays where it can be.
+    let least = input.allowed()[0].max(0.0);
+    Drive { amplitude: amplitude.map(|v| v.max(least)), clipped }
+}
+
 /// The experiment for a mechanism.
 pub fn experiment(subject: &Subject<'_>, reach: &Reach) -> Experiment {
-    let input = reach.input(subject.input);
-    let way = way(subject);
-    let largest = input.map_or(0.0, |i| i.largest);
-    let amplitude = match way {
-        Way::Slow => Some([0.0, largest]),
-        Way::Wide | Way::Loud => Some([largest, LOUDER * largest]),
-        Way::Around(_) | Way::AsNow => input.map(|i| [i.rms, i.largest]),
-        Way::Silent => Some([0.0, 0.0]),
-        Way::Again => Some([largest, largest]),
-        Way::Ramp(end) => Some([0.0, end]),
-        Way::Beyond(start) => Some([start, LOUDER * start.max(largest)]),
+    planned(way(subject), subject, reach)
+}
+
+/// The experiment for a remainder without a name: the recordings again, louder.
+pub fn for_remainder(location: &Location, input: Option<&str>, reach: &Reach, shape: &str) -> Experiment {
+    // Nobody sweeps time.
+    let (way, ask) = match shape.ends_with("with time") {
+        true => (Way::Again, "the same short experiment at the beginning and at the end of a long run"),
+        false => (Way::Loud, "slow sweeps over the whole range of that variable, at two amplitudes"),
     };
+    let separate = format!("the residual looks like {shape}: {ask}");
+    let subject = Subject { kind: "", rival: "", input, location, value: &|_| None, separate: &separate };
+    planned(way, &subject, reach)
+}
+
+fn planned(way: Way, subject: &Subject<'_>, reach: &Reach) -> Experiment {
+    let input = reach.input(subject.input);
+    let drive = input.map(|input| drive(way, input));
     // Time is not for the experimenter to pass through; with the input at zero nothing else is either.
     let region = subject.location.region.iter().next().filter(|(name, _)| *name != "t" && way != Way::Silent);
     let band = match way {
@@ -149,26 +225,17 @@ pub fn experiment(subject: &Subject<'_>, reach: &Reach) -> Experiment {
     let mut found = Experiment {
         text: String::new(),
         input: input.map(|i| i.name.clone()),
-        amplitude: amplitude.filter(|_| input.is_some()).and_then(interval),
+        amplitude: drive.and_then(|d| {
+            let [from, to] = d.amplitude;
+            interval([from.min(to), from.max(to)])
+        }),
         band_hz: band.and_then(interval),
         variable: region.map(|(name, _)| name.clone()),
         range: region.map(|(_, range)| *range),
     };
     let unit = region.and_then(|(name, _)| subject.location.region_units.get(name));
-    found.text = words(way, &found, input, unit.map_or("", String::as_str), subject.separate);
-    found
-}
-
-/// The experiment for a remainder without a name: the recordings again, louder.
-pub fn for_remainder(location: &Location, input: Option<&str>, reach: &Reach, shape: &str) -> Experiment {
-    let separate = format!(
-        "the residual looks like {shape}: slow sweeps over the whole range of that variable, at two amplitudes"
-    );
-    let subject = Subject { kind: "", rival: "", input, location, value: &|_| None, separate: &separate };
-    let input = reach.input(subject.input);
-    let mut found = experiment(&subject, reach);
-    found.amplitude = input.and_then(|i| interval([i.largest, LOUDER * i.largest]));
-    found.text = words(Way::Loud, &found, input, "", &separate);
+    let driven = input.zip(drive).filter(|_| found.amplitude.is_some());
+    found.text = words(way, &found, driven, unit.map_or("", String::as_str), subject.separate);
     found
 }
 
@@ -198,27 +265,46 @@ fn decade(frequency: f64, reach: &Reach) -> Option<[f64; 2]> {
 }
 
 /// `Drive u slowly, 0.05 … 0.3 Hz, up to 2 V, with θ′ from −0.2 to 0.2; then …`.
-fn words(way: Way, e: &Experiment, input: Option<&InputRange>, unit: &str, separate: &str) -> String {
+fn words(
+    way: Way,
+    e: &Experiment,
+    driven: Option<(&InputRange, Drive)>,
+    unit: &str,
+    separate: &str,
+) -> String {
     let mut text = String::new();
-    if let (Some(input), Some(amplitude)) = (input, e.amplitude) {
+    if let Some((input, Drive { amplitude: [low, high], clipped })) = driven {
         let name = expression::text(&input.name);
-        let size = |v: f64| {
-            let unit = format::unit(&input.unit);
-            let space = if unit.is_empty() { "" } else { " " };
-            format!("{}{space}{unit}", format::plain(v))
-        };
-        let (low, high) = (size(amplitude.low), size(amplitude.high));
+        let of = format::unit(&input.unit);
+        let space = if of.is_empty() { "" } else { " " };
+        let size = |v: f64| format!("{}{space}{of}", format::plain(v));
+        let back = if input.is_negative() { -input.allowed()[1] } else { input.allowed()[0] };
+        let (from, to) = (size(low), size(high));
         text = match way {
-            Way::Slow => format!("drive {name} slowly, up to {high} as now"),
-            Way::Wide => format!("drive {name} slowly, from {low} as now up to {high}"),
-            Way::Loud => format!("drive {name} as now, {low}, and at up to {high}"),
-            Way::Around(_) => format!("sweep {name} as a sine of {low} to {high}"),
-            Way::AsNow => format!("drive {name} with {low} to {high}"),
-            Way::Silent => format!("record with {name} at zero"),
-            Way::Again => format!("record the same again, {name} up to {high}"),
-            Way::Ramp(_) => format!("ramp {name} slowly between −{high} and {high}"),
-            Way::Beyond(_) => format!("step {name} from {low} up to {high}"),
+            Way::Slow => format!("drive {name} slowly, up to {to} as now"),
+            Way::Wide if clipped => format!("drive {name} slowly, up to {to}"),
+            Way::Wide => format!("drive {name} slowly, from {from} as now up to {to}"),
+            Way::Loud if clipped => format!("drive {name} at up to {from} and at up to {to}"),
+            Way::Loud => format!("drive {name} as now, {from}, and at up to {to}"),
+            Way::Around(_) => format!("sweep {name} as a sine of {from} to {to}"),
+            Way::AsNow => format!("drive {name} with {from} to {to}"),
+            Way::Silent if low == 0.0 => format!("record with {name} at zero"),
+            Way::Silent => format!("record with {name} held at {from}"),
+            Way::Again => format!("record the same again, {name} up to {to}"),
+            // To the other side only as far as the input goes there.
+            Way::Ramp(_) if back <= -high.abs() => {
+                format!("ramp {name} slowly between {} and {to}", size(-high))
+            }
+            Way::Ramp(_) if back < 0.0 => format!("ramp {name} slowly between {} and {to}", size(back)),
+            Way::Ramp(_) => format!("ramp {name} slowly between {from} and {to}"),
+            Way::Beyond(_) => format!("step {name} from {from} up to {to}"),
         };
+        if clipped {
+            text.push_str(match input.stated {
+                Some(_) => ", the most that the model states for it",
+                None => ", the most that these recordings reach",
+            });
+        }
         if let Some(band) = e.band_hz {
             let (low, high) = (format::plain(band.low), format::plain(band.high));
             text.push_str(&match band.low > 0.0 {
@@ -230,7 +316,8 @@ fn words(way: Way, e: &Experiment, input: Option<&InputRange>, unit: &str, separ
             && !matches!(way, Way::Silent | Way::Ramp(_) | Way::Beyond(_))
             && let Some(condition) = crate::sentence::condition(variable, range, unit)
         {
-            let through = if way == Way::Wide { "beyond" } else { "through" };
+            let further = way == Way::Wide && driven.is_some_and(|(_, d)| !d.clipped);
+            let through = if further { "beyond" } else { "through" };
             text.push_str(&format!(", {through} {condition}"));
         }
     }
@@ -247,13 +334,41 @@ mod tests {
 
     fn reach() -> Reach {
         Reach {
-            inputs: vec![InputRange { name: "v".into(), unit: "V".into(), rms: 1.0, largest: 2.0 }],
+            inputs: vec![InputRange {
+                name: "v".into(),
+                unit: "V".into(),
+                rms: 1.0,
+                reached: [-2.0, 1.5],
+                stated: Some([-10.0, 10.0]),
+            }],
             coordinates: Ordered::from_iter([("theta".to_owned(), [-0.5, 0.5])]),
             dt: 0.01,
         }
     }
 
     fn ask(kind: &str, region: &[(&str, [Option<f64>; 2])], values: &[(&str, f64)]) -> Experiment {
+        ask_of(&reach(), kind, region, values)
+    }
+
+    /// The same where the recordings reach `reached` and the model states `stated`.
+    fn ask_within(
+        reached: [f64; 2],
+        stated: Option<[f64; 2]>,
+        kind: &str,
+        values: &[(&str, f64)],
+    ) -> (Option<[f64; 2]>, String) {
+        let mut reach = reach();
+        reach.inputs[0] = InputRange { reached, stated, rms: 1.0, ..reach.inputs[0].clone() };
+        let e = ask_of(&reach, kind, &[("theta", [Some(-1.0), Some(1.0)])], values);
+        (e.amplitude.map(|a| [a.low, a.high]), e.text)
+    }
+
+    fn ask_of(
+        reach: &Reach,
+        kind: &str,
+        region: &[(&str, [Option<f64>; 2])],
+        values: &[(&str, f64)],
+    ) -> Experiment {
         let region = region.iter().map(|(n, r)| ((*n).to_owned(), *r)).collect();
         let location = Location { region, band_hz: Some(Interval::new(0.5, 3.0)), ..Location::default() };
         let value = |name: &str| values.iter().find(|v| v.0 == name).map(|v| v.1);
@@ -266,7 +381,7 @@ mod tests {
                 value: &value,
                 separate: "look.",
             },
-            &reach(),
+            reach,
         )
     }
 
@@ -311,6 +426,70 @@ mod tests {
     }
 
     #[test]
+    fn no_experiment_asks_for_more_than_the_recordings_reach() {
+        let all = [
+            "coulomb_friction",
+            "gravity",
+            "quadratic_drag",
+            "actuator_lag",
+            "constant_offset",
+            "parameter_drift",
+            "input_dead_zone",
+            "input_saturation",
+            "my_own",
+        ];
+        let values = [("ta", 0.1), ("udz", 7.0), ("usat", 9.0)];
+        for reached in [[-2.0, 2.0], [0.0, 2.0], [0.5, 2.0], [-2.0, -0.5], [-2.0, 0.0], [0.0, 0.0]] {
+            for kind in all {
+                let (amplitude, text) = ask_within(reached, None, kind, &values);
+                let [low, high] = amplitude.unwrap();
+                assert!(reached[0] <= low && low <= high && high <= reached[1], "{kind} {reached:?}: {text}");
+            }
+        }
+        let told = |kind| ask_within([0.0, 2.0], None, kind, &values).1;
+        assert_eq!(
+            told("gravity"),
+            "drive v slowly, up to 2 V, the most that these recordings reach, through |θ| < 1: look"
+        );
+        let loud = told("quadratic_drag");
+        assert!(
+            loud.starts_with("drive v at up to 1 V and at up to 2 V, the most that these recordings reach"),
+            "{loud}"
+        );
+        assert_eq!(
+            told("input_dead_zone"),
+            "ramp v slowly between 0 V and 2 V, the most that these recordings reach: look"
+        );
+        assert_eq!(
+            told("input_saturation"),
+            "step v from 1 V up to 2 V, the most that these recordings reach: look"
+        );
+        let negative = |kind| ask_within([-2.0, -0.5], None, kind, &values).1;
+        assert_eq!(negative("constant_offset"), "record with v held at −0.5 V: look");
+        assert_eq!(negative("parameter_drift"), "record the same again, v up to −2 V, through |θ| < 1: look");
+        let uneven = ask_within([-1.0, 2.0], None, "input_dead_zone", &[("udz", 0.8)]).1;
+        assert_eq!(uneven, "ramp v slowly between −1 V and 1.6 V: look");
+    }
+
+    #[test]
+    fn what_the_model_states_of_the_actuator_is_allowed() {
+        let told = |stated, kind, values: &[(&str, f64)]| ask_within([-2.0, 2.0], Some(stated), kind, values);
+        assert_eq!(told([-10.0, 10.0], "gravity", &[]).0, Some([2.0, 3.0]));
+        let (amplitude, text) = told([-2.5, 2.5], "quadratic_drag", &[]);
+        assert_eq!(amplitude, Some([2.0, 2.5]));
+        assert!(text.starts_with("drive v as now, 2 V, and at up to 2.5 V"), "{text}");
+        let (amplitude, text) = told([-2.0, 2.0], "gravity", &[]);
+        assert_eq!(amplitude, Some([0.0, 2.0]));
+        assert!(
+            text.starts_with("drive v slowly, up to 2 V, the most that the model states for it, through"),
+            "{text}"
+        );
+        // Even below what the recordings reached.
+        assert_eq!(told([-1.0, 1.0], "coulomb_friction", &[]).0, Some([0.0, 1.0]));
+        assert_eq!(told([-10.0, 10.0], "input_dead_zone", &[("udz", 3.0)]).0, Some([0.0, 6.0]));
+    }
+
+    #[test]
     fn the_rival_says_what_to_do() {
         let (location, b) = (Location::default(), reach());
         let subject = |kind, rival| {
@@ -321,6 +500,21 @@ mod tests {
         };
         assert_eq!(subject("step_disturbance", "periodic_disturbance").text, "record with v at zero");
         assert_eq!(subject("step_disturbance", "my_own").text, "record the same again, v up to 2 V");
+    }
+
+    #[test]
+    fn a_remainder_asks_for_its_variable_or_for_time() {
+        let told = |shape| for_remainder(&Location::default(), Some("v"), &reach(), shape).text;
+        assert_eq!(
+            told("a term that depends on h"),
+            "drive v as now, 2 V, and at up to 3 V: the residual looks like a term that depends on h: slow sweeps \
+             over the whole range of that variable, at two amplitudes"
+        );
+        assert_eq!(
+            told("a term that changes slowly with time"),
+            "record the same again, v up to 2 V: the residual looks like a term that changes slowly with time: the \
+             same short experiment at the beginning and at the end of a long run"
+        );
     }
 
     #[test]

@@ -82,6 +82,39 @@ fn the_page_keeps_nobody_out() {
     assert!(faults.is_empty(), "{faults:#?}");
 }
 
+/// Long names, many mechanisms and long equations: what is wide scrolls in its own box, the page never does.
+#[test]
+fn a_wide_page_does_not_scroll_sideways() {
+    let mut page = sample::page();
+    let long = "a_recording_of_the_second_axis_at_the_third_operating_point_".repeat(4);
+    let terms: Vec<String> = (0..40).map(|i| format!("coefficient_{i}*sin({i}*theta')")).collect();
+    let law = terms.join(" + ");
+    page.title = long.clone();
+    page.report.model.file = format!("{long}.toml");
+    for (i, recording) in page.recordings.iter_mut().enumerate() {
+        recording.name = format!("{long}{i}.csv");
+        recording.channels[0].name = format!("{long}channel");
+        recording.inputs[0].name = format!("{long}input");
+    }
+    page.models.improved.push_str(&format!("wide = \"{law} = 0\"\n"));
+    let report = &mut page.report;
+    report.fit.recordings = report.fit.recordings.values().map(|fit| (long.clone(), fit.clone())).collect();
+    let mut mechanism = report.mechanisms[0].clone();
+    mechanism.expression = law.clone();
+    for alternative in &mut mechanism.alternatives {
+        alternative.kind = "a_kind_with_a_name_that_is_much_longer_than_any_other".repeat(3);
+        alternative.expression = Some(law.clone());
+        alternative.separate = Some(long.clone());
+    }
+    let estimate = mechanism.parameters["fc"].clone();
+    mechanism.parameters.insert(format!("{long}parameter"), estimate);
+    report.mechanisms.extend(std::iter::repeat_n(mechanism, 6));
+    report.summary = vec![long];
+    let Some(faults) = faults(&page.to_html().unwrap()) else { return };
+    let wide: Vec<&String> = faults.iter().filter(|fault| fault.contains("px wide")).collect();
+    assert!(wide.is_empty(), "{wide:#?}");
+}
+
 /// What the audit is worth: it finds each of these.
 #[test]
 fn the_audit_finds_what_keeps_a_reader_out() {

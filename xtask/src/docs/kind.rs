@@ -4,7 +4,7 @@ use std::fmt::Write;
 
 use anyhow::{Context, Result};
 use greybox_diagnose::candidate::{Candidate, candidates};
-use greybox_diagnose::library::{First, Inner, Mechanism, On, Scale};
+use greybox_diagnose::library::{Domain, First, Inner, Mechanism, On, Scale};
 use greybox_diagnose::place::{Place, places};
 use greybox_model::{Model, WriteOptions};
 use greybox_report::format;
@@ -60,6 +60,19 @@ fn form(page: &mut String, file: &str, m: &Mechanism, all: &[Kind]) -> Result<()
         writeln!(page, "\n**Taken for:** {}.", links.join(", "))?;
     }
     writeln!(page, "\n**The recording that separates them:** {}.", m.about.separate)?;
+    if !m.about.elsewhere.is_empty() {
+        writeln!(
+            page,
+            "\n**Where nothing moves (a temperature, a level, a voltage):** {}.",
+            m.about.elsewhere
+        )?;
+    }
+    if m.domain == Some(Domain::Mechanical) {
+        writeln!(
+            page,
+            "\n**Where it is tried:** not in equations that units show to be thermal or electrical."
+        )?;
+    }
     writeln!(page, "\n**How it is found:** {}", found(m))?;
     writeln!(page, "\n**Where it acts:** {}", located(m))?;
     let lines = changed_lines(m).with_context(|| file.to_owned())?;

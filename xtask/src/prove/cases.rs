@@ -372,8 +372,7 @@ pub(crate) mod tests {
             kind: "asymmetric_coulomb_friction".into(),
             confidence: 0.4,
             equivalent,
-            expression: None,
-            separate: None,
+            ..Alternative::default()
         };
         alone.mechanisms[0].alternatives = vec![twin(false)];
         assert_eq!(missed(&emps_velocity(&alone)), ["offset"]);

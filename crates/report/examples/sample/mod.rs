@@ -310,6 +310,7 @@ fn mechanism(windows: Vec<Interval>) -> Mechanism {
                 equivalent: false,
                 expression: Some("(fc + (fs - fc)*exp(-(theta'/vs)^2))*sign(theta')".to_owned()),
                 separate: Some("a slow sweep of v through zero velocity, below 0.1 Hz".to_owned()),
+                ..Alternative::default()
             },
             Alternative {
                 kind: "presliding_friction".to_owned(),
@@ -317,6 +318,7 @@ fn mechanism(windows: Vec<Interval>) -> Mechanism {
                 equivalent: false,
                 expression: Some("s0*z".to_owned()),
                 separate: Some("small reversals that stay inside the stuck zone".to_owned()),
+                ..Alternative::default()
             },
         ],
         experiment: Some(Experiment {

@@ -32,10 +32,11 @@ pub(crate) fn dom(html: &str) -> Option<String> {
     Some(run(&browser, dir.path(), &file))
 }
 
-/// What keeps a reader out of the page, at the widths of a small phone, a phone and a desk: each a sentence. `None`
+/// What keeps a reader out of the page, at the widths of a small phone, a phone, a small window and a desk: each a
+/// sentence. `None`
 /// without a browser. What is looked for stands in `audit.js`.
 pub(crate) fn faults(html: &str) -> Option<Vec<String>> {
-    let frames: String = [320, 390, 1280]
+    let frames: String = [320, 390, 1000, 1280]
         .map(|width| {
             format!(
                 "<iframe width=\"{width}\" height=\"900\" data-width=\"{width}\" srcdoc=\"{}\"></iframe>",

@@ -23,7 +23,13 @@ pub fn model(
         name: "test".into(),
         inputs: inputs
             .iter()
-            .map(|n| Input { name: n.to_string(), channel: n.to_string(), unit: unit(), hold: Hold::Linear })
+            .map(|n| Input {
+                name: n.to_string(),
+                channel: n.to_string(),
+                unit: unit(),
+                hold: Hold::Linear,
+                range: None,
+            })
             .collect(),
         states: states
             .iter()

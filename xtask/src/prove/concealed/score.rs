@@ -391,8 +391,7 @@ mod tests {
             kind: "input_offset".into(),
             confidence: 0.5,
             equivalent: true,
-            expression: None,
-            separate: None,
+            ..Alternative::default()
         }];
         assert_eq!(scored(&t, &declared).exact, Some(true));
         declared.mechanisms[0].alternatives[0].equivalent = false;
