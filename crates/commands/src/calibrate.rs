@@ -4,13 +4,12 @@ use greybox_calibrate::{Data, Score};
 use greybox_diagnose::Calibration;
 use greybox_diagnose::diagnosis::ParameterChange;
 use greybox_model::{Model, WriteOptions};
-use greybox_recording::{Recording, Severity};
+use greybox_recording::Recording;
 use greybox_report::contract::{self, FitSet, Interval, ModelId, Ordered, Parameter, Producer};
-use greybox_report::convert::calibrated_recordings;
+use greybox_report::convert::{calibrated_recordings, health_findings};
 use greybox_report::page;
 use serde::Serialize;
 
-use crate::check::check_for_model;
 use crate::failure::Failure;
 use crate::loading::LoadedModel;
 use crate::story;
@@ -44,7 +43,8 @@ impl Results {
         train: &[Recording],
         holdout: &[Recording],
     ) -> Result<Results, Failure> {
-        let mut findings = findings(&loaded.model, train.iter().chain(holdout));
+        let mut findings = health_findings(&loaded.model, train.iter().chain(holdout));
+        findings.retain(|f| f.severity > contract::Severity::Info);
         findings.extend(calibration.limited.then(limit));
         findings.extend((!calibration.converged && !calibration.limited).then(not_converged));
         let report = report(loaded, calibration, findings);
@@ -118,29 +118,6 @@ fn report(loaded: &LoadedModel, calibration: &Calibration, findings: Vec<contrac
         noise_floor: data.channels.iter().map(|c| c.name.clone()).zip(floor).collect(),
         findings,
     }
-}
-
-/// Health findings of at least a warning.
-fn findings<'a>(model: &Model, recordings: impl Iterator<Item = &'a Recording>) -> Vec<contract::Finding> {
-    recordings
-        .flat_map(|recording| {
-            check_for_model(recording, model).into_iter().filter_map(|f| {
-                let severity = match f.severity {
-                    Severity::Info => return None,
-                    Severity::Warning => contract::Severity::Warning,
-                    Severity::Problem => contract::Severity::Error,
-                };
-                Some(contract::Finding {
-                    severity,
-                    code: f.code.to_owned(),
-                    recording: Some(recording.name.clone()),
-                    channel: f.channel,
-                    message: f.message,
-                    mend: f.mend,
-                })
-            })
-        })
-        .collect()
 }
 
 /// The fits ended before their end.

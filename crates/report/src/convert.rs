@@ -410,8 +410,8 @@ fn findings(d: &Diagnosis, sources: &Sources<'_>) -> Vec<Finding> {
     out
 }
 
-/// What the health checks say about the channels that `model` uses.
-fn health_findings<'a>(model: &Model, recordings: impl Iterator<Item = &'a Recording>) -> Vec<Finding> {
+/// What the health checks say about the channels that `model` uses, recording by recording.
+pub fn health_findings<'a>(model: &Model, recordings: impl Iterator<Item = &'a Recording>) -> Vec<Finding> {
     let inputs: Vec<&str> = model.inputs.iter().map(|i| i.channel.as_str()).collect();
     let outputs: Vec<&str> = model.measurements.iter().map(|m| m.channel.as_str()).collect();
     let mut out = Vec::new();
