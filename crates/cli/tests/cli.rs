@@ -63,6 +63,40 @@ fn check_says_what_each_channel_feeds() {
 }
 
 #[test]
+fn what_recordings_have_in_common_is_one_line() {
+    let bench = bench();
+    // Both rounded to fewer than fifty steps.
+    for name in ["run1.csv", "run2.csv", "run3.csv"] {
+        let run = recording(if name == "run2.csv" { 900 } else { 1200 }, 0.0);
+        let mut rows = run.lines();
+        let mut text = format!("{}\n", rows.next().unwrap());
+        let cells: Vec<Vec<f64>> =
+            rows.map(|row| row.split(',').map(|cell| cell.parse().unwrap()).collect()).collect();
+        let largest = cells.iter().map(|row| row[2].abs()).fold(0.0, f64::max);
+        for row in cells {
+            let step = largest / 15.0;
+            text.push_str(&format!("{},{},{:.6}\n", row[0], row[1], (row[2] / step).round() * step));
+        }
+        bench.write(name, &text);
+    }
+    let files = ["run1.csv", "run2.csv", "run3.csv"];
+    let told = bench.greybox(&[&["check"], &files[..], &["--model", "model.toml"]].concat()).stdout;
+    assert!(told.starts_with("run1.csv: usable, 1 warning\nrun2.csv: usable, "), "{told}");
+    assert_eq!(told.matches("Use a finer sensor").count(), 1, "{told}");
+    let place = "x in 3 recordings (run1.csv, run2.csv, run3.csv): The values come in steps of";
+    assert!(told.contains(&format!("  warning  {place}")), "{told}");
+    let json = bench.json(&[&["check"], &files[..], &["--model", "model.toml"]].concat());
+    for k in 0..3 {
+        let findings = json["recordings"][k]["findings"].as_array().unwrap();
+        assert!(findings.iter().any(|f| f["code"] == "quantisation"), "{findings:#?}");
+    }
+    let fit = ["calibrate", "model.toml", "run1.csv", "run2.csv", "--holdout", "run3.csv", "--out", "out"];
+    let told = bench.greybox(&fit).stdout;
+    assert_eq!(told.matches("Use a finer sensor").count(), 1, "{told}");
+    assert!(told.contains(&format!("Note: {place}")), "{told}");
+}
+
+#[test]
 fn check_names_the_gap_and_still_exits_0() {
     let bench = bench();
     let whole = recording(600, 0.0);

@@ -115,6 +115,30 @@ fn the_duffing_oscillator_is_found_and_simulates_as_well_as_the_report_says() {
 }
 
 #[test]
+fn every_part_of_the_library_makes_an_equation() {
+    let bench = Bench::empty();
+    let pendulum =
+        recorded(["f [N m]", "theta [rad]"], 1.0, 20.0, 0.0, |x, v, f| 0.2 * f - 9.0 * x.sin() - 0.5 * v);
+    bench.write("train.csv", &pendulum);
+    let request = |library: &'static str| {
+        let names = ["identify", "train.csv", "--states", "theta", "--inputs", "f", "--order", "1"];
+        [&names[..], &["--replicates", "1", "--library", library, "--out", "out"]].concat()
+    };
+    for library in ["tensor", "total", "separate", "constant", "friction", "trigonometric"] {
+        let outcome = bench.greybox(&request(library));
+        assert_eq!(outcome.code, 0, "{library}: {}", outcome.stderr);
+    }
+    let report = bench.json(&request("separate,constant,friction,trigonometric"));
+    let sine = report["equations"]["theta"]["terms"].as_array().unwrap().iter();
+    assert!(sine.clone().any(|t| t["expression"] == "sin(theta)"), "{report:#}");
+    assert!(bench.read("out/model.toml").contains("a_sin*sin(theta)"));
+    bench.write("length.csv", &pendulum.replace("[rad]", "[m]"));
+    let mut lengths = request("trigonometric");
+    lengths[1] = "length.csv";
+    bench.refuses(&lengths, &["none of the states (theta) is an angle", "`rad` or `deg`"]);
+}
+
+#[test]
 fn a_recording_is_read_in_blocks_and_the_stages_are_told() {
     let bench = bench();
     let blocks = ["--block", "1000", "--out", "out", "--json", "--log"];

@@ -218,7 +218,7 @@ fn check_takes_folders_and_finds_clocks_that_disagree() {
     assert!((found["value"].as_f64().unwrap() - 0.12).abs() < 1e-9, "{found}");
     let words = bench.greybox(&["check", "runs", "--inputs", "u"]).stdout;
     for part in [
-        "warning  y: Recorded about 12 samples (0.12 s) later than `x`",
+        "warning  two_clocks.csv, y: Recorded about 12 samples (0.12 s) later than `x`",
         "The lag is sure: 8 of 8 parts",
         "mend: If the machine does not explain it, move the column `y` up by 12 rows",
     ] {

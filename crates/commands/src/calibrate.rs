@@ -4,13 +4,12 @@ use greybox_calibrate::{Data, Score, Setup, input_noise};
 use greybox_diagnose::Calibration;
 use greybox_diagnose::diagnosis::ParameterChange;
 use greybox_model::{Model, WriteOptions};
-use greybox_recording::{Finding, Recording, Severity};
+use greybox_recording::Recording;
 use greybox_report::contract::{self, FitSet, Interval, ModelId, Ordered, Parameter, Producer};
-use greybox_report::convert::calibrated_recordings;
+use greybox_report::convert::{calibrated_recordings, health_finding, health_findings};
 use greybox_report::page;
 use serde::Serialize;
 
-use crate::check::check_for_model;
 use crate::failure::Failure;
 use crate::loading::LoadedModel;
 use crate::story;
@@ -44,7 +43,8 @@ impl Results {
         train: &[Recording],
         holdout: &[Recording],
     ) -> Result<Results, Failure> {
-        let mut findings = findings(&loaded.model, train.iter().chain(holdout));
+        let mut findings = health_findings(&loaded.model, train.iter().chain(holdout));
+        findings.retain(|f| f.severity > contract::Severity::Info);
         findings.extend(input_noise(calibration));
         findings.extend(calibration.limited.then(limit));
         findings.extend((!calibration.converged && !calibration.limited).then(not_converged));
@@ -121,39 +121,15 @@ fn report(loaded: &LoadedModel, calibration: &Calibration, findings: Vec<contrac
     }
 }
 
-/// Health findings of at least a warning.
-fn findings<'a>(model: &Model, recordings: impl Iterator<Item = &'a Recording>) -> Vec<contract::Finding> {
-    recordings
-        .flat_map(|recording| {
-            let found = check_for_model(recording, model);
-            found.into_iter().filter_map(|f| at_least_a_warning(f, Some(recording.name.clone())))
-        })
-        .collect()
-}
-
 /// Inputs whose noise is a good part of what the calibrated model leaves, if they are measurements.
 fn input_noise(calibration: &Calibration) -> Vec<contract::Finding> {
     let Ok(setup) = Setup::new(&calibration.model, calibration.data.clone(), Vec::new()) else {
         return Vec::new();
     };
     let found = input_noise::findings(&setup, &setup.values(), &calibration.train_runs.1, true);
-    found.into_iter().filter_map(|f| at_least_a_warning(f, None)).collect()
-}
-
-fn at_least_a_warning(f: Finding, recording: Option<String>) -> Option<contract::Finding> {
-    let severity = match f.severity {
-        Severity::Info => return None,
-        Severity::Warning => contract::Severity::Warning,
-        Severity::Problem => contract::Severity::Error,
-    };
-    Some(contract::Finding {
-        severity,
-        code: f.code.to_owned(),
-        recording,
-        channel: f.channel,
-        message: f.message,
-        mend: f.mend,
-    })
+    let mut found: Vec<_> = found.into_iter().map(|f| health_finding(f, None)).collect();
+    found.retain(|f| f.severity > contract::Severity::Info);
+    found
 }
 
 /// The fits ended before their end.

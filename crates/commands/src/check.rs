@@ -6,7 +6,8 @@ use std::path::Path;
 use greybox_calibrate::Data;
 use greybox_model::{Model, Unit};
 use greybox_recording::{Finding, Recording, Severity, health, told};
-use greybox_report::format;
+use greybox_report::notes::{Note, grouped};
+use greybox_report::{contract, format};
 use serde::Serialize;
 use serde_json::json;
 
@@ -71,9 +72,36 @@ pub fn check(
     Ok(checked)
 }
 
-/// What was found, in plain language.
+/// What was found, in plain language: a verdict for each recording, its channels, then the findings, those that matter most
+/// first. What the recordings have in common is said once.
 pub fn story(checked: &[Health]) -> String {
-    checked.iter().map(in_words).collect::<Vec<_>>().join("\n")
+    let tables: Vec<String> = checked.iter().map(table).collect();
+    let alike = checked.len() > 1 && tables.windows(2).all(|pair| pair[0] == pair[1]);
+    let mut text = String::new();
+    for (health, table) in checked.iter().zip(&tables) {
+        let _ = writeln!(text, "{}: {}", health.file, verdict(&health.findings));
+        if !alike {
+            text.push_str(table);
+        }
+    }
+    if let Some(table) = tables.first().filter(|_| alike) {
+        let _ = write!(text, "\nChannels of each:\n{table}");
+    }
+    let found: Vec<contract::Finding> = checked.iter().flat_map(Health::findings).collect();
+    let mut notes = grouped(&found);
+    notes.sort_by_key(|note| std::cmp::Reverse(note.severity));
+    if checked.len() > 1 {
+        text.push_str("\nFindings:\n");
+    }
+    for mut note in notes {
+        if let [alone] = checked {
+            // It stands above.
+            let place = note.place.strip_prefix(&alone.file).unwrap_or(&note.place);
+            note.place = place.trim_start_matches(", ").to_owned();
+        }
+        text.push_str(&in_words(&note));
+    }
+    text
 }
 
 /// What was found, for machines.
@@ -168,16 +196,38 @@ fn describe(
     }
 }
 
-/// The table of one recording: a verdict, the channels, then the findings, those that matter most first.
-fn in_words(health: &Health) -> String {
-    let count = |severity| health.findings.iter().filter(|f| f.severity == severity).count();
-    let verdict = match (count(Severity::Problem), count(Severity::Warning)) {
+impl Health {
+    /// The findings as those of a study of several recordings.
+    fn findings(&self) -> impl Iterator<Item = contract::Finding> {
+        self.findings.iter().map(|f| contract::Finding {
+            severity: match f.severity {
+                Severity::Info => contract::Severity::Info,
+                Severity::Warning => contract::Severity::Warning,
+                Severity::Problem => contract::Severity::Error,
+            },
+            code: f.code.to_owned(),
+            recording: Some(self.file.clone()),
+            channel: f.channel.clone(),
+            message: f.message.clone(),
+            mend: f.mend.clone(),
+        })
+    }
+}
+
+/// What the findings amount to.
+fn verdict(findings: &[Finding]) -> String {
+    let count = |severity| findings.iter().filter(|f| f.severity == severity).count();
+    match (count(Severity::Problem), count(Severity::Warning)) {
         (0, 0) => "healthy".to_owned(),
         (0, w) => format!("usable, {}", plural(w, "warning")),
         (p, 0) => plural(p, "problem"),
         (p, w) => format!("{}, {}", plural(p, "problem"), plural(w, "warning")),
-    };
-    let mut text = format!("{}: {verdict}\n", health.file);
+    }
+}
+
+/// The channels of a recording.
+fn table(health: &Health) -> String {
+    let mut text = String::new();
     let width = health.channels.iter().map(|c| c.name.chars().count()).max().unwrap_or(0);
     for channel in &health.channels {
         let unit = channel.unit.as_deref().map_or(String::new(), |u| format!("[{}]", format::unit(u)));
@@ -185,20 +235,20 @@ fn in_words(health: &Health) -> String {
         let line = format!("  {:width$}  {unit:10}  {feeds}", channel.name);
         let _ = writeln!(text, "{}", line.trim_end());
     }
-    let mut ordered: Vec<&Finding> = health.findings.iter().collect();
-    ordered.sort_by_key(|f| std::cmp::Reverse(f.severity));
-    for finding in ordered {
-        text.push_str(&finding_in_words(finding));
-    }
     text
 }
 
-/// One finding: severity, channel, sentence; the mend on a line of its own.
-fn finding_in_words(finding: &Finding) -> String {
-    let severity = finding.severity.to_string();
-    let channel = finding.channel.as_deref().map_or(String::new(), |c| format!("{c}: "));
-    let mut text = format!("  {severity:8} {channel}{}\n", finding.message);
-    if let Some(mend) = &finding.mend {
+/// One note: severity, place, sentence; the mend on a line of its own.
+fn in_words(note: &Note) -> String {
+    let severity = match note.severity {
+        contract::Severity::Info => Severity::Info,
+        contract::Severity::Warning => Severity::Warning,
+        contract::Severity::Error => Severity::Problem,
+    };
+    let severity = severity.to_string();
+    let place = if note.place.is_empty() { String::new() } else { format!("{}: ", note.place) };
+    let mut text = format!("  {severity:8} {place}{}\n", note.message);
+    if let Some(mend) = &note.mend {
         let _ = writeln!(text, "           mend: {mend}");
     }
     text

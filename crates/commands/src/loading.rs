@@ -9,6 +9,7 @@ use greybox_model::{Model, Problem};
 use greybox_recording::{CsvBlocks, EXTENSIONS, Recording, RecordingError, Rename};
 
 use crate::failure::Failure;
+use crate::foreign;
 
 /// A model and the text it was read from.
 #[derive(Debug)]
@@ -26,9 +27,21 @@ pub struct LoadedModel {
 /// Reads the model at `path`.
 ///
 /// # Errors
-/// Bad input: no such file, a folder, a recording in its place, or a fault in the model.
+/// Bad input: no such file, a folder, a recording or the file of another tool in its place, or a fault in the model.
 pub fn model(path: &Path) -> Result<LoadedModel, Failure> {
-    model_of(read_text(path)?, path)
+    read_text(path).and_then(|text| model_of(text, path)).map_err(|failure| match foreign::of(path) {
+        Some(kind) => kind.as_model(path),
+        None if path.is_file() && EXTENSIONS.iter().any(|e| has_extension(path, e)) => {
+            not_a_model(path, if has_extension(path, "csv") { "a recording (CSV)" } else { "a recording" })
+        }
+        None => failure,
+    })
+}
+
+/// The error where a recording stands in the place of the model.
+fn not_a_model(path: &Path, what: &str) -> Failure {
+    Failure::file(path, format!("this is {what}, but a model (TOML) is needed here"))
+        .mend("put the model first and the recordings after it: `MODEL.toml TRAIN.csv`")
 }
 
 /// The model in `text`, which errors say stands at `path`.
@@ -42,8 +55,7 @@ pub fn model_of(text: String, path: &Path) -> Result<LoadedModel, Failure> {
         Err(error)
             if matches!(error.problem(), Problem::Toml { .. }) && looks_like_recording(path, &text) =>
         {
-            Err(Failure::file(path, "this is a recording (CSV), but a model (TOML) is needed here")
-                .mend("put the model first and the recordings after it: `MODEL.toml TRAIN.csv`"))
+            Err(not_a_model(path, "a recording (CSV)"))
         }
         Err(_) if text.trim().is_empty() => Err(Failure::file(path, "the model file is empty")
             .mend("write at least [states], [parameters] and [equations]")),
@@ -232,7 +244,10 @@ fn unreadable(path: &Path, error: RecordingError) -> Failure {
         return Failure::file(path, "this is a model (TOML), but a recording is needed here")
             .mend("name the model once, before the recordings");
     }
-    error.into()
+    match foreign::of(path) {
+        Some(kind) => kind.as_recording(path),
+        None => error.into(),
+    }
 }
 
 /// The recordings at `paths` one after the other, in blocks of `rows` rows.

@@ -4,7 +4,7 @@
 use std::sync::Arc;
 
 use greybox_calibrate::{Data, FreeRun, Setup, input_noise};
-use greybox_model::{Measurement, Model, Unit};
+use greybox_model::{Expr, Measurement, Model, Unit};
 use greybox_recording::{Channel, Finding, Recording, Severity};
 use greybox_report::format;
 
@@ -28,6 +28,19 @@ const BEYOND: f64 = 100.0;
 /// A channel that moves by fewer times its noise tells nothing.
 const STILL: f64 = 5.0;
 
+/// A simulation this far from the measurements, RMS over the RMS of their motion, is worse than none.
+const POOR: f64 = 1.0;
+
+/// Below this it follows them, and what it takes of the error of the model as given makes it clearly the better one.
+const FOLLOWS: f64 = 0.7;
+const CLEARLY: f64 = 0.5;
+
+/// Errors within this factor of the least are as good as it: the signs of an input and of its gain are one.
+const AS_GOOD: f64 = 1.02;
+
+/// Most signs that are tried, one after the other.
+const MOST_SIGNS: usize = 50;
+
 /// What a channel without a unit is often in, where the model has another.
 const OFTEN: [&str; 12] = ["deg", "rev", "mrad", "deg/s", "rpm", "rps", "mm", "cm", "mm/s", "mV", "mA", "kN"];
 
@@ -48,24 +61,129 @@ pub(crate) fn findings(model: &Model, recording: &Recording) -> Vec<Finding> {
             Finding::new(
                 Severity::Warning,
                 "nominal_diverges",
-                "Run on this recording, the model as given leaves the measurements far behind.",
+                "Run on this recording, the model as given diverges from the measurements.",
             )
-            .mend(
-                "Look at its signs first (of the input, of damping, stiffness and feedback), then at units and values \
-                 of its parameters.",
-            ),
+            .mend(match turned(&setup, &moving, f64::INFINITY) {
+                Some(turned) => turned.mend(""),
+                None => "Look at units and values of its parameters: with no single sign reversed does the simulation \
+                         follow the recording."
+                    .to_owned(),
+            }),
         ];
     }
-    let compared = moving.into_iter().filter_map(|c| {
-        let measurement = &model.measurements[c];
-        let stated = recording.channel(&measurement.channel)?.unit.is_some();
-        sized(measurement, stated, motion(data, &run, c)?)
-    });
-    let mut found: Vec<Finding> = compared.collect();
-    if !run.diverged {
+    let error = misfit(data, &run, &moving);
+    let mut found: Vec<Finding> = moving
+        .iter()
+        .filter_map(|&c| {
+            let measurement = &model.measurements[c];
+            let stated = recording.channel(&measurement.channel)?.unit.is_some();
+            sized(measurement, stated, motion(data, &run, c)?)
+        })
+        .collect();
+    // A motion that grows looks too large, whatever the units.
+    let poor = error > POOR || found.iter().any(|f| f.code == SIGN);
+    let Some(turned) = poor.then(|| turned(&setup, &moving, error)).flatten() else {
         found.extend(input_noise::findings(&setup, &setup.values(), &run, false));
+        return found;
+    };
+    if let Some(finding) = found.iter_mut().find(|f| f.code == SIGN) {
+        finding.mend = Some(turned.mend(" or of this measurement"));
+        return found;
     }
-    found
+    vec![
+        Finding::new(
+            Severity::Warning,
+            SIGN,
+            format!(
+                "Run on this recording, the model as given is far from the measurements (nrmse {}).",
+                format::percent(error)
+            ),
+        )
+        .mend(turned.mend("")),
+    ]
+}
+
+/// Code of the findings about signs.
+const SIGN: &str = "nominal_sign";
+
+/// What fits clearly better with its sign reversed.
+#[derive(Debug)]
+struct Turned {
+    /// Parameters and inputs, as sentences name them; any one of them.
+    names: Vec<String>,
+    /// The error with the best of them reversed.
+    error: f64,
+}
+
+impl Turned {
+    /// What to do, with `besides` as one more thing that may be reversed.
+    fn mend(&self, besides: &str) -> String {
+        let names = self.names.join(" or of ");
+        format!(
+            "Reverse the sign of {names}{besides}, in its value or where it stands in the equations: so the simulation follows \
+             the recording (nrmse {}).",
+            format::percent(self.error)
+        )
+    }
+}
+
+/// Tries the sign of every input and of every parameter that is no inertia, one at a time. `None` where no simulation
+/// follows the measurements, or none is clearly better than the model as given, which has this `error`.
+fn turned(setup: &Setup, moving: &[usize], error: f64) -> Option<Turned> {
+    let (model, values) = (&setup.model, setup.values());
+    let inertias = inertias(model);
+    let parameters = model.parameters.iter().enumerate();
+    let parameters =
+        parameters.filter(|(_, p)| p.value != 0.0 && !inertias.contains(&p.name)).map(|(i, p)| {
+            let mut values = values.clone();
+            values[i] = -values[i];
+            (format!("`{}`", p.name), settled_run(setup, &values))
+        });
+    let inputs = model.inputs.iter().filter_map(|input| {
+        let mut model = model.clone();
+        for primes in 0..=2 {
+            model.replace(&input.name, primes, &-Expr::prime(&input.name, primes));
+        }
+        let setup = setup.with_model(model, Vec::new()).ok()?;
+        Some((format!("the input `{}`", input.name), settled_run(&setup, &values)))
+    });
+    let tried: Vec<(String, f64)> = inputs
+        .chain(parameters)
+        .take(MOST_SIGNS)
+        .map(|(name, run)| (name, misfit(&setup.data, &run, moving)))
+        .collect();
+    let least = tried.iter().map(|t| t.1).fold(f64::INFINITY, f64::min);
+    if !(least < FOLLOWS && least < CLEARLY * error) {
+        return None;
+    }
+    let names = tried.into_iter().filter(|t| t.1 <= AS_GOOD * least).map(|t| t.0).collect();
+    Some(Turned { names, error: least })
+}
+
+/// The parameters in the factors of the highest derivatives: reversed with one of them, all the rest of an equation would be.
+fn inertias(model: &Model) -> Vec<String> {
+    let factors = model.equations.iter().flat_map(|equation| {
+        let residual = equation.residual();
+        model.states.iter().map(move |state| residual.derivative(&state.name, state.order.min(255) as u8))
+    });
+    factors.flat_map(|factor| factor.variables()).map(|(name, _)| name.to_string()).collect()
+}
+
+/// Error of a run: RMS over these channels of the RMS error over the RMS of the motion; infinite where the run diverges.
+fn misfit(data: &Data, run: &FreeRun, channels: &[usize]) -> f64 {
+    if run.diverged {
+        return f64::INFINITY;
+    }
+    let of = |&c: &usize| {
+        let (mut sum, mut count) = (0.0, 0usize);
+        for (m, s) in pairs(data, run, c).flat_map(|(m, s)| m.iter().zip(s)).filter(|(m, _)| !m.is_nan()) {
+            sum += (m - s) * (m - s);
+            count += 1;
+        }
+        sum / count.max(1) as f64 / (data.spread[c] * data.spread[c])
+    };
+    let mean = channels.iter().map(of).sum::<f64>() / channels.len().max(1) as f64;
+    if mean.is_nan() { f64::INFINITY } else { mean.sqrt() }
 }
 
 /// The first rows of a recording.
@@ -126,7 +244,7 @@ fn sized(measurement: &Measurement, stated: bool, ratio: f64) -> Option<Finding>
     };
     if ratio < 0.0 {
         return Some(on(
-            "nominal_sign",
+            SIGN,
             "It moves against what the model as given says on this recording.".to_owned(),
             "Look at the sign of the input and of this measurement, in the model and at the machine."
                 .to_owned(),
@@ -223,16 +341,68 @@ shaft = "J*theta'' + b*theta' = kt*u"
         assert!(found[0].mend.as_deref().unwrap().contains("a gear"), "{found:?}");
     }
 
+    fn mend(found: &[Finding]) -> &str {
+        found[0].mend.as_deref().unwrap()
+    }
+
     #[test]
     fn a_turned_sign_is_told() {
         let found = told(MODEL, -1.0);
         assert_eq!((found.len(), found[0].code), (1, "nominal_sign"));
+        assert!(mend(&found).contains("the input `u` or of `kt` or of this measurement"), "{found:?}");
     }
 
     #[test]
-    fn a_model_that_runs_away_is_told() {
+    fn a_turned_damping_is_told_by_its_name() {
         let wrong = MODEL.replace("+ b*theta'", "- b*theta'");
         let found = told(&wrong, 1.0);
         assert_eq!((found.len(), found[0].code), (1, "nominal_diverges"));
+        assert!(mend(&found).starts_with("Reverse the sign of `b`, in its value"), "{found:?}");
+        assert!(mend(&found).contains("(nrmse"), "{found:?}");
+        // As a value too.
+        let found = told(&MODEL.replace("value = 0.1,", "value = -0.1,"), 1.0);
+        assert!(mend(&found).starts_with("Reverse the sign of `b`, in its value"), "{found:?}");
+    }
+
+    #[test]
+    fn a_turned_damping_is_told_before_it_runs_away() {
+        let wrong = Model::from_toml(&MODEL.replace("+ b*theta'", "- b*theta'"), "m.toml").unwrap();
+        for rows in [80, 120] {
+            let mut recording = logged(1.0);
+            recording.time.truncate(rows);
+            recording.channels.iter_mut().for_each(|channel| channel.values.truncate(rows));
+            let short = Recording::from_columns("run.csv", recording.time, recording.channels).unwrap();
+            let found = findings(&wrong, &short);
+            assert_eq!((found.len(), found[0].code), (1, "nominal_sign"), "{found:?}");
+            assert!(mend(&found).starts_with("Reverse the sign of `b`, in its value"), "{found:?}");
+        }
+    }
+
+    #[test]
+    fn a_wrong_inertia_is_told_without_a_word_on_signs() {
+        for inertia in ["2e-6", "200"] {
+            let wrong = MODEL.replace("value = 0.02,", &format!("value = {inertia},"));
+            for finding in told(&wrong, 1.0) {
+                let mend = finding.mend.as_deref().unwrap();
+                assert!(!mend.contains("Reverse the sign"), "{inertia}: {finding:?}");
+                assert_ne!(finding.code, "nominal_sign", "{inertia}");
+            }
+        }
+        // So small that the motion would be hundreds of times as large.
+        let free = MODEL.replace(" + b*theta'", "").replace("value = 0.02,", "value = 2e-5,");
+        let free = free.replace("b = { value = 0.1, unit = \"N m s/rad\" }\n", "");
+        let found = told(&free, 1.0);
+        assert_eq!((found.len(), found[0].code), (1, "nominal_diverges"));
+        assert!(mend(&found).starts_with("Look at units and values"), "{found:?}");
+    }
+
+    #[test]
+    fn inertias_are_what_multiplies_the_highest_derivatives() {
+        let text = "[states]\nx = {}\nq = {}\n[parameters]\nm = { value = 1 }\nl = { value = 1 }\nc = { value = 1 }\n\
+                    [equations]\na = \"m*l^2*x'' + c*x' = 0\"\nb = \"q' + c*q + m*l*x = 0\"\n";
+        let mut found = inertias(&Model::from_toml(text, "m.toml").unwrap());
+        found.sort();
+        found.dedup();
+        assert_eq!(found, ["l", "m"]);
     }
 }

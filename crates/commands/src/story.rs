@@ -6,6 +6,7 @@ use greybox_report::contract::{
     Finding, Fit, FitSet, Mechanism, Ordered, Parameter, Report, Score, Severity, Verdict,
 };
 use greybox_report::identified::{Equation, IdentifyReport};
+use greybox_report::notes::grouped;
 use greybox_report::summary::{Spread, Summary};
 use greybox_report::{expression, format, sentence};
 
@@ -189,15 +190,14 @@ pub fn parameter_table(parameters: &Ordered<Parameter>) -> String {
     format!("Parameters (± half the 95 % interval):\n{}", aligned(&rows))
 }
 
-/// What a reader must know of the data, one line each; mere facts stay in the report.
+/// What a reader must know of the data, one line for what a channel has in common over recordings; mere facts stay in the
+/// report.
 pub fn notes(findings: &[Finding]) -> String {
     let mut text = String::new();
-    for finding in findings.iter().filter(|f| f.severity > Severity::Info) {
-        let place = [finding.recording.as_deref(), finding.channel.as_deref()];
-        let place: Vec<&str> = place.into_iter().flatten().collect();
-        let place = if place.is_empty() { String::new() } else { format!("{}: ", place.join(", ")) };
-        let _ = writeln!(text, "Note: {place}{}", finding.message);
-        if let Some(mend) = &finding.mend {
+    for note in grouped(findings).iter().filter(|n| n.severity > Severity::Info) {
+        let place = if note.place.is_empty() { String::new() } else { format!("{}: ", note.place) };
+        let _ = writeln!(text, "Note: {place}{}", note.message);
+        if let Some(mend) = &note.mend {
             let _ = writeln!(text, "      mend: {mend}");
         }
     }

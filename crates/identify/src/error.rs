@@ -44,6 +44,15 @@ pub enum IdentifyError {
         /// As given.
         term: String,
     },
+    /// Sines of states that are no angles.
+    #[error(
+        "the library has sines, but none of the states ({states}) is an angle; leave `trigonometric` out, or give the angle's \
+         channel the unit `rad` or `deg`"
+    )]
+    NoAngle {
+        /// The states.
+        states: String,
+    },
     /// A setting outside its range.
     #[error("{what} is {found}, but must lie in {range}")]
     Range {

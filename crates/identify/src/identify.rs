@@ -3,13 +3,13 @@
 use std::sync::Arc;
 
 use greybox_calibrate::{Data, FreeRun, Hats, Score, Setup, Work, window_length};
-use greybox_model::{Hold, Model};
+use greybox_model::{Hold, Model, Unit};
 use greybox_recording::Recording;
 use greybox_sparse::{folds, select};
 
 use crate::choose::Roles;
 use crate::error::IdentifyError;
-use crate::library::{Library, Setting, derivative};
+use crate::library::{Library, Setting, derivative, is_of_the_language};
 use crate::output_error::{self, Refined, State};
 use crate::precision::{self, Precision};
 use crate::structure::{Equation, Extra, Signal, Structure};
@@ -349,8 +349,21 @@ pub(crate) fn structure(recordings: &[Recording], options: &Options) -> Result<S
     library.terms.extend(options.inputs.iter().skip(1).cloned());
     let mut taken: Vec<String> = options.states.iter().chain(&options.inputs).cloned().collect();
     taken.extend(["t", "pi", "tau", "kp"].map(String::from));
-    let mut setting =
-        Setting { states: &options.states, derivatives: options.derivatives, orders: options.order, taken };
+    // A unit that cannot be read is told where the recordings are laid out.
+    let may_be_angle = |state: &String| {
+        unit(state).and_then(|text| Unit::parse(&text).ok()).is_none_or(|unit| unit.dimension.is_none())
+    };
+    let angles: Vec<bool> = options.states.iter().map(may_be_angle).collect();
+    if library.trigonometric && !angles.contains(&true) {
+        return Err(IdentifyError::NoAngle { states: options.states.join(", ") });
+    }
+    let mut setting = Setting {
+        states: &options.states,
+        derivatives: options.derivatives,
+        orders: options.order,
+        angles,
+        taken,
+    };
     let terms = library.terms(&mut setting);
     let mut extras = Vec::new();
     if let Some(delay) = &options.delay {
@@ -404,7 +417,7 @@ pub(crate) fn structure(recordings: &[Recording], options: &Options) -> Result<S
 
 fn check_name(name: &str) -> Result<(), IdentifyError> {
     let wrong = |reason: String| IdentifyError::Name { name: name.to_string(), reason };
-    if ["t", "pi"].contains(&name) || greybox_model::Func::from_name(name).is_some() {
+    if is_of_the_language(name) {
         return Err(wrong("the language has another meaning for it".to_string()));
     }
     match greybox_model::parse(name) {

@@ -23,7 +23,7 @@ pub struct Library {
     pub constant: bool,
     /// Coulomb friction: the sign of every velocity.
     pub friction: bool,
-    /// sin q and cos q of every state.
+    /// sin q and cos q of every state that may be an angle: in rad, deg, another dimensionless unit, or none stated.
     pub trigonometric: bool,
     /// Terms of the user in the model language.
     pub terms: Vec<String>,
@@ -35,6 +35,8 @@ pub(crate) struct Setting<'a> {
     /// Order of the leading derivative.
     pub derivatives: usize,
     pub orders: usize,
+    /// Which of the states may be angles.
+    pub angles: Vec<bool>,
     /// Names already taken.
     pub taken: Vec<String>,
 }
@@ -59,7 +61,7 @@ impl Library {
             let prefix = if several { format!("{state}_") } else { String::new() };
             let mut name = |base: &str| {
                 let mut name = format!("{prefix}{base}");
-                while setting.taken.contains(&name) {
+                while setting.taken.contains(&name) || is_of_the_language(&name) {
                     name.push('_');
                 }
                 setting.taken.push(name.clone());
@@ -151,7 +153,7 @@ impl Library {
         }
         let own =
             |base: &str, state: &String| if several { format!("{base}_{state}") } else { base.to_string() };
-        for s in setting.states {
+        for (s, angle) in setting.states.iter().zip(&setting.angles) {
             if self.friction && setting.derivatives > 1 {
                 out.push(Candidate {
                     expression: format!("sign({s}')"),
@@ -161,11 +163,11 @@ impl Library {
                     even: false,
                 });
             }
-            if self.trigonometric {
+            if self.trigonometric && *angle {
                 for (function, even) in [("sin", false), ("cos", true)] {
                     out.push(Candidate {
                         expression: format!("{function}({s})"),
-                        base: own(function, s),
+                        base: own(&format!("a_{function}"), s),
                         powers: Vec::new(),
                         order: 1,
                         even,
@@ -188,6 +190,11 @@ impl Library {
     }
 }
 
+/// Whether the model language has a meaning of its own for a name.
+pub(crate) fn is_of_the_language(name: &str) -> bool {
+    ["t", "pi"].contains(&name) || greybox_model::Func::from_name(name).is_some()
+}
+
 /// `x` with `order` primes.
 pub(crate) fn derivative(state: &str, order: usize) -> String {
     format!("{state}{}", "'".repeat(order))
@@ -199,7 +206,9 @@ mod tests {
 
     fn expressions(library: &Library, states: &[&str], orders: usize) -> Vec<String> {
         let states: Vec<String> = states.iter().map(|s| (*s).to_string()).collect();
-        let mut setting = Setting { states: &states, derivatives: 2, orders, taken: vec!["k1".to_string()] };
+        let angles = vec![true; states.len()];
+        let mut setting =
+            Setting { states: &states, derivatives: 2, orders, angles, taken: vec!["k1".to_string()] };
         library.terms(&mut setting).into_iter().map(|t| t.expression).collect()
     }
 
@@ -234,10 +243,54 @@ mod tests {
     #[test]
     fn a_coefficient_never_takes_a_name_in_use() {
         let states = vec!["x".to_string()];
-        let mut setting =
-            Setting { states: &states, derivatives: 2, orders: 1, taken: vec!["k1".to_string()] };
+        let mut setting = Setting {
+            states: &states,
+            derivatives: 2,
+            orders: 1,
+            angles: vec![true],
+            taken: vec!["k1".to_string()],
+        };
         let names: Vec<String> =
             Library::default().terms(&mut setting).into_iter().map(|t| t.parameter).collect();
         assert_eq!(names, ["m", "k1_", "c1", "k1c1"]);
+    }
+
+    /// Every part of the library at once.
+    fn whole(monomials: Monomials) -> Library {
+        Library {
+            monomials,
+            constant: true,
+            friction: true,
+            trigonometric: true,
+            terms: vec!["x'*abs(x')".to_string()],
+        }
+    }
+
+    #[test]
+    fn no_coefficient_is_called_as_a_function_is() {
+        for monomials in [Monomials::Tensor, Monomials::TotalDegree, Monomials::Separate] {
+            for states in [vec!["x".to_string()], vec!["x".to_string(), "a".to_string()]] {
+                let angles = vec![true; states.len()];
+                let mut setting =
+                    Setting { states: &states, derivatives: 2, orders: 3, angles, taken: states.clone() };
+                let names: Vec<String> =
+                    whole(monomials).terms(&mut setting).into_iter().map(|t| t.parameter).collect();
+                for (k, name) in names.iter().enumerate() {
+                    assert!(!is_of_the_language(name), "{name}");
+                    assert!(!names[..k].contains(name) && !states.contains(name), "{name} stands twice");
+                }
+                assert!(names.iter().any(|name| name.ends_with("a_sin") || name.ends_with("a_sin_x")));
+            }
+        }
+    }
+
+    #[test]
+    fn a_length_has_no_sine() {
+        let states = vec!["x".to_string(), "theta".to_string()];
+        let angles = vec![false, true];
+        let mut setting = Setting { states: &states, derivatives: 2, orders: 1, angles, taken: Vec::new() };
+        let library = whole(Monomials::Separate);
+        let terms: Vec<String> = library.terms(&mut setting).into_iter().map(|t| t.expression).collect();
+        assert!(terms.contains(&"sin(theta)".to_string()) && !terms.contains(&"sin(x)".to_string()));
     }
 }

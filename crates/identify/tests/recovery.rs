@@ -349,3 +349,50 @@ fn a_recording_of_noise_alone_is_not_given_an_equation_with_confidence() {
         Ok(found) => assert!(found.train.scores[0].nrmse > 0.9, "{}", found.train.scores[0].nrmse),
     }
 }
+
+/// A driven pendulum: θ″ + 0.3 θ′ + 9 sin θ = f, swinging beyond a right angle.
+fn pendulum(unit: Option<&str>) -> Recording {
+    let (dt, mut random) = (0.01, Pcg64Mcg::seed_from_u64(77));
+    let f: Vec<f64> = (0..3000).map(|k| 6.0 * (2.2 * dt * f64::from(k)).sin()).collect();
+    let theta = oscillator(&f, dt, [1.0, 0.0], |x, v, f| f - 9.0 * x.sin() - 0.3 * v);
+    let theta = noisy(&theta, 0.002, &mut random);
+    recording(dt, &[("f", None, f), ("theta", unit, theta)])
+}
+
+fn with(library: Library) -> Options {
+    Options { library, order: 2, hold: Some(Hold::Linear), replicates: 0, ..Options::new(&["theta"], &["f"]) }
+}
+
+#[test]
+fn the_sine_of_a_pendulum_is_found() {
+    let library =
+        Library { monomials: Monomials::Separate, trigonometric: true, constant: true, ..Library::default() };
+    let found = run(&[pendulum(Some("rad"))], &with(library));
+    let terms = &found.equations[0].terms;
+    assert!(same_terms(&expressions(&found, 0), &["theta''", "theta'", "sin(theta)"]), "{terms:?}");
+    let sine = terms.iter().find(|t| t.expression == "sin(theta)").unwrap();
+    assert!((sine.value - 9.0).abs() < 0.1, "{sine:?}");
+}
+
+#[test]
+fn every_part_of_the_library_makes_a_model() {
+    let recordings = [pendulum(None)];
+    for monomials in [Monomials::Tensor, Monomials::TotalDegree, Monomials::Separate] {
+        for parts in 0..8 {
+            let [constant, friction, trigonometric] = [1, 2, 4].map(|part| parts & part != 0);
+            let library = Library { monomials, constant, friction, trigonometric, terms: Vec::new() };
+            let options = Options { order: 1, ..with(library.clone()) };
+            if let Err(error) = identify(&recordings, &recordings, &options, &Quiet) {
+                panic!("{library:?}: {error}");
+            }
+        }
+    }
+}
+
+#[test]
+fn sines_without_an_angle_are_refused() {
+    let library = Library { trigonometric: true, ..Library::default() };
+    let recordings = [pendulum(Some("m"))];
+    let error = identify(&recordings, &recordings, &with(library), &Quiet).unwrap_err();
+    assert!(matches!(error, IdentifyError::NoAngle { .. }), "{error}");
+}

@@ -6,8 +6,7 @@
 use crate::finding::{Finding, Severity, number, quantity};
 use crate::interpolate::fill_missing;
 use crate::noise::{
-    finite_range, fourth_difference, median, noise_sigma, quantisation_step, recording_sigma,
-    spectral_floor_sigma,
+    finite_range, median, noise_sigma, quantisation_step, recording_sigma, spectral_floor_sigma,
 };
 use crate::recording::{Channel, Recording};
 use crate::spectrum::{Periodogram, correlation, periodogram, whiten};
@@ -62,11 +61,14 @@ fn check_channel(recording: &Recording, c: usize, role: Role, driven: bool) -> V
     let sigma = recording_sigma(recording, c);
     let pieces: Vec<&[f64]> = recording.pieces.iter().map(|piece| piece.columns[c].as_slice()).collect();
     let longest = pieces.iter().copied().max_by_key(|y| y.len()).unwrap_or(&[]);
-    findings.extend(clipping(channel, longest));
+    let clipped = clipping(channel, longest);
+    let rails: Vec<f64> = clipped.iter().filter_map(|finding| finding.value).collect();
+    findings.extend(clipped);
+    // Levels that somebody set, and pulses between them, are what was commanded.
     if role == Role::Output || !is_set_level_by_level(longest) {
         findings.extend(quantisation(channel, longest));
+        findings.extend(outliers(recording, c, &rails));
     }
-    findings.extend(outliers(recording, c));
     let full = fill_missing(longest);
     if full.len() < 16 || finite_range(&full).is_none_or(|(low, high)| low == high) {
         return findings;
@@ -290,31 +292,13 @@ fn quantisation(channel: &Channel, y: &[f64]) -> Option<Finding> {
     Some(finding)
 }
 
-/// Largest robust z-score of a fourth difference that passes as noise.
-const OUTLIER_Z: f64 = 8.0;
-
-/// Single samples that stand out of their neighbours: fourth difference beyond 8 robust standard deviations
-/// (Hampel), with the pattern 1, −4, 6, −4, 1 of a spike around it: the differences beside the largest are −2/3 of
-/// it. A step leaves 1, −3, 3, −1.
-fn outliers(recording: &Recording, c: usize) -> Option<Finding> {
+/// Single samples that stand out of their neighbours, away from the values at which the signal is clipped.
+fn outliers(recording: &Recording, c: usize, rails: &[f64]) -> Option<Finding> {
     let (mut count, mut first) = (0usize, None);
     for piece in &recording.pieces {
-        let y = &piece.columns[c];
-        let differences: Vec<f64> = y.windows(5).map(fourth_difference).collect();
-        let centre = median(&differences);
-        let deviations: Vec<f64> = differences.iter().map(|d| (d - centre).abs()).collect();
-        let rounding = quantisation_step(y).map_or(0.0, |q| q * (70.0f64 / 12.0).sqrt());
-        let spread = (1.4826 * median(&deviations)).max(rounding);
-        if spread.is_nan() || spread <= 0.0 {
-            continue;
-        }
-        for k in 1..differences.len().saturating_sub(1) {
-            let beside = [differences[k - 1], differences[k + 1]];
-            let spike = beside.iter().all(|d| (d / differences[k] + 2.0 / 3.0).abs() < 0.25);
-            if deviations[k] > OUTLIER_Z * spread && spike {
-                count += 1;
-                first.get_or_insert(recording.time[0] + piece.time(k + 2));
-            }
+        for k in crate::outliers::outliers(&piece.columns[c], rails) {
+            count += 1;
+            first.get_or_insert(recording.time[0] + piece.time(k));
         }
     }
     let first = first?;

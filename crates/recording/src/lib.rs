@@ -54,6 +54,7 @@ pub mod interpolate;
 #[cfg(feature = "mat")]
 pub mod mat;
 pub mod noise;
+mod outliers;
 #[cfg(feature = "parquet")]
 pub mod parquet;
 mod read;

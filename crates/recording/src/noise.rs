@@ -35,7 +35,7 @@ pub fn noise_sigma(y: &[f64]) -> f64 {
 }
 
 /// Δ⁴ of five neighbouring samples.
-pub(crate) fn fourth_difference(w: &[f64]) -> f64 {
+fn fourth_difference(w: &[f64]) -> f64 {
     w[0] - 4.0 * w[1] + 6.0 * w[2] - 4.0 * w[3] + w[4]
 }
 

@@ -164,6 +164,99 @@ fn spikes_are_counted_and_steps_are_not() {
     assert_eq!(of_output(step, "outliers"), None);
 }
 
+/// The outliers found in a channel of this role, by their number.
+fn outliers(y: Vec<f64>, input: bool) -> usize {
+    let recording = recording(&[("y", y)]);
+    let findings = if input { check(&recording, &["y"], &[]) } else { check(&recording, &[], &["y"]) };
+    find(&findings, "outliers").map_or(0, |finding| finding.value.unwrap() as usize)
+}
+
+/// Sine of 0.2 Hz at a phase of its own.
+fn slow(seed: u64) -> impl Fn(usize) -> f64 {
+    move |k| (2.0 * PI * 0.2 * DT * k as f64 + seed as f64).sin()
+}
+
+fn rounded(v: f64, q: f64) -> f64 {
+    (v / q).round() * q
+}
+
+const SEEDS: u64 = 100;
+
+#[test]
+fn spikes_of_ten_noise_deviations_are_found() {
+    // Noise, the step to which it is rounded, a rail, size of the spikes.
+    for (sigma, q, rail, size) in [
+        (0.0_f64, 0.0, f64::INFINITY, 0.2),
+        (0.02, 0.0, f64::INFINITY, 0.2),
+        (0.2, 0.0, f64::INFINITY, 2.0),
+        (0.0, 0.01, f64::INFINITY, 0.2),
+        (0.02, 0.01, f64::INFINITY, 0.25),
+        (0.02, 0.0, 0.8, 0.2),
+    ] {
+        let (mut found, mut more) = (0, 0);
+        for seed in 0..SEEDS {
+            let (slow, noise) = (slow(seed), white(seed, sigma.max(1e-12)));
+            let mut y: Vec<f64> = (0..N).map(|k| slow(k) + noise[k]).collect();
+            // Half-way down a flank, far from a rail.
+            let at =
+                (500..N - 500).find(|&k| slow(k) > 0.1 && slow(k + 1) < slow(k) && slow(k) < 0.15).unwrap();
+            y[at] += if seed % 2 == 0 { size } else { -size };
+            y[at + 20] += size;
+            let y = y.iter().map(|v| if q > 0.0 { rounded(*v, q) } else { *v }.min(rail)).collect();
+            let count = outliers(y, false);
+            found += count.min(2);
+            more += usize::from(count > 2);
+        }
+        assert!(
+            found >= 190 && more <= 2,
+            "noise {sigma}, step {q}, rail {rail}: {found} found, {more} more"
+        );
+    }
+}
+
+#[test]
+fn quantised_saturated_and_stepped_signals_have_no_outliers() {
+    type Signal = fn(u64, &[f64]) -> Vec<f64>;
+    let commanded = |noise: &[f64]| {
+        let mut level = 0.0;
+        let step = |w: &f64| {
+            if w.abs() < 0.03 {
+                level = 0.1 * (1e4 * w).rem_euclid(20.0).floor();
+            }
+            level
+        };
+        noise.iter().map(step).collect::<Vec<f64>>()
+    };
+    let cases: [(&str, bool, Signal); 8] = [
+        ("an encoder", false, |seed, _| (0..N).map(|k| rounded(slow(seed)(k), 0.02)).collect()),
+        ("a coarse sensor with noise", false, |seed, w| {
+            (0..N).map(|k| rounded(slow(seed)(k) + 0.02 * w[k], 0.05)).collect()
+        }),
+        ("a slow throttle of few levels", true, |seed, _| {
+            (0..N).map(|k| rounded(0.1 + 0.09 * slow(seed)(k / 4), 0.005)).collect()
+        }),
+        ("a saturated signal", false, |seed, _| (0..N).map(|k| (2.0 * slow(seed)(k)).min(1.2)).collect()),
+        ("a saturated signal with noise", false, |seed, w| {
+            (0..N).map(|k| (2.0 * slow(seed)(k) + 0.05 * w[k]).clamp(-1.0, 1.2)).collect()
+        }),
+        ("a square wave with noise", false, |seed, w| {
+            (0..N).map(|k| slow(seed)(k).signum() + 0.01 * w[k]).collect()
+        }),
+        ("a binary excitation", true, |seed, w| {
+            let bits = white(seed + 1000, 1.0);
+            (0..N).map(|k| bits[k / 5].signum() + 0.01 * w[k]).collect()
+        }),
+        ("corners", false, |seed, w| (0..N).map(|k| slow(seed)(k).abs() + 0.002 * w[k]).collect()),
+    ];
+    for (name, input, signal) in cases {
+        let alarms = (0..SEEDS).filter(|&seed| outliers(signal(seed, &white(seed, 1.0)), input) > 0).count();
+        assert!(alarms <= 2, "{name}: an alarm in {alarms} recordings");
+    }
+    // Commanded levels, some for one sample only.
+    let alarms = (0..SEEDS).filter(|&seed| outliers(commanded(&white(seed, 1.0)), true) > 0).count();
+    assert!(alarms <= 2, "commanded levels: an alarm in {alarms} recordings");
+}
+
 #[test]
 fn missing_and_flat_channels_are_reported() {
     let mut y = noisy_multisine();

@@ -116,3 +116,21 @@ fn reading_and_smoothing_are_fast_enough_for_long_recordings() {
     assert_eq!(smooth.window, 131);
     assert!(reading.as_secs_f64() < 2.0 && smoothing.as_secs_f64() < 5.0, "even on a busy machine");
 }
+
+/// Throttles move in steps, a tank that overflows has corners, a servo's goal jumps: no sample of these stands out.
+#[test]
+fn steps_and_corners_of_real_machines_are_no_outliers() {
+    for (file, inputs, outputs) in [
+        ("dart/dart_00.csv", &["thr"][..], &["v"][..]),
+        ("dart/dart_02.csv", &["thr"], &["v"]),
+        ("dart/dart_10.csv", &["thr"], &["v"]),
+        ("cascaded_tanks/cascaded_tanks_train.csv", &["u"], &["y"]),
+        ("servo_pendulum_xl330/xl330_sin_time_square_kp400.csv", &["goal"], &["theta"]),
+        ("leaf/leaf_dis1c_raw.csv", &["I"], &["V"]),
+    ] {
+        let Some(recording) = read(file) else { return };
+        let findings = health::check(&recording, inputs, outputs);
+        let outliers = findings.iter().find(|f| f.code == "outliers");
+        assert!(outliers.is_none(), "{file}: {outliers:?}");
+    }
+}

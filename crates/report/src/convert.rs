@@ -485,7 +485,8 @@ fn findings(d: &Diagnosis, sources: &Sources<'_>) -> Vec<Finding> {
     out
 }
 
-fn health_finding(f: greybox_recording::Finding, recording: Option<String>) -> Finding {
+/// A finding of a recording in the words of the contract.
+pub fn health_finding(f: greybox_recording::Finding, recording: Option<String>) -> Finding {
     Finding {
         severity: match f.severity {
             Level::Info => Severity::Info,
@@ -500,8 +501,8 @@ fn health_finding(f: greybox_recording::Finding, recording: Option<String>) -> F
     }
 }
 
-/// What the health checks say about the channels that `model` uses.
-fn health_findings<'a>(model: &Model, recordings: impl Iterator<Item = &'a Recording>) -> Vec<Finding> {
+/// What the health checks say about the channels that `model` uses, recording by recording.
+pub fn health_findings<'a>(model: &Model, recordings: impl Iterator<Item = &'a Recording>) -> Vec<Finding> {
     let outputs: Vec<&str> = model.measurements.iter().map(|m| m.channel.as_str()).collect();
     let mut out = Vec::new();
     for recording in recordings {

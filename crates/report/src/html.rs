@@ -23,6 +23,7 @@ use crate::contract::{
 use crate::decimate::{Buckets, MAX_POINTS, round_to_range};
 use crate::diff::{Edit, diff};
 use crate::expression::{self, escape};
+use crate::notes;
 use crate::page::{Channel, Lagged, MechanismPlot, Page, Recording, Residual, Role};
 use crate::{ReportError, format, sentence, svg};
 
@@ -1306,19 +1307,17 @@ fn severity(of: Severity) -> (&'static str, &'static str) {
 }
 
 fn findings(found: &[Finding]) -> Vec<FindingView> {
-    let mut sorted: Vec<&Finding> = found.iter().collect();
-    sorted.sort_by_key(|finding| std::cmp::Reverse(finding.severity));
-    let view = sorted.into_iter().map(|finding| {
-        let (severity, class) = severity(finding.severity);
-        let place: Vec<&str> =
-            finding.recording.as_deref().into_iter().chain(finding.channel.as_deref()).collect();
+    let mut notes = notes::grouped(found);
+    notes.sort_by_key(|note| std::cmp::Reverse(note.severity));
+    let view = notes.into_iter().map(|note| {
+        let (severity, class) = severity(note.severity);
         FindingView {
             severity,
             class,
-            code: finding.code.replace('_', " "),
-            place: place.join(", "),
-            message: finding.message.clone(),
-            mend: finding.mend.clone(),
+            code: note.code.replace('_', " "),
+            place: note.place,
+            message: note.message,
+            mend: note.mend,
         }
     });
     view.collect()

@@ -48,6 +48,7 @@ pub mod format;
 mod html;
 pub mod identified;
 pub mod merge;
+pub mod notes;
 pub mod page;
 pub mod pool;
 pub mod sentence;

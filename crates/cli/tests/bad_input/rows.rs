@@ -32,6 +32,7 @@ impl Row {
 pub(crate) fn rows() -> Vec<Row> {
     [
         files(),
+        foreign(),
         texts(),
         cells(),
         formats(),
@@ -150,6 +151,90 @@ fn files() -> Vec<Row> {
             "a file that is no report",
             |b| b.write("report.json", "{\"verdict\": 3}"),
             "greybox compare report.json report.json",
+        ),
+    ]
+}
+
+fn foreign() -> Vec<Row> {
+    const S: &str = "Files of other tools";
+    const ZIP: &[u8] = b"PK\x03\x04\x14\0\x06\0\x08\0\0\0!\0modelDescription.xml";
+    const URDF: &str = "<?xml version=\"1.0\"?>\n<robot name=\"arm\">\n  <link name=\"upper\"/>\n</robot>\n";
+    const MODELICA: &str = "model Spring\n  Real x;\nequation\n  der(x) = -x;\nend Spring;\n";
+    let model = |what, make, run| Row::new(S, what, make, run);
+    vec![
+        model("an FMU", |b| binary(b, "arm.fmu", ZIP), "greybox diagnose arm.fmu run.csv --out out"),
+        model(
+            "a Simulink model",
+            |b| binary(b, "arm.slx", ZIP),
+            "greybox diagnose arm.slx run.csv --out out",
+        ),
+        model(
+            "a Simulink model of old",
+            |b| b.write("arm.mdl", "Model {\n  Name \"arm\"\n}\n"),
+            "greybox simulate arm.mdl run.csv --out out.csv",
+        ),
+        model(
+            "a robot description",
+            |b| b.write("arm.urdf", URDF),
+            "greybox calibrate arm.urdf run.csv --out out",
+        ),
+        model(
+            "a robot description that is called XML",
+            |b| b.write("arm.xml", URDF),
+            "greybox check run.csv --model arm.xml",
+        ),
+        model(
+            "a simulated world",
+            |b| b.write("world.sdf", "<sdf version=\"1.7\"/>\n"),
+            "greybox check run.csv --model world.sdf",
+        ),
+        model(
+            "a MuJoCo model",
+            |b| b.write("arm.xml", "<mujoco model=\"arm\">\n</mujoco>\n"),
+            "greybox check run.csv --model arm.xml",
+        ),
+        model("an XML file", |b| b.write("arm.xml", "<arm/>\n"), "greybox check run.csv --model arm.xml"),
+        model(
+            "a Python program",
+            |b| b.write("arm.py", "def rate(t, x):\n    return [x[1], -x[0]]\n"),
+            "greybox diagnose arm.py run.csv --out out",
+        ),
+        model(
+            "a notebook",
+            |b| b.write("arm.ipynb", "{\"cells\": []}\n"),
+            "greybox diagnose arm.ipynb run.csv --out out",
+        ),
+        model(
+            "a MATLAB program",
+            |b| b.write("arm.m", "[t, x] = ode45(@rate, [0 1], [0 0]);\n"),
+            "greybox diagnose arm.m run.csv --out out",
+        ),
+        model("a Modelica model", |b| b.write("arm.mo", MODELICA), "greybox export arm.mo --to python"),
+        model(
+            "an archive that is called a model",
+            |b| binary(b, "arm.toml", ZIP),
+            "greybox check run.csv --model arm.toml",
+        ),
+        model(
+            "a MAT-file in the place of the model",
+            |b| binary(b, "run.mat", b"MATLAB 5.0 MAT-file\0\0"),
+            "greybox diagnose run.mat run.csv --out out",
+        ),
+        model(
+            "a robot description in the place of a recording",
+            |b| b.write("arm.urdf", URDF),
+            "greybox check arm.urdf",
+        ),
+        model(
+            "a Python program in the place of a recording",
+            |b| b.write("arm.py", "print(1)\n"),
+            "greybox diagnose model.toml arm.py --out out",
+        ),
+        model("an FMU in the place of a recording", |b| binary(b, "arm.fmu", ZIP), "greybox check arm.fmu"),
+        model(
+            "a spreadsheet in the place of a recording",
+            |b| binary(b, "run.xlsx", ZIP),
+            "greybox check run.xlsx",
         ),
     ]
 }

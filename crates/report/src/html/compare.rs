@@ -4,7 +4,8 @@ use askama::Template;
 
 use super::{Assets, Common, severity};
 use crate::compare::{Change, Comparison, Errors, MechanismChange, Run, Weight};
-use crate::contract::{Estimate, Finding, Interval};
+use crate::contract::{Estimate, Interval};
+use crate::notes::{self, Note};
 use crate::sentence::comparison as words;
 use crate::sentence::recordings::place;
 use crate::{ReportError, expression, format, svg};
@@ -121,7 +122,7 @@ impl View {
             findings: [("Only before", &c.findings_gone), ("Only after", &c.findings_new)]
                 .into_iter()
                 .filter(|(_, list)| !list.is_empty())
-                .map(|(when, list)| (when, list.iter().map(finding).collect()))
+                .map(|(when, list)| (when, notes::grouped(list).iter().map(note).collect()))
                 .collect(),
         }
     }
@@ -214,8 +215,7 @@ fn errors(of: Option<Errors>) -> [String; 4] {
     }
 }
 
-fn finding(f: &Finding) -> String {
-    let place: Vec<&str> = [f.recording.as_deref(), f.channel.as_deref()].into_iter().flatten().collect();
-    let place = if place.is_empty() { String::new() } else { format!("{}: ", place.join(", ")) };
-    format!("{}: {place}{}", severity(f.severity).0, f.message)
+fn note(of: &Note) -> String {
+    let place = if of.place.is_empty() { String::new() } else { format!("{}: ", of.place) };
+    format!("{}: {place}{}", severity(of.severity).0, of.message)
 }
