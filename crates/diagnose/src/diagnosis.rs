@@ -8,7 +8,7 @@ use greybox_calibrate::{
     Criterion, Data, DataError, Ending, Fit, FreeRun, Horizon, Level, Limits, Point, Score, Setup,
     SetupError, Work, free_parameters, window_length, window_of,
 };
-use greybox_model::{Expr, Func, Hold, Input, Model};
+use greybox_model::{Expr, Func, Hold, Model};
 use greybox_recording::Recording;
 use rayon::prelude::*;
 

@@ -71,7 +71,7 @@ fn on(place: &Place) -> crate::library::On {
     }
 }
 
-fn places(model: &Model) -> impl Iterator<Item = Place> + use<> {
+fn places(model: &Model) -> impl Iterator<Item = Place> + use<'_> {
     let (equations, inputs, measurements) =
         (model.equations.len(), model.inputs.len(), model.measurements.len());
     (0..equations)
