@@ -3,7 +3,7 @@
 use std::ops::Range;
 use std::sync::OnceLock;
 
-use greybox_model::{Hold, Model, nearest};
+use greybox_model::{Expr, Hold, Model, Unit, UnitError, nearest};
 use greybox_recording::{Recording, SIZES, smooth::Smoothed};
 use greybox_simulate::{Environment, FINE, Signal};
 
@@ -87,8 +87,34 @@ pub struct ChannelInfo {
     pub name: String,
     /// Unit as the model writes it.
     pub unit: String,
-    /// SI value of one of that unit.
+    /// SI value of a difference of one of that unit.
     pub factor: f64,
+    /// SI value of zero of that unit, see [`Unit::offset`].
+    pub offset: f64,
+}
+
+impl ChannelInfo {
+    /// The value in the channel's unit of an SI value.
+    pub fn from_si(&self, si: f64) -> f64 {
+        if self.offset == 0.0 { si / self.factor } else { (si - self.offset) / self.factor }
+    }
+}
+
+/// The unit in which a channel is recorded: that of its header, else that of the model. `measured` is the expression
+/// that it measures; a difference of temperatures has no zero, whatever the header says.
+///
+/// # Errors
+/// [`UnitError`] where the header's text is no unit, neither built in nor declared by the model.
+pub fn recorded_unit(
+    model: &Model,
+    header: Option<&str>,
+    unit: &Unit,
+    measured: Option<&Expr>,
+) -> Result<Unit, UnitError> {
+    let stated = header.map(|text| model.units.parse(text)).transpose()?;
+    let unit = stated.unwrap_or_else(|| unit.clone());
+    let difference = unit.offset != 0.0 && measured.is_some_and(|e| model.is_difference(e));
+    Ok(if difference { unit.of_difference() } else { unit })
 }
 
 /// One uniformly sampled stretch.
@@ -140,9 +166,11 @@ impl Data {
         let mut pieces = Vec::new();
         let mut sigmas: Vec<Vec<f64>> = vec![Vec::new(); model.measurements.len()];
         for (index, recording) in recordings.iter().enumerate() {
-            let find = |channel: &str, role: String, name: Option<&str>, unit: &greybox_model::Unit| {
-                find_channel(recording, channel, role, name, unit)
-            };
+            let find =
+                |channel: &str, role: String, name: Option<&str>, unit: &Unit, measured: Option<&Expr>| {
+                    let recorded = |header: Option<&str>| recorded_unit(model, header, unit, measured);
+                    find_channel(recording, channel, role, name, unit, &recorded)
+                };
             let mut inputs = Vec::new();
             for input in &model.inputs {
                 inputs.push(find(
@@ -150,20 +178,22 @@ impl Data {
                     format!("input `{}`", input.name),
                     Some(&input.name),
                     &input.unit,
+                    None,
                 )?);
             }
             let mut measured = Vec::new();
             for m in &model.measurements {
                 let state = model.states.iter().find(|s| s.channel.as_ref() == Some(&m.channel));
                 let name = state.map(|s| s.name.as_str());
-                measured.push(find(&m.channel, format!("measurement `{}`", m.expr), name, &m.unit)?);
+                let role = format!("measurement `{}`", m.expr);
+                measured.push(find(&m.channel, role, name, &m.unit, Some(&m.expr))?);
             }
-            let scaled = |(channel, factor): (usize, f64), piece: &greybox_recording::Piece| -> Vec<f64> {
-                piece.columns[channel].iter().map(|v| v * factor).collect()
+            let scaled = |(channel, unit): &(usize, Unit), piece: &greybox_recording::Piece| -> Vec<f64> {
+                piece.columns[*channel].iter().map(|v| unit.to_si(*v)).collect()
             };
             let mut of_recording: Vec<Vec<f64>> = vec![Vec::new(); measured.len()];
             for piece in &recording.pieces {
-                let ys: Vec<Vec<f64>> = measured.iter().map(|&m| scaled(m, piece)).collect();
+                let ys: Vec<Vec<f64>> = measured.iter().map(|m| scaled(m, piece)).collect();
                 let mut smooth = Vec::new();
                 for (c, y) in ys.iter().enumerate() {
                     let sigma = noise_level(y);
@@ -180,7 +210,7 @@ impl Data {
                     inputs: inputs
                         .iter()
                         .zip(&model.inputs)
-                        .map(|(&i, input)| filled(&scaled(i, piece), input.hold))
+                        .map(|(i, input)| filled(&scaled(i, piece), input.hold))
                         .collect(),
                     measured: ys,
                     smooth,
@@ -198,6 +228,7 @@ impl Data {
                 name: m.channel.clone(),
                 unit: m.unit.text.clone(),
                 factor: m.unit.factor,
+                offset: m.unit.offset,
             })
             .collect();
         let spread: Vec<f64> = (0..channels.len())
@@ -315,14 +346,16 @@ fn mend(channel: &str, name: Option<&str>, recording: &Recording) -> String {
     )
 }
 
-/// Column and factor to SI of a channel. `name` is that of the input or the state which it feeds alone.
+/// Column and unit of a channel. `name` is that of the input or the state which it feeds alone, `recorded` the unit
+/// of a header.
 fn find_channel(
     recording: &Recording,
     channel: &str,
     role: String,
     name: Option<&str>,
-    unit: &greybox_model::Unit,
-) -> Result<(usize, f64), DataError> {
+    unit: &Unit,
+    recorded: &dyn Fn(Option<&str>) -> Result<Unit, UnitError>,
+) -> Result<(usize, Unit), DataError> {
     let file = recording.name.clone();
     let Some(index) = recording.channels.iter().position(|c| c.name == channel) else {
         let available: Vec<String> = recording.channels.iter().map(|c| format!("`{}`", c.name)).collect();
@@ -338,31 +371,25 @@ fn find_channel(
     if found.values.iter().all(|v| v.is_nan()) {
         return Err(DataError::EmptyChannel { file, channel: channel.to_string() });
     }
-    let factor = match &found.unit {
-        None => unit.factor,
-        Some(text) => {
-            let header = greybox_model::Unit::parse(text).map_err(|e| DataError::UnreadableUnit {
-                file: file.clone(),
-                channel: channel.to_string(),
-                message: e.to_string(),
-            })?;
-            if !header.dimension.same(&unit.dimension) {
-                return Err(DataError::Unit {
-                    file,
-                    channel: channel.to_string(),
-                    found: text.clone(),
-                    role,
-                    expected: unit.text.clone(),
-                });
-            }
-            header.factor
-        }
-    };
-    let largest = found.values.iter().map(|v| (v * factor).abs()).fold(0.0, f64::max);
+    let recorded = recorded(found.unit.as_deref()).map_err(|e| DataError::UnreadableUnit {
+        file: file.clone(),
+        channel: channel.to_string(),
+        message: e.to_string(),
+    })?;
+    if !recorded.dimension.same(&unit.dimension) {
+        return Err(DataError::Unit {
+            file,
+            channel: channel.to_string(),
+            found: recorded.text,
+            role,
+            expected: unit.text.clone(),
+        });
+    }
+    let largest = found.values.iter().map(|v| recorded.to_si(*v).abs()).fold(0.0, f64::max);
     if largest > *SIZES.end() {
         return Err(DataError::OutOfRange { file, channel: channel.to_string(), largest });
     }
-    Ok((index, factor))
+    Ok((index, recorded))
 }
 
 /// An input with its missing samples as its hold has them: a value is held until the next one, or joined with it.

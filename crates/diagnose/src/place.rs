@@ -422,6 +422,11 @@ fn motion(model: &Model, weights: Vec<f64>, coefficients: Vec<f64>) -> Option<Mo
 
 fn is_velocity(d: &Dimension) -> bool {
     // m/s, or 1/s (rad/s)
-    let d = d.0;
-    d[2] == -1.0 && d[1] == 0.0 && d[3..].iter().all(|v| *v == 0.0) && (d[0] == 1.0 || d[0] == 0.0)
+    let declared = d.declared().next().is_some();
+    let d = d.si_exponents();
+    !declared
+        && d[2] == -1.0
+        && d[1] == 0.0
+        && d[3..].iter().all(|v| *v == 0.0)
+        && (d[0] == 1.0 || d[0] == 0.0)
 }
