@@ -226,6 +226,28 @@ mod tests {
         );
     }
 
+    /// Twice 20 degC is another temperature than twice 293.15 K.
+    #[test]
+    fn the_prior_of_a_temperature_does_not_depend_on_its_zero() {
+        let priors = |room: &str| -> Vec<Prior> {
+            let text = format!(
+                "[states]\nT = {{ unit = \"degC\" }}\n[parameters]\ntau = {{ value = 4, unit = \"s\" }}\n\
+                 To = {{ {room} }}\n[equations]\nheat = \"tau*T' + T = To\"\n"
+            );
+            let model = Model::from_toml(&text, "model.toml").unwrap();
+            free_parameters(&model).into_iter().map(|f| f.prior).collect()
+        };
+        let weak = Prior::Cauchy { centre: 4.0, scale: 2.0 };
+        for room in ["value = 20, unit = \"degC\"", "value = 293.15, unit = \"K\"", "value = 20"] {
+            assert_eq!(priors(room), [weak, Prior::Flat], "{room}");
+        }
+        let stated = priors("value = 20, unit = \"degC\", std = 3");
+        assert_eq!(stated, [weak, Prior::Normal { mean: 293.15, std: 3.0 }]);
+        let stated = priors("value = 68, unit = \"degF\", std = 9");
+        let Prior::Normal { mean, std } = stated[1] else { panic!("{stated:?}") };
+        assert!((mean - 293.15).abs() < 1e-12 && std == 5.0);
+    }
+
     #[test]
     fn what_is_stated_counts() {
         expect(

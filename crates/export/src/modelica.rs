@@ -3,7 +3,7 @@
 use std::fmt::Write as _;
 
 use greybox_model::expr::Func;
-use greybox_model::{Dimension, Expr, Model, System, Unit};
+use greybox_model::{Expr, Model, System, Unit};
 
 use crate::error::ExportError;
 use crate::infix::{Dialect, atom, number, quoted, text};

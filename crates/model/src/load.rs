@@ -408,6 +408,10 @@ fn read_units(root: &DeTable<'_>) -> Result<Units, Located> {
                         format!("declare one of them as `\"{OWN}\"`, or as a multiple of a known unit");
                     bad(&item, message, value.span(), help)
                 }
+                None if text.trim() == OWN => {
+                    let help = error.help.unwrap_or_else(|| "write `0.5 rad`".into());
+                    bad(&item, error.message, value.span(), help)
+                }
                 None => unit_fault(&item, value, &text, error, "0.5 rad"),
             });
         }

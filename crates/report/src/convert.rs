@@ -802,19 +802,26 @@ mod tests {
     #[test]
     fn numbers_in_si_are_told_where_the_model_has_other_units() {
         let text = r#"
+            [units]
+            doz = 12
             [inputs]
             q = { unit = "L/min" }
             [states]
             phi = { unit = "deg" }
             psi = { unit = "rad" }
             h = { unit = "cm" }
+            Ti = { unit = "degC" }
+            e = { unit = "doz" }
             [parameters]
             J = { value = 1.0, unit = "s^2" }
             A = { value = 1.0, unit = "m^2" }
+            tau = { value = 1.0, unit = "s" }
             [equations]
             a = "J*phi'' + phi = 0"
             b = "J*psi'' + psi = 0"
             c = "A*h' = q"
+            d = "tau*Ti' + Ti = 0"
+            e = "tau*e' + e = 0"
         "#;
         let model = Model::from_toml(text, "m.toml").unwrap();
         let told = |e: &str| converted(e, &model);
@@ -823,6 +830,11 @@ mod tests {
         assert_eq!(told("abs(h')").as_deref(), Some("m/s"));
         assert_eq!(told("q").as_deref(), Some("m^3/s"));
         assert_eq!(told("phi - psi").as_deref(), Some("rad"));
+        assert_eq!(told("Ti").as_deref(), Some("K"));
+        assert_eq!(told("Ti'").as_deref(), Some("K/s"));
+        assert_eq!(told("e").as_deref(), Some("1"));
+        assert_eq!(coherent(&Unit::parse("degC").unwrap()), "K");
+        assert_eq!(coherent(&Unit::parse("count").unwrap()), "count");
         for plain in ["psi'", "t", "z", "h*q"] {
             assert_eq!(told(plain), None, "{plain}");
         }
