@@ -22,7 +22,7 @@ use std::fmt;
 use std::ops::{Div, Mul, Range};
 
 /// Longest symbol of a dimension that a model declares, bytes of UTF-8.
-pub(crate) const LONGEST_SYMBOL: usize = 23;
+pub(crate) const LONGEST_SYMBOL: usize = 15;
 
 /// The symbol of a dimension that a model declares.
 #[derive(Clone, Copy, PartialEq, Eq)]
@@ -1101,7 +1101,7 @@ mod tests {
         let product = four.parse("a_ b_^2/(c_ e_^0.5)").unwrap();
         assert_eq!(product.dimension.declared().count(), 4);
         let long = "x".repeat(LONGEST_SYMBOL + 1);
-        assert!(Units::default().declare(&long, "own").unwrap_err().to_string().contains("23 bytes"));
+        assert!(Units::default().declare(&long, "own").unwrap_err().to_string().contains("15 bytes"));
         for symbol in ["mm", "count", "degC", "own", "", "x2", "a b", "\u{b0}"] {
             assert!(refused_symbol(symbol).is_some(), "{symbol}");
         }
