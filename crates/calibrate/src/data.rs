@@ -189,7 +189,7 @@ impl Data {
                 measured.push(find(&m.channel, role, name, &m.unit, Some(&m.expr))?);
             }
             let scaled = |(channel, unit): &(usize, Unit), piece: &greybox_recording::Piece| -> Vec<f64> {
-                piece.columns[*channel].iter().map(|v| unit.difference_to_si(*v)).collect()
+                piece.columns[*channel].iter().map(|v| unit.to_si(*v)).collect()
             };
             let mut of_recording: Vec<Vec<f64>> = vec![Vec::new(); measured.len()];
             for piece in &recording.pieces {
