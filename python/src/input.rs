@@ -178,11 +178,11 @@ pub(crate) struct Recordings {
     pub(crate) holdout: Vec<greybox_recording::Recording>,
 }
 
-/// As `--map` of the command.
+/// As `--map` of the command: a symbol that is not built in may be declared by the model.
 fn rename(text: &str) -> Result<Rename, Failure> {
     let rename: Rename = text.parse().map_err(|e: RenameError| Failure::input(e.to_string()))?;
     match rename.unit.as_deref().map(Unit::parse) {
-        Some(Err(error)) => Err(Failure::input(error.to_string())),
+        Some(Err(error)) if error.unknown.is_none() => Err(Failure::input(error.to_string())),
         _ => Ok(rename),
     }
 }
@@ -255,11 +255,12 @@ impl Model {
     fn parameters<'py>(&self, py: Python<'py>) -> PyResult<Bound<'py, PyDict>> {
         let all = PyDict::new(py);
         for p in &self.0.model.parameters {
-            let factor = p.unit.as_ref().map_or(1.0, |u| u.factor);
+            let value = p.unit.as_ref().map_or(p.value, |u| u.from_si(p.value));
+            let std = p.std.map(|s| p.unit.as_ref().map_or(s, |u| u.difference_from_si(s)));
             let told = PyDict::new(py);
-            told.set_item("value", p.value / factor)?;
+            told.set_item("value", value)?;
             told.set_item("unit", p.unit.as_ref().map(|u| u.text.as_str()))?;
-            told.set_item("std", p.std.map(|s| s / factor))?;
+            told.set_item("std", std)?;
             told.set_item("fixed", p.fixed)?;
             all.set_item(&p.name, told)?;
         }
@@ -289,7 +290,7 @@ impl Model {
                     .mend("give a finite number"));
             }
             let parameter = &mut model.parameters[index];
-            parameter.value = value * parameter.unit.as_ref().map_or(1.0, |u| u.factor);
+            parameter.value = parameter.unit.as_ref().map_or(*value, |u| u.to_si(*value));
         }
         let text = model.to_toml(&WriteOptions { original: Some(&self.0.text), ..Default::default() });
         loading::model_of(text, &self.0.path).map(Model)

@@ -3,7 +3,7 @@
 use std::ops::Range;
 use std::sync::OnceLock;
 
-use greybox_model::{Dimension, Hold, Input, Model, Unit, nearest};
+use greybox_model::{Dimension, Expr, Hold, Input, Model, Unit, UnitError, nearest};
 use greybox_recording::{Recording, SIZES, smooth::Smoothed};
 use greybox_simulate::{Environment, FINE, Signal};
 
@@ -101,8 +101,34 @@ pub struct ChannelInfo {
     pub name: String,
     /// Unit as the model writes it.
     pub unit: String,
-    /// SI value of one of that unit.
+    /// SI value of a difference of one of that unit.
     pub factor: f64,
+    /// SI value of zero of that unit, see [`Unit::offset`].
+    pub offset: f64,
+}
+
+impl ChannelInfo {
+    /// The value in the channel's unit of an SI value.
+    pub fn from_si(&self, si: f64) -> f64 {
+        if self.offset == 0.0 { si / self.factor } else { (si - self.offset) / self.factor }
+    }
+}
+
+/// The unit in which a channel is recorded: that of its header, else that of the model. `measured` is the expression
+/// that it measures; a difference of temperatures has no zero, whatever the header says.
+///
+/// # Errors
+/// [`UnitError`] where the header's text is no unit, neither built in nor declared by the model.
+pub fn recorded_unit(
+    model: &Model,
+    header: Option<&str>,
+    unit: &Unit,
+    measured: Option<&Expr>,
+) -> Result<Unit, UnitError> {
+    let stated = header.map(|text| model.units.parse(text)).transpose()?;
+    let unit = stated.unwrap_or_else(|| unit.clone());
+    let difference = unit.offset != 0.0 && measured.is_some_and(|e| model.is_difference(e));
+    Ok(if difference { unit.of_difference() } else { unit })
 }
 
 /// One uniformly sampled stretch.
@@ -154,9 +180,11 @@ impl Data {
         let mut pieces = Vec::new();
         let mut sigmas: Vec<Vec<f64>> = vec![Vec::new(); model.measurements.len()];
         for (index, recording) in recordings.iter().enumerate() {
-            let find = |channel: &str, role: String, name: Option<&str>, unit: &greybox_model::Unit| {
-                find_channel(recording, channel, role, name, unit)
-            };
+            let find =
+                |channel: &str, role: String, name: Option<&str>, unit: &Unit, measured: Option<&Expr>| {
+                    let recorded = |header: Option<&str>| recorded_unit(model, header, unit, measured);
+                    find_channel(recording, channel, role, name, unit, &recorded)
+                };
             let mut inputs = Vec::new();
             for input in &model.inputs {
                 inputs.push(find_input(model, input, recording)?);
@@ -165,14 +193,15 @@ impl Data {
             for m in &model.measurements {
                 let state = model.states.iter().find(|s| s.channel.as_ref() == Some(&m.channel));
                 let name = state.map(|s| s.name.as_str());
-                measured.push(find(&m.channel, format!("measurement `{}`", m.expr), name, &m.unit)?);
+                let role = format!("measurement `{}`", m.expr);
+                measured.push(find(&m.channel, role, name, &m.unit, Some(&m.expr))?);
             }
-            let scaled = |(channel, factor): (usize, f64), piece: &greybox_recording::Piece| -> Vec<f64> {
-                piece.columns[channel].iter().map(|v| v * factor).collect()
+            let scaled = |(channel, unit): &(usize, Unit), piece: &greybox_recording::Piece| -> Vec<f64> {
+                piece.columns[*channel].iter().map(|v| unit.to_si(*v)).collect()
             };
             let mut of_recording: Vec<Vec<f64>> = vec![Vec::new(); measured.len()];
             for piece in &recording.pieces {
-                let ys: Vec<Vec<f64>> = measured.iter().map(|&m| scaled(m, piece)).collect();
+                let ys: Vec<Vec<f64>> = measured.iter().map(|m| scaled(m, piece)).collect();
                 let mut smooth = Vec::new();
                 for (c, y) in ys.iter().enumerate() {
                     let sigma = noise_level(y);
@@ -190,7 +219,7 @@ impl Data {
                         .iter()
                         .zip(&model.inputs)
                         .map(|(found, input)| {
-                            let values = scaled((found.column, found.factor), piece);
+                            let values = scaled(&(found.column, found.unit.clone()), piece);
                             match found.differentiated {
                                 true => derivative(&filled(&values, Hold::Linear), piece.dt, input.hold),
                                 false => filled(&values, input.hold),
@@ -213,6 +242,7 @@ impl Data {
                 name: m.channel.clone(),
                 unit: m.unit.text.clone(),
                 factor: m.unit.factor,
+                offset: m.unit.offset,
             })
             .collect();
         let spread: Vec<f64> = (0..channels.len())
@@ -348,8 +378,8 @@ fn mend(channel: &str, name: Option<(&str, &str)>, recording: &Recording) -> Str
 /// Where an input is found.
 struct FoundInput {
     column: usize,
-    /// To SI, before it is differentiated.
-    factor: f64,
+    /// Before it is differentiated.
+    unit: Unit,
     differentiated: bool,
 }
 
@@ -358,8 +388,10 @@ fn find_input(model: &Model, input: &Input, recording: &Recording) -> Result<Fou
     let role = format!("input `{}`", input.name);
     let base = input.derivative_of().filter(|_| recording.channel(&input.channel).is_none());
     let Some(base) = base else {
-        let (column, factor) = find_channel(recording, &input.channel, role, Some(&input.name), &input.unit)?;
-        return Ok(FoundInput { column, factor, differentiated: false });
+        let recorded = |header: Option<&str>| recorded_unit(model, header, &input.unit, None);
+        let (column, unit) =
+            find_channel(recording, &input.channel, role, Some(&input.name), &input.unit, &recorded)?;
+        return Ok(FoundInput { column, unit, differentiated: false });
     };
     let refused = |reason: &str, mend: String| DataError::Derivative {
         file: recording.name.clone(),
@@ -406,14 +438,16 @@ fn find_input(model: &Model, input: &Input, recording: &Recording) -> Result<Fou
     }
     unit.dimension = input.unit.dimension * Dimension::TIME;
     let role = format!("{role} (its derivative)");
-    let (column, factor) = find_channel(recording, base, role, None, &unit).map_err(|error| match error {
+    let recorded = |header: Option<&str>| recorded_unit(model, header, &unit, None);
+    let found = find_channel(recording, base, role, None, &unit, &recorded);
+    let (column, unit) = found.map_err(|error| match error {
         DataError::MissingChannel { file, channel, role, available, .. } => {
             let mend = mend(base, Some((&input.name, "'")), recording);
             DataError::MissingChannel { file, channel, role, available, mend }
         }
         other => other,
     })?;
-    Ok(FoundInput { column, factor, differentiated: true })
+    Ok(FoundInput { column, unit, differentiated: true })
 }
 
 /// Samples of the derivative of a signal without missing samples. What stays constant between samples is the slope of the
@@ -446,14 +480,16 @@ pub(crate) fn derivative(u: &[f64], dt: f64, hold: Hold) -> Vec<f64> {
     }
 }
 
-/// Column and factor to SI of a channel. `name` is that of the input or the state which it feeds alone.
+/// Column and unit of a channel. `name` is that of the input or the state which it feeds alone, `recorded` the unit
+/// of a header.
 fn find_channel(
     recording: &Recording,
     channel: &str,
     role: String,
     name: Option<&str>,
-    unit: &greybox_model::Unit,
-) -> Result<(usize, f64), DataError> {
+    unit: &Unit,
+    recorded: &dyn Fn(Option<&str>) -> Result<Unit, UnitError>,
+) -> Result<(usize, Unit), DataError> {
     let file = recording.name.clone();
     let Some(index) = recording.channels.iter().position(|c| c.name == channel) else {
         let available: Vec<String> = recording.channels.iter().map(|c| format!("`{}`", c.name)).collect();
@@ -469,31 +505,25 @@ fn find_channel(
     if found.values.iter().all(|v| v.is_nan()) {
         return Err(DataError::EmptyChannel { file, channel: channel.to_string() });
     }
-    let factor = match &found.unit {
-        None => unit.factor,
-        Some(text) => {
-            let header = greybox_model::Unit::parse(text).map_err(|e| DataError::UnreadableUnit {
-                file: file.clone(),
-                channel: channel.to_string(),
-                message: e.to_string(),
-            })?;
-            if !header.dimension.same(&unit.dimension) {
-                return Err(DataError::Unit {
-                    file,
-                    channel: channel.to_string(),
-                    found: text.clone(),
-                    role,
-                    expected: unit.text.clone(),
-                });
-            }
-            header.factor
-        }
-    };
-    let largest = found.values.iter().map(|v| (v * factor).abs()).fold(0.0, f64::max);
+    let recorded = recorded(found.unit.as_deref()).map_err(|e| DataError::UnreadableUnit {
+        file: file.clone(),
+        channel: channel.to_string(),
+        message: e.to_string(),
+    })?;
+    if !recorded.dimension.same(&unit.dimension) {
+        return Err(DataError::Unit {
+            file,
+            channel: channel.to_string(),
+            found: recorded.text,
+            role,
+            expected: unit.text.clone(),
+        });
+    }
+    let largest = found.values.iter().map(|v| recorded.to_si(*v).abs()).fold(0.0, f64::max);
     if largest > *SIZES.end() {
         return Err(DataError::OutOfRange { file, channel: channel.to_string(), largest });
     }
-    Ok((index, factor))
+    Ok((index, recorded))
 }
 
 /// An input with its missing samples as its hold has them: a value is held until the next one, or joined with it.

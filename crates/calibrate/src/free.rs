@@ -1,6 +1,6 @@
 //! Which parameters a fit may move, within which bounds, and what is known of them before.
 
-use greybox_model::{Expr, Model};
+use greybox_model::{Dimension, Expr, Model};
 
 use crate::problem::{Free, Prior};
 
@@ -19,7 +19,7 @@ const MATCHED: usize = 7;
 /// |---|---|
 /// | `std` | normal, N(value, std) |
 /// | nothing | Cauchy about the value, scale \|value\|/2: a guess that may be wrong by orders of magnitude |
-/// | a value of zero without `std` | none |
+/// | a value of zero without `std`, or a temperature | none: where zero stands on its scale says nothing of it |
 ///
 /// A parameter may cross zero, but for those that physics keeps from it: where `positive = true` is stated, and where
 /// nothing is stated those that [`keeps_sign`] finds.
@@ -31,8 +31,11 @@ pub fn free_parameters(model: &Model) -> Vec<Free> {
         .enumerate()
         .filter(|(_, p)| !p.fixed)
         .map(|(index, p)| {
+            // Twice as many degrees are not twice as hot.
+            let temperature = p.unit.as_ref().is_some_and(|u| u.dimension.same(&Dimension::TEMPERATURE));
             let prior = match p.std {
                 Some(std) if std > 0.0 => Prior::Normal { mean: p.value, std },
+                _ if temperature => Prior::Flat,
                 _ if p.value != 0.0 => Prior::Cauchy { centre: p.value, scale: UNSTATED * p.value.abs() },
                 _ => Prior::Flat,
             };
@@ -221,6 +224,28 @@ mod tests {
             "#,
             &["A", "B"],
         );
+    }
+
+    /// Twice 20 degC is another temperature than twice 293.15 K.
+    #[test]
+    fn the_prior_of_a_temperature_does_not_depend_on_its_zero() {
+        let priors = |room: &str| -> Vec<Prior> {
+            let text = format!(
+                "[states]\nT = {{ unit = \"degC\" }}\n[parameters]\ntau = {{ value = 4, unit = \"s\" }}\n\
+                 To = {{ {room} }}\n[equations]\nheat = \"tau*T' + T = To\"\n"
+            );
+            let model = Model::from_toml(&text, "model.toml").unwrap();
+            free_parameters(&model).into_iter().map(|f| f.prior).collect()
+        };
+        let weak = Prior::Cauchy { centre: 4.0, scale: 2.0 };
+        for room in ["value = 20, unit = \"degC\"", "value = 293.15, unit = \"K\"", "value = 20"] {
+            assert_eq!(priors(room), [weak, Prior::Flat], "{room}");
+        }
+        let stated = priors("value = 20, unit = \"degC\", std = 3");
+        assert_eq!(stated, [weak, Prior::Normal { mean: 293.15, std: 3.0 }]);
+        let stated = priors("value = 68, unit = \"degF\", std = 9");
+        let Prior::Normal { mean, std } = stated[1] else { panic!("{stated:?}") };
+        assert!((mean - 293.15).abs() < 1e-12 && std == 5.0);
     }
 
     #[test]

@@ -74,11 +74,11 @@ pub(crate) struct Channels {
     pub(crate) map: Vec<Rename>,
 }
 
-/// A [`Rename`] whose unit, if it has one, is a unit.
+/// A [`Rename`] whose unit, if it has one, is written as one; a symbol that is not built in may be declared by the model.
 fn rename(text: &str) -> Result<Rename, String> {
     let rename: Rename = text.parse().map_err(|e: RenameError| e.to_string())?;
     match rename.unit.as_deref().map(Unit::parse) {
-        Some(Err(error)) => Err(error.to_string()),
+        Some(Err(error)) if error.unknown.is_none() => Err(error.to_string()),
         _ => Ok(rename),
     }
 }

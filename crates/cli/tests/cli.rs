@@ -416,3 +416,60 @@ fn diagnose_of_a_complete_model_says_that_nothing_is_missing() {
     assert_eq!(report["verdict"], "consistent");
     assert_eq!(report["mechanisms"], serde_json::json!([]));
 }
+
+/// A heated room, recorded on the Celsius scale: what comes in as degrees Celsius goes out as degrees Celsius.
+#[test]
+fn temperatures_stay_on_their_scale_and_declared_units_in_the_model() {
+    let bench = Bench::empty();
+    let model = r#"[units]
+duty = "0.01 1"
+
+[inputs]
+u = { unit = "duty" }
+
+[states]
+T = { unit = "degC" }
+
+[parameters]
+tau = { value = 3, unit = "s" }
+rise = { value = 20, unit = "K" }
+To = { value = 10, unit = "degC" }
+
+[equations]
+heat = "tau*T' = To - T + rise*u"
+"#;
+    bench.write("room.toml", model);
+    // 4 T' = 15 - T + 30 u, degC.
+    let (mut rows, mut temperature) = ("t,u [duty],T [degF]\n".to_owned(), 15.0);
+    for k in 0..400 {
+        let u = if k * 13 % 97 < 40 { 100.0 } else { 0.0 };
+        rows += &format!("{:.2},{u},{:.6}\n", 0.1 * f64::from(k), temperature * 1.8 + 32.0);
+        for _ in 0..20 {
+            temperature += 0.005 * (15.0 - temperature + 0.3 * u) / 4.0;
+        }
+    }
+    bench.write("room.csv", &rows);
+    let report = bench.json(&["calibrate", "room.toml", "room.csv", "--out", "out"]);
+    let ground = &report["parameters"]["To"];
+    let (nominal, value) = (ground["nominal"].as_f64().unwrap(), ground["value"].as_f64().unwrap());
+    assert!((nominal - 10.0).abs() < 1e-9 && (value - 15.0).abs() < 1.0, "{ground}");
+    let (low, high) = (ground["ci95"][0].as_f64().unwrap(), ground["ci95"][1].as_f64().unwrap());
+    assert!(low < value && value < high && high - low < 8.0, "{ground}");
+    let written = bench.read("out/model.toml");
+    assert!(
+        written.starts_with("[units]\nduty = \"0.01 1\"\n") && written.contains("unit = \"degC\""),
+        "{written}"
+    );
+    bench.json(&["simulate", "out/model.toml", "room.csv", "--out", "simulated.csv"]);
+    let simulated = bench.read("simulated.csv");
+    assert_eq!(simulated.lines().next(), Some("t,T [degF]"));
+    for (simulated, measured) in column(&simulated, 1).into_iter().zip(column(&rows, 2)) {
+        let (simulated, measured) = (simulated.unwrap(), measured.unwrap());
+        assert!((simulated - measured).abs() < 2.0, "{simulated} {measured}");
+    }
+    // A symbol of the model is known to `--map` too.
+    bench.write("bare.csv", &rows.replace("u [duty]", "valve"));
+    let report =
+        bench.json(&["calibrate", "room.toml", "bare.csv", "--map", "u=valve [duty]", "--out", "mapped"]);
+    assert!((report["parameters"]["To"]["value"].as_f64().unwrap() - value).abs() < 1e-9);
+}

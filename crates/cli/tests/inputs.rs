@@ -116,7 +116,12 @@ fn a_map_that_does_not_fit_is_refused() {
             "did you mean `sensor_3`?",
         ],
     );
-    bench.refuses(&check("x=sensor_3 [furlong]"), &["unknown unit `furlong`", "--map"]);
+    bench.refuses(&check("x=sensor_3 [N//m]"), &["found `/`", "--map"]);
+    // A model might declare it; this one does not.
+    bench.refuses(
+        &["check", "raw.csv", "--model", "model.toml", "--map", "f=force", "--map", "x=sensor_3 [furlong]"],
+        &["channel `x`: unknown unit `furlong`", "[units]"],
+    );
     bench.refuses(&check("sensor_3"), &["is not `NAME=CHANNEL`"]);
     bench.refuses(&check("force=sensor_3"), &["a channel `force` already"]);
     bench.refuses(&["check", "run.csv", "--map", "x=x [m]"], &["channel `x` in [mm], not [m]"]);

@@ -178,11 +178,11 @@ fn parameters(model: &Model, changes: &[ParameterChange]) -> Ordered<Parameter> 
         .iter()
         .filter_map(|change| {
             let p = model.parameters.get(change.index)?;
-            let factor = p.unit.as_ref().map_or(1.0, |u| u.factor);
+            let told = |si: f64| p.unit.as_ref().map_or(si, |u| u.from_si(si));
             let parameter = Parameter {
-                nominal: change.nominal / factor,
-                value: change.calibrated.value / factor,
-                ci95: change.calibrated.ci95.map(|(low, high)| Interval::new(low / factor, high / factor)),
+                nominal: told(change.nominal),
+                value: told(change.calibrated.value),
+                ci95: change.calibrated.ci95.map(|(low, high)| Interval::new(told(low), told(high))),
                 unit: p.unit.as_ref().map(|u| u.text.clone()),
                 fixed: p.fixed,
                 calibrated: None,

@@ -3,8 +3,9 @@
 use std::fmt::Write as _;
 use std::sync::Arc;
 
+use greybox_calibrate::data::recorded_unit;
 use greybox_calibrate::{Data, FreeRun, Score, Setup, window_length};
-use greybox_model::{Model, Unit};
+use greybox_model::Model;
 use greybox_recording::{Piece, Recording};
 use greybox_report::format;
 use serde_json::{Map, json};
@@ -129,7 +130,9 @@ fn columns(model: &Model, recording: &Recording, run: &FreeRun) -> Vec<(String, 
         .enumerate()
         .filter_map(|(c, measurement)| {
             let channel = recording.channel(&measurement.channel)?;
-            let factor = header_factor(channel.unit.as_deref(), &measurement.unit);
+            let unit =
+                recorded_unit(model, channel.unit.as_deref(), &measurement.unit, Some(&measurement.expr));
+            let unit = unit.unwrap_or_else(|_| measurement.unit.clone());
             let mut values = vec![f64::NAN; recording.time.len()];
             for ((piece, y), length) in recording.pieces.iter().zip(&run.y).zip(&run.lengths) {
                 let mut simulated = y[c * piece.len..(c + 1) * piece.len].to_vec();
@@ -138,16 +141,11 @@ fn columns(model: &Model, recording: &Recording, run: &FreeRun) -> Vec<(String, 
                 at_rows(piece, &recording.time, simulated, &mut values);
             }
             for v in &mut values {
-                *v = if v.is_finite() { *v / factor } else { f64::NAN };
+                *v = if v.is_finite() { unit.from_si(*v) } else { f64::NAN };
             }
             Some((channel.header(), values))
         })
         .collect()
-}
-
-/// SI value of one unit of the header, or of the model's unit where the header states none.
-fn header_factor(header: Option<&str>, unit: &Unit) -> f64 {
-    header.and_then(|text| Unit::parse(text).ok()).map_or(unit.factor, |u| u.factor)
 }
 
 /// Writes what was simulated on a piece's grid to the rows the piece came from: row by row, or
@@ -186,12 +184,5 @@ mod tests {
         for (row, t) in rows.iter().zip(&time) {
             assert!((row - 3.0 * (t - time[0])).abs() < 1e-12, "{row} at {t}");
         }
-    }
-
-    #[test]
-    fn degrees_stay_degrees() {
-        let rad = Unit::parse("rad").unwrap();
-        assert_eq!(header_factor(Some("deg"), &rad), std::f64::consts::PI / 180.0);
-        assert_eq!(header_factor(None, &Unit::parse("mm").unwrap()), 1e-3);
     }
 }

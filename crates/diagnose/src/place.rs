@@ -126,9 +126,9 @@ fn realm(model: &Model, equation: usize, own: Option<usize>) -> Realm {
         return Realm::Motion;
     }
     // The exponents of A and K.
-    let shows = |d: &Dimension| d.0[3] != 0.0 || d.0[4] != 0.0;
-    let length = Dimension([1.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0]);
-    let power = Dimension([2.0, 1.0, -3.0, 0.0, 0.0, 0.0, 0.0]);
+    let shows = |d: &Dimension| d.si_exponents()[3..5].iter().any(|e| *e != 0.0);
+    let length = Dimension::from_si([1.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0]);
+    let power = Dimension::from_si([2.0, 1.0, -3.0, 0.0, 0.0, 0.0, 0.0]);
     // A position or an angle may be driven by a voltage.
     let position = unit.is_none() || unit.same(&length);
     let balance = || model.dimension_of(&model.equations[equation].residual()).ok();
@@ -484,8 +484,13 @@ fn motion(model: &Model, weights: Vec<f64>, coefficients: Vec<f64>) -> Option<Mo
 
 fn is_velocity(d: &Dimension) -> bool {
     // m/s, or 1/s (rad/s)
-    let d = d.0;
-    d[2] == -1.0 && d[1] == 0.0 && d[3..].iter().all(|v| *v == 0.0) && (d[0] == 1.0 || d[0] == 0.0)
+    let declared = d.declared().next().is_some();
+    let d = d.si_exponents();
+    !declared
+        && d[2] == -1.0
+        && d[1] == 0.0
+        && d[3..].iter().all(|v| *v == 0.0)
+        && (d[0] == 1.0 || d[0] == 0.0)
 }
 
 #[cfg(test)]

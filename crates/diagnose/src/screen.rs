@@ -421,6 +421,7 @@ impl Recall {
         let none = Unit::dimensionless;
         let mut model = Model {
             name: String::new(),
+            units: greybox_model::Units::default(),
             inputs: used
                 .iter()
                 .map(|(n, p)| {

@@ -158,3 +158,164 @@ proptest! {
         }
     }
 }
+
+/// A room with losses to the outside and to the ground, whose temperature `To` is not known. `{T}` is the unit of the
+/// temperatures, `{To}` the guess.
+const ROOM: &str = r#"
+name = "room"
+[inputs]
+Ta = { unit = "{T}" }
+Ph = { unit = "W" }
+[states]
+Ti = { unit = "{T}" }
+[parameters]
+C  = { value = 1.5e5, unit = "J/{T}" }
+R  = { value = 0.02, unit = "{T}/W" }
+Rg = { value = 0.05, unit = "{T}/W", fixed = true }
+To = { value = {To}, unit = "{T}" }
+[equations]
+room = "C*Ti' + (Ti - Ta)/R + (Ti - To)/Rg = Ph"
+"#;
+
+/// What a temperature in K is on a scale, and the size of a degree in K.
+fn scale(unit: &str) -> (fn(f64) -> f64, f64) {
+    match unit {
+        "degC" | "\u{b0}C" => (|k| k - 273.15, 1.0),
+        "degF" => (|k| k * 1.8 - 459.67, 5.0 / 9.0),
+        _ => (|k| k, 1.0),
+    }
+}
+
+/// The model with its temperatures in a unit; its numbers mean the same.
+fn room(unit: &str) -> Model {
+    let (of, degree) = scale(unit);
+    let text = ROOM
+        .replace("{To}", &format!("{:?}", of(283.15)))
+        .replace("1.5e5", &format!("{:?}", 1.5e5 * degree))
+        .replace("0.02", &format!("{:?}", 0.02 / degree))
+        .replace("0.05", &format!("{:?}", 0.05 / degree))
+        .replace("{T}", unit);
+    Model::from_toml(&text, "room.toml").unwrap()
+}
+
+/// 1e5 Ti' + (Ti - Ta)/0.03 + (Ti - 288)/0.05 = Ph in K, by small steps, recorded in a unit; with `stated` it stands in
+/// the header.
+fn heated(seed: u64, unit: &str, stated: bool) -> Recording {
+    let mut rng = rand_pcg::Pcg64Mcg::seed_from_u64(seed);
+    let noise = Normal::new(0.0, 0.02).unwrap();
+    let (rows, dt, fine) = (400, 60.0, 20);
+    let on = |k: usize| if (k * 7 + seed as usize) % 64 < 29 { 1500.0 } else { 0.0 };
+    let outside = |k: usize| 275.0 + 4.0 * (k as f64 / 60.0).sin() + 2.0 * (k as f64 / 17.0).cos();
+    let line = |a: f64, b: f64, i: u32| a + (b - a) * f64::from(i) / f64::from(fine);
+    let (of, _) = scale(unit);
+    let (mut ti, mut columns) = (291.0, [Vec::new(), Vec::new(), Vec::new()]);
+    for k in 0..rows {
+        columns[0].push(of(outside(k)));
+        columns[1].push(on(k));
+        columns[2].push(of(ti + noise.sample(&mut rng)));
+        for i in 0..fine {
+            let (ta, ph) = (line(outside(k), outside(k + 1), i), line(on(k), on(k + 1), i));
+            ti += dt / f64::from(fine) * (ph - (ti - ta) / 0.03 - (ti - 288.0) / 0.05) / 1e5;
+        }
+    }
+    let [ta, ph, ti] = columns;
+    let channel = |name: &str, unit: &str, values| Channel {
+        name: name.into(),
+        unit: stated.then(|| unit.to_owned()),
+        values,
+    };
+    let channels = vec![channel("Ta", unit, ta), channel("Ph", "W", ph), channel("Ti", unit, ti)];
+    Recording::from_columns("room.csv", (0..rows).map(|k| k as f64 * dt).collect(), channels).unwrap()
+}
+
+/// Values and intervals of all parameters, and the scores; of `To`, its distance from `zero`.
+fn of_room(model: &Model, recording: &Recording, zero: f64) -> Vec<f64> {
+    let calibration = calibrate(model, std::slice::from_ref(recording), &[], &Quiet).unwrap();
+    let to = calibration.model.parameter("To").unwrap();
+    let mut all = Vec::new();
+    for p in &calibration.parameters {
+        let e = p.calibrated;
+        let zero = if p.index == to { zero } else { 0.0 };
+        let ci = e.ci95.map_or([f64::NAN; 2], |(low, high)| [low - zero, high - zero]);
+        all.extend([e.value - zero].into_iter().chain(ci.into_iter().filter(|v| !v.is_nan())));
+    }
+    for (nominal, calibrated) in [&calibration.train, &calibration.holdout] {
+        all.extend(nominal.iter().chain(calibrated).flat_map(|s| [s.rmse, s.nrmse, s.nrmse_windowed]));
+    }
+    all
+}
+
+#[test]
+fn a_calibration_does_not_depend_on_the_scale_of_temperature() {
+    let plain = of_room(&room("K"), &heated(3, "K", true), 0.0);
+    let [c, r, to] = [plain[0], plain[3], plain[plain.len() - 1 - 12 - 2]];
+    assert!((c / 1e5 - 1.0).abs() < 0.02 && (r / 0.03 - 1.0).abs() < 0.05 && (to - 288.0).abs() < 2.0);
+    for (model, recorded, stated) in [
+        ("degC", "degC", true),
+        ("degF", "degF", true),
+        ("K", "degC", true),
+        ("K", "degF", true),
+        ("degC", "K", true),
+        ("degF", "\u{b0}C", true),
+        ("degC", "degC", false),
+        ("degF", "degF", false),
+    ] {
+        let other = of_room(&room(model), &heated(3, recorded, stated), 0.0);
+        assert!(close(&plain, &other, false, 1e-6), "{model} {recorded} {stated}:\n{plain:?}\n{other:?}");
+    }
+}
+
+/// Temperatures on the Celsius scale that are called K, in the model and in the recording.
+#[test]
+fn a_calibration_does_not_depend_on_the_zero_of_temperature() {
+    let plain = of_room(&room("K"), &heated(3, "K", true), 273.15);
+    let shifted = Model::from_toml(&ROOM.replace("{To}", "10.0").replace("{T}", "K"), "room.toml");
+    let mut celsius = heated(3, "degC", true);
+    for channel in celsius.channels.iter_mut().filter(|c| c.name != "Ph") {
+        channel.unit = Some("K".into());
+    }
+    let other = of_room(&shifted.unwrap(), &celsius, 0.0);
+    assert!(close(&plain, &other, false, 1e-6), "{plain:?}\n{other:?}");
+}
+
+#[test]
+fn a_diagnosis_does_not_depend_on_the_scale_of_temperature() {
+    let of = |unit: &str| {
+        let mut library = built_in().unwrap();
+        library.retain(|m| ["constant_offset", "input_delay", "input_offset"].contains(&m.kind.as_str()));
+        let options = Options { library: Some(library), ..Options::default() };
+        // The ground is 5 K warmer than the model holds for certain: a flow of heat is missing.
+        let mut model = room(unit);
+        let to = model.parameter("To").unwrap();
+        model.parameters[to].fixed = true;
+        diagnose(&model, &[heated(3, unit, true)], &[], &options, &Quiet).unwrap()
+    };
+    let plain = of("K");
+    let (kinds, numbers) = found(&plain);
+    assert!(kinds.contains(&"constant_offset"), "{kinds:?}");
+    for unit in ["degC", "degF"] {
+        let other = of(unit);
+        let (other_kinds, other_numbers) = found(&other);
+        assert_eq!(kinds, other_kinds, "{unit}");
+        assert!(close(&numbers, &other_numbers, false, 1e-4), "{unit}: {numbers:?} {other_numbers:?}");
+    }
+}
+
+#[test]
+fn a_calibration_does_not_depend_on_count_against_1() {
+    let recordings = [record(7, 400, 0.1)];
+    let of = |unit: &str| {
+        let text = MODEL
+            .replace("x = { unit = \"m\" }", &format!("x = {{ unit = \"{unit}\" }}"))
+            .replace("\"kg\"", &format!("\"N s^2/{unit}\""))
+            .replace("\"N s/m\"", &format!("\"N s/{unit}\""))
+            .replace("\"N/m\"", &format!("\"N/{unit}\""));
+        let model = Model::from_toml(&text, "oscillator.toml").unwrap();
+        let said = changed(&recordings[0], 0.0, |channels| channels[1].unit = Some(unit.to_owned()));
+        numbers(&calibrate(&model, &[said], &[], &Quiet).unwrap())
+    };
+    let plain = of("1");
+    for unit in ["count", "LSB", "px", "step"] {
+        assert!(close(&plain, &of(unit), true, 0.0), "{unit}");
+    }
+}

@@ -146,8 +146,9 @@ pub fn latex_document(model: &Model) -> String {
         .parameters
         .iter()
         .map(|p| {
-            let (factor, unit) = p.unit.as_ref().map_or((1.0, ""), |u| (u.factor, u.text.as_str()));
-            let value = decimal(p.value / factor);
+            let (value, unit) =
+                p.unit.as_ref().map_or((p.value, ""), |u| (u.from_si(p.value), u.text.as_str()));
+            let value = decimal(value);
             format!("  ${}$ & ${value}$ & {} \\\\\n", symbol(&p.name, 0), unit_text(unit))
         })
         .collect();

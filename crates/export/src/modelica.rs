@@ -3,7 +3,7 @@
 use std::fmt::Write as _;
 
 use greybox_model::expr::Func;
-use greybox_model::{Dimension, Expr, Model, System, Unit};
+use greybox_model::{Expr, Model, System, Unit};
 
 use crate::error::ExportError;
 use crate::infix::{Dialect, atom, number, quoted, text};
@@ -315,10 +315,10 @@ fn class_name(name: &str) -> String {
 }
 
 /// The unit in SI base units, as Modelica writes units (Specification 3.6, chapter 19): `kg.m2/(s2.A)`. `None`
-/// where it has none or a fractional exponent.
+/// where it has none, a fractional exponent or a dimension that only the model knows.
 fn unit(unit: &Unit) -> Option<String> {
-    let Dimension(exponents) = unit.dimension;
-    if exponents.iter().any(|e| e.fract() != 0.0) {
+    let exponents = unit.dimension.si_exponents();
+    if exponents.iter().any(|e| e.fract() != 0.0) || unit.dimension.declared().next().is_some() {
         return None;
     }
     // Plane angles are plain numbers to a model, but a reader wants to know.

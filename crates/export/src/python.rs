@@ -429,10 +429,14 @@ impl Module<'_> {
     }
 }
 
-/// `NAME = {"a": ("mm", 0.001)}`
+/// `NAME = {"a": ("mm", 0.001)}`; what has a zero of its own is given in SI.
 fn units<'a>(out: &mut String, name: &str, entries: impl Iterator<Item = (&'a String, &'a Unit)>) {
     let entries: Vec<String> = entries
-        .map(|(name, unit)| format!("{}: ({}, {})", literal(name), literal(&unit.text), number(unit.factor)))
+        .map(|(name, unit)| {
+            let si = (unit.offset != 0.0).then(|| Unit::si(unit.dimension));
+            let unit = si.as_ref().unwrap_or(unit);
+            format!("{}: ({}, {})", literal(name), literal(&unit.text), number(unit.factor))
+        })
         .collect();
     let _ = writeln!(out, "{name} = {{{}}}", entries.join(", "));
 }

@@ -205,3 +205,20 @@ fn a_model_edited_into_nonsense_is_an_error() {
     assert!(matches!(python(&model), Err(ExportError::Compile(_))));
     assert!(matches!(modelica(&model), Err(ExportError::Compile(_))));
 }
+
+/// Modelica, Python and LaTeX of a model with a temperature scale and a dimension of its own.
+#[test]
+fn units_that_only_the_model_language_has() {
+    let text = "[units]\ndose = \"own\"\n[states]\nT = { unit = \"degC\", initial = 20 }\nc = { unit = \"dose\" }\n[parameters]\n\
+                tau = { value = 2, unit = \"s\" }\nTo = { value = 25, unit = \"degC\" }\nk = { value = 3 }\n\
+                [equations]\nheat = \"tau*T' + T = To + k*c\"\nloss = \"tau*c' + c = 0\"\n";
+    let model = Model::from_toml(text, "heat.toml").unwrap();
+    let told = modelica(&model).unwrap();
+    assert!(told.contains("parameter Real To(unit = \"K\") = 298.15;"), "{told}");
+    assert!(told.contains("Real T(unit = \"K\", start = 293.15, fixed = true)"), "{told}");
+    assert!(told.contains("parameter Real k = 3;") && !told.contains("dose"), "{told}");
+    let told = python(&model).unwrap();
+    assert!(told.contains("CHANNELS = {\"T\": (\"K\", 1), \"c\": (\"dose\", 1)}"), "{told}");
+    let told = latex_document(&model);
+    assert!(told.contains("& $25$ & degC"), "{told}");
+}

@@ -52,6 +52,7 @@
 //! | table | entry | keys |
 //! |---|---|---|
 //! | | `name = "…"` | |
+//! | `[units]` | `enc = "2*pi/4096 rad"` | a multiple of a known unit, or `"own"`: a dimension of its own |
 //! | `[inputs]` | `u = { … }` | `unit`, `hold`, `channel` |
 //! | `[states]` | `x = { … }` | `unit`, `channel`, `measured`, `initial` (x or [x, x', …], in its unit) |
 //! | `[parameters]` | `k = { … }` | `value`, `unit`, `std`, `fixed` |
@@ -92,5 +93,5 @@ pub use model::{Equation, Hold, Input, Measurement, Model, Parameter, State};
 pub use nearest::nearest;
 pub use parse::{Parsed, ParsedEquation, SyntaxError, parse, parse_equation};
 pub use system::System;
-pub use units::{Dimension, Unit, UnitError};
+pub use units::{DeclaredUnit, Dimension, Unit, UnitError, Units};
 pub use write::WriteOptions;

@@ -6,7 +6,7 @@ use crate::expr::{Expr, Func};
 use crate::model::{Equation, Hold, Input, Measurement, Model, Parameter, State};
 use crate::nearest::nearest;
 use crate::parse::{Parsed, ParsedEquation, SyntaxError, parse, parse_equation};
-use crate::units::Unit;
+use crate::units::{OWN, Unit, UnitError, Units, refused_symbol};
 use std::ops::Range;
 use toml::Spanned;
 use toml::de::{DeTable, DeValue};
@@ -14,7 +14,10 @@ use toml::de::{DeTable, DeValue};
 /// Most inputs, states and parameters of a model, each.
 const MOST_NAMES: usize = 500;
 
-const TABLES: [&str; 6] = ["name", "inputs", "states", "parameters", "equations", "measurements"];
+/// Longest definition of a unit, bytes.
+const LONGEST_DEFINITION: usize = 1000;
+
+const TABLES: [&str; 7] = ["name", "units", "inputs", "states", "parameters", "equations", "measurements"];
 
 impl Model {
     /// Reads a model from the text of a TOML file; `file` is its name for messages.
@@ -97,6 +100,7 @@ fn load(text: &str) -> Result<Model, Located> {
 
     let mut model = Model {
         name: String::new(),
+        units: read_units(root)?,
         inputs: Vec::new(),
         states: Vec::new(),
         parameters: Vec::new(),
@@ -111,7 +115,7 @@ fn load(text: &str) -> Result<Model, Located> {
     }
     for (name, at, value) in section(root, "inputs")? {
         declare(name, &at, "input", &mut declared)?;
-        let (input, stated) = read_input(name, value)?;
+        let (input, stated) = read_input(name, value, &model.units)?;
         if !stated {
             unstated.push(Unstated::Input(model.inputs.len()));
         }
@@ -119,7 +123,7 @@ fn load(text: &str) -> Result<Model, Located> {
     }
     for (name, at, value) in section(root, "states")? {
         declare(name, &at, "state", &mut declared)?;
-        let (state, stated) = read_state(name, value)?;
+        let (state, stated) = read_state(name, value, &model.units)?;
         if !stated {
             unstated.push(Unstated::State(model.states.len()));
         }
@@ -128,7 +132,7 @@ fn load(text: &str) -> Result<Model, Located> {
     }
     for (name, at, value) in section(root, "parameters")? {
         declare(name, &at, "parameter", &mut declared)?;
-        model.parameters.push(read_parameter(name, value)?);
+        model.parameters.push(read_parameter(name, value, &model.units)?);
     }
     check_size(&model, root)?;
     // Parameters come first in the elimination, states next, inputs last.
@@ -158,7 +162,7 @@ fn load(text: &str) -> Result<Model, Located> {
                     let problem = Problem::MissingKey { key: "expression".into(), table: item.clone() };
                     fault(problem, value.span(), "write `{ expression = \"…\", unit = \"…\" }`")
                 })?;
-                (expression, read_unit(table, &item)?)
+                (expression, read_unit(table, &item, &model.units)?)
             }
             _ => (value, None),
         };
@@ -355,8 +359,13 @@ fn number(value: &Spanned<DeValue<'_>>, key: &str, item: &str) -> Result<f64, Lo
 }
 
 /// A number in SI.
-fn quantity(factor: f64, given: &Spanned<DeValue<'_>>, key: &str, item: &str) -> Result<f64, Located> {
-    let value = factor * number(given, key, item)?;
+fn quantity(
+    to_si: impl Fn(f64) -> f64,
+    given: &Spanned<DeValue<'_>>,
+    key: &str,
+    item: &str,
+) -> Result<f64, Located> {
+    let value = to_si(number(given, key, item)?);
     if value.is_finite() {
         return Ok(value);
     }
@@ -364,21 +373,110 @@ fn quantity(factor: f64, given: &Spanned<DeValue<'_>>, key: &str, item: &str) ->
     Err(bad(item, message, given.span(), "numbers reach 1.7e308"))
 }
 
-fn read_unit(table: &DeTable<'_>, item: &str) -> Result<Option<Unit>, Located> {
+/// `[units]`: a definition may use symbols that stand above or below it.
+fn read_units(root: &DeTable<'_>) -> Result<Units, Located> {
+    let mut units = Units::default();
+    let mut open = Vec::new();
+    for (symbol, at, value) in section(root, "units")? {
+        if let Some((reason, help)) = refused_symbol(symbol) {
+            let problem = Problem::BadName { name: symbol.to_owned(), what: "unit", reason };
+            return Err(fault(problem, at, help));
+        }
+        open.push((symbol, value, definition(symbol, value)?));
+    }
+    if open.len() > MOST_NAMES {
+        let message = format!("{} units; at most {MOST_NAMES} can be declared", open.len());
+        return Err(bad("[units]", message, root_span(root, "units"), "leave out what is not used"));
+    }
+    while !open.is_empty() {
+        let before = open.len();
+        let mut waiting = Vec::new();
+        let mut first = None;
+        for (symbol, value, text) in open {
+            let Err(e) = units.declare(symbol, &text) else { continue };
+            first.get_or_insert((symbol, value, text.clone(), e));
+            waiting.push((symbol, value, text));
+        }
+        open = waiting;
+        if let Some((symbol, value, text, error)) = first.filter(|_| open.len() == before) {
+            let circular = error.unknown.as_ref().filter(|u| open.iter().any(|(s, ..)| s == u));
+            let item = format!("unit `{symbol}`");
+            return Err(match circular {
+                Some(other) => {
+                    let message = format!("its definition leads through `{other}` back to itself");
+                    let help =
+                        format!("declare one of them as `\"{OWN}\"`, or as a multiple of a known unit");
+                    bad(&item, message, value.span(), help)
+                }
+                None if text.trim() == OWN => {
+                    let help = error.help.unwrap_or_else(|| "write `0.5 rad`".into());
+                    bad(&item, error.message, value.span(), help)
+                }
+                None => unit_fault(&item, value, &text, error, "0.5 rad"),
+            });
+        }
+    }
+    Ok(units)
+}
+
+/// What a unit stands for: `"2*pi/4096 rad"`, `"own"`, a bare number, or `{ value = …, unit = "…" }`.
+fn definition(symbol: &str, value: &Spanned<DeValue<'_>>) -> Result<String, Located> {
+    let item = format!("unit `{symbol}`");
+    match value.get_ref() {
+        DeValue::String(text) if text.len() > LONGEST_DEFINITION => {
+            let message = format!("its definition is longer than {LONGEST_DEFINITION} bytes");
+            Err(bad(&item, message, value.span(), "write a number and a unit"))
+        }
+        DeValue::String(text) => Ok(text.as_ref().to_owned()),
+        DeValue::Integer(_) | DeValue::Float(_) => Ok(format!("{:?}", number(value, symbol, &item)?)),
+        DeValue::Table(table) => {
+            check_keys(table, &["value", "unit"], &item)?;
+            let part = |key: &str| {
+                table.get(key).ok_or_else(|| {
+                    let problem = Problem::MissingKey { key: key.to_owned(), table: item.clone() };
+                    fault(
+                        problem,
+                        value.span(),
+                        format!("write `{symbol} = {{ value = 0.5, unit = \"rad\" }}`"),
+                    )
+                })
+            };
+            Ok(format!("{:?} {}", number(part("value")?, "value", &item)?, string(part("unit")?, &item)?))
+        }
+        other => {
+            let message = format!("expected a definition, found {}", kind(other));
+            let help = format!(
+                "write `{symbol} = \"0.5 rad\"`, or `{symbol} = \"{OWN}\"` for a dimension of its own"
+            );
+            Err(bad(&item, message, value.span(), help))
+        }
+    }
+}
+
+fn read_unit(table: &DeTable<'_>, item: &str, units: &Units) -> Result<Option<Unit>, Located> {
     let Some(value) = table.get("unit") else { return Ok(None) };
     let text = string(value, item)?;
-    Unit::parse(text).map(Some).map_err(|e| {
-        let problem = Problem::Unit { item: item.to_owned(), text: text.to_owned(), message: e.message };
-        // Without escapes the string is its text between two quotes.
-        let plain = value.span().len() == text.len() + 2;
-        let inner = if plain {
-            let start = value.span().start + 1;
-            start + e.span.start..start + e.span.end
-        } else {
-            value.span()
-        };
-        fault(problem, inner, e.help.unwrap_or_else(|| "write units like `N m/V`".into()))
-    })
+    units.parse(text).map(Some).map_err(|e| unit_fault(item, value, text, e, "N m/V"))
+}
+
+/// A text that is no unit, at its token where it stands in the file as it is.
+fn unit_fault(
+    item: &str,
+    value: &Spanned<DeValue<'_>>,
+    text: &str,
+    error: UnitError,
+    example: &str,
+) -> Located {
+    let problem = Problem::Unit { item: item.to_owned(), text: text.to_owned(), message: error.message };
+    // Without escapes the string is its text between two quotes.
+    let plain = value.get_ref().is_str() && value.span().len() == text.len() + 2;
+    let inner = if plain {
+        let start = value.span().start + 1;
+        start + error.span.start..start + error.span.end
+    } else {
+        value.span()
+    };
+    fault(problem, inner, error.help.unwrap_or_else(|| format!("write units like `{example}`")))
 }
 
 fn table_of<'a, 'i>(
@@ -440,7 +538,7 @@ fn declare(
     Ok(())
 }
 
-fn read_input(name: &str, value: &Spanned<DeValue<'_>>) -> Result<(Input, bool), Located> {
+fn read_input(name: &str, value: &Spanned<DeValue<'_>>, units: &Units) -> Result<(Input, bool), Located> {
     let item = format!("input `{name}`");
     let table = table_of(
         value,
@@ -448,7 +546,7 @@ fn read_input(name: &str, value: &Spanned<DeValue<'_>>) -> Result<(Input, bool),
         &item,
         &format!("{name} = {{ unit = \"V\" }}"),
     )?;
-    let unit = read_unit(table, &item)?;
+    let unit = read_unit(table, &item, units)?;
     let channel = match table.get("channel") {
         None => name.to_owned(),
         Some(value) => string(value, &item)?.to_owned(),
@@ -465,12 +563,12 @@ fn read_input(name: &str, value: &Spanned<DeValue<'_>>) -> Result<(Input, bool),
     };
     let stated = unit.is_some();
     let unit = unit.unwrap_or_else(Unit::dimensionless);
-    let range = table.get("range").map(|given| read_range(given, unit.factor, &item)).transpose()?;
+    let range = table.get("range").map(|given| read_range(given, &unit, &item)).transpose()?;
     Ok((Input { name: name.to_owned(), channel, unit, hold, range }, stated))
 }
 
 /// `[low, high]` in the unit of the input.
-fn read_range(given: &Spanned<DeValue<'_>>, factor: f64, item: &str) -> Result<[f64; 2], Located> {
+fn read_range(given: &Spanned<DeValue<'_>>, unit: &Unit, item: &str) -> Result<[f64; 2], Located> {
     let wrong = |found: String| {
         let help = "write the lowest and the highest value that the actuator can make: `range = [-10, 10]`";
         bad(item, format!("`range` must be two rising numbers, found {found}"), given.span(), help)
@@ -479,15 +577,16 @@ fn read_range(given: &Spanned<DeValue<'_>>, factor: f64, item: &str) -> Result<[
     let [low, high] = list.iter().collect::<Vec<_>>()[..] else {
         return Err(wrong(format!("{} in a list", list.len())));
     };
-    let range = [quantity(factor, low, "range", item)?, quantity(factor, high, "range", item)?];
+    let end = |given| quantity(|v| unit.to_si(v), given, "range", item);
+    let range = [end(low)?, end(high)?];
     if range[0] < range[1] { Ok(range) } else { Err(wrong("one that is not below the other".to_owned())) }
 }
 
-fn read_state(name: &str, value: &Spanned<DeValue<'_>>) -> Result<(State, bool), Located> {
+fn read_state(name: &str, value: &Spanned<DeValue<'_>>, units: &Units) -> Result<(State, bool), Located> {
     let item = format!("state `{name}`");
     let known = ["unit", "channel", "measured", "initial"];
     let table = table_of(value, &known, &item, &format!("{name} = {{ unit = \"m\" }}"))?;
-    let unit = read_unit(table, &item)?;
+    let unit = read_unit(table, &item, units)?;
     let stated = unit.is_some();
     let unit = unit.unwrap_or_else(Unit::dimensionless);
     let measured = boolean(table, "measured", &item)?;
@@ -507,15 +606,16 @@ fn read_state(name: &str, value: &Spanned<DeValue<'_>>) -> Result<(State, bool),
         Some(value) => match value.get_ref() {
             DeValue::Array(list) => list
                 .iter()
-                .map(|v| quantity(unit.factor, v, "initial", &item))
+                .enumerate()
+                .map(|(primes, v)| quantity(|v| unit.initial_to_si(primes, v), v, "initial", &item))
                 .collect::<Result<Vec<f64>, Located>>()?,
-            _ => vec![quantity(unit.factor, value, "initial", &item)?],
+            _ => vec![quantity(|v| unit.to_si(v), value, "initial", &item)?],
         },
     };
     Ok((State { name: name.to_owned(), unit, order: 1, channel, initial }, stated))
 }
 
-fn read_parameter(name: &str, value: &Spanned<DeValue<'_>>) -> Result<Parameter, Located> {
+fn read_parameter(name: &str, value: &Spanned<DeValue<'_>>, units: &Units) -> Result<Parameter, Located> {
     let item = format!("parameter `{name}`");
     let known = ["value", "unit", "std", "fixed", "positive"];
     let shown = match value.get_ref() {
@@ -524,8 +624,8 @@ fn read_parameter(name: &str, value: &Spanned<DeValue<'_>>) -> Result<Parameter,
         _ => "1.0".to_owned(),
     };
     let table = table_of(value, &known, &item, &format!("{name} = {{ value = {shown} }}"))?;
-    let unit = read_unit(table, &item)?;
-    let factor = unit.as_ref().map_or(1.0, |u| u.factor);
+    let unit = read_unit(table, &item, units)?;
+    let written = unit.clone().unwrap_or_else(Unit::dimensionless);
     let given = table.get("value").ok_or_else(|| {
         let problem = Problem::MissingKey { key: "value".into(), table: item.clone() };
         fault(problem, value.span(), format!("write `{name} = {{ value = 1.0 }}`; calibration may move it"))
@@ -539,12 +639,12 @@ fn read_parameter(name: &str, value: &Spanned<DeValue<'_>>) -> Result<Parameter,
                 let help = "write the 1-sigma uncertainty, or `fixed = true` if the value is exact";
                 return Err(bad(&item, message, v.span(), help));
             }
-            Some(quantity(factor, v, "std", &item)?)
+            Some(quantity(|v| written.difference_to_si(v), v, "std", &item)?)
         }
     };
     let fixed = boolean(table, "fixed", &item)?.unwrap_or(false);
     let positive = boolean(table, "positive", &item)?;
-    let value = quantity(factor, given, "value", &item)?;
+    let value = quantity(|v| written.to_si(v), given, "value", &item)?;
     if positive == Some(true) && value <= 0.0 {
         let message = format!("`positive = true`, and its value is {value}");
         let help = "correct the value, or write `positive = false` if the parameter may have either sign";
@@ -925,6 +1025,14 @@ fn set_measurement_units(
                     format!("write `unit = \"{}\"`", default.text),
                 ));
             }
+            Some((_, Some(unit), span)) if unit.offset != 0.0 && model.is_difference(&measurement.expr) => {
+                let message = format!(
+                    "its unit {} is that of an absolute temperature, but `{}` is a difference",
+                    unit.text, measurement.expr
+                );
+                let item = format!("measurement \"{}\"", measurement.channel);
+                return Err(bad(&item, message, span.clone(), "write `unit = \"K\"`"));
+            }
             Some((_, Some(unit), _)) => unit.clone(),
             _ => default,
         };
@@ -935,12 +1043,14 @@ fn set_measurement_units(
 
 impl Model {
     /// The unit of an expression if none is stated: that of the first state in it with the same
-    /// dimension, else the SI unit.
+    /// dimension, else the SI unit. A difference of temperatures has no zero, and is in K.
     pub(crate) fn default_measurement_unit(&self, expr: &Expr) -> Result<Unit, ModelError> {
         let dimension = self.dimension_of(expr)?;
+        let difference = self.is_difference(expr);
         let of_state = expr.variables().into_iter().find_map(|(name, primes)| {
             let unit = &self.states[self.state(&name)?].unit;
-            (primes == 0 && unit.dimension.same(&dimension)).then(|| unit.clone())
+            let fits = unit.dimension.same(&dimension) && !(difference && unit.offset != 0.0);
+            (primes == 0 && fits).then(|| unit.clone())
         });
         Ok(of_state.unwrap_or_else(|| Unit::si(dimension)))
     }

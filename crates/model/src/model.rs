@@ -1,16 +1,18 @@
 //! The model as data: names, values, units and equations, everything in SI.
 
-use crate::expr::Expr;
-use crate::units::Unit;
+use crate::expr::{BinOp, Expr, Func};
+use crate::units::{Dimension, Unit, Units};
 
 /// A mechanistic model: ordinary differential equations as a textbook writes them.
 ///
-/// All numbers are SI; [`Unit`] keeps how the user wrote the unit and the factor to SI.
+/// All numbers are SI; [`Unit`] keeps how the user wrote the unit, and its factor and offset to SI.
 /// Names are unique over inputs, states and parameters.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Model {
     /// Free text.
     pub name: String,
+    /// Units that the model declares.
+    pub units: Units,
     /// Exogenous signals, in the order of the file.
     pub inputs: Vec<Input>,
     /// Generalised coordinates and other states, in the order of the file.
@@ -190,4 +192,60 @@ impl Model {
             |m| matches!(&m.expr, Expr::Var { name, primes: p } if **name == *state && *p == primes),
         )
     }
+
+    /// Whether an expression is a difference of temperatures: whether it stays as it is where all temperatures among
+    /// states and inputs, and the parameters whose unit has a zero of its own, rise by the same amount.
+    ///
+    /// ```
+    /// use greybox_model::{Model, parse};
+    /// let model = Model::from_toml("[states]\nTi = { unit = \"degC\" }\nTe = { unit = \"degC\" }\n[parameters]\n\
+    ///     tau = { value = 1, unit = \"h\" }\n[equations]\ni = \"tau*Ti' = Te - Ti\"\ne = \"tau*Te' = Ti - Te\"\n", "m.toml")?;
+    /// let difference = |text| Ok::<bool, Box<dyn std::error::Error>>(model.is_difference(&parse(text)?.expr));
+    /// assert!(difference("Ti - Te")? && difference("Ti'")?);
+    /// assert!(!difference("Ti")? && !difference("(Ti + Te)/2")?);
+    /// # Ok::<(), Box<dyn std::error::Error>>(())
+    /// ```
+    pub fn is_difference(&self, expr: &Expr) -> bool {
+        self.shift(expr) == Some(0.0)
+    }
+
+    /// By how much an expression rises where all temperatures rise by 1 K; `None` where that is not one number.
+    fn shift(&self, expr: &Expr) -> Option<f64> {
+        match expr {
+            Expr::Num(_) => Some(0.0),
+            Expr::Var { primes, .. } if *primes > 0 => Some(0.0),
+            Expr::Var { name, .. } => {
+                let state = self.state(name).map(|i| &self.states[i].unit);
+                let signal = state.or_else(|| self.input(name).map(|i| &self.inputs[i].unit));
+                let parameter = self.parameter(name).and_then(|i| self.parameters[i].unit.as_ref());
+                let absolute = signal.is_some_and(|u| u.dimension.same(&Dimension::TEMPERATURE))
+                    || parameter.is_some_and(|u| u.offset != 0.0);
+                Some(if absolute { 1.0 } else { 0.0 })
+            }
+            Expr::Neg(a) => Some(-self.shift(a)?),
+            Expr::Bin(BinOp::Add, a, b) => Some(self.shift(a)? + self.shift(b)?),
+            Expr::Bin(BinOp::Sub, a, b) => Some(self.shift(a)? - self.shift(b)?),
+            Expr::Bin(BinOp::Mul, a, b) => match (self.shift(a)?, self.shift(b)?) {
+                (0.0, 0.0) => Some(0.0),
+                (0.0, s) => Some(a.constant()? * s),
+                (s, 0.0) => Some(b.constant()? * s),
+                _ => None,
+            },
+            Expr::Bin(BinOp::Div, a, b) => match (self.shift(a)?, self.shift(b)?) {
+                (0.0, 0.0) => Some(0.0),
+                (s, 0.0) => Some(s / b.constant()?),
+                _ => None,
+            },
+            Expr::Bin(BinOp::Pow, a, b) => unmoved(&[self.shift(a)?, self.shift(b)?]),
+            Expr::Call(Func::Delay, args) => self.shift(args.first()?),
+            Expr::Call(_, args) => {
+                let shifts: Option<Vec<f64>> = args.iter().map(|a| self.shift(a)).collect();
+                unmoved(&shifts?)
+            }
+        }
+    }
+}
+
+fn unmoved(shifts: &[f64]) -> Option<f64> {
+    shifts.iter().all(|s| *s == 0.0).then_some(0.0)
 }

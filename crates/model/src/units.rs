@@ -1,27 +1,69 @@
-//! Run-time units: a dimension (exponents of the SI base units), a factor to SI and the text as the
-//! user wrote it. Radians count as dimensionless, as textbooks mix `N m` and `N m/rad` freely.
+//! Run-time units: a dimension (exponents of the SI base units and of those that the model declares), a
+//! factor and an offset to SI, and the text as the user wrote it. Radians and counts are dimensionless, as
+//! textbooks mix `N m` and `N m/rad` freely.
 //!
 //! ```text
 //! unit   = factor {["*" | "·" | "/"] factor}      a space multiplies; "/" divides by the next factor only
 //! factor = (symbol | "1" | "(" unit ")") ["^" exponent]
 //! ```
+//!
+//! # Temperatures
+//! `degC` and `degF` alone are absolute temperatures, with a zero of their own. In a product they are
+//! differences, as in `W/degC`.
+//!
+//! # Units of a model
+//! A model declares further symbols under `[units]` ([`Units`]): a multiple of a known unit, or a dimension
+//! of its own.
 
 use crate::nearest::nearest;
+use crate::parse::parse;
 use std::f64::consts::PI;
 use std::fmt;
 use std::ops::{Div, Mul, Range};
 
-/// Exponents of m, kg, s, A, K, mol, cd.
-#[derive(Debug, Clone, Copy, PartialEq, Default)]
-pub struct Dimension(pub [f64; 7]);
+/// Longest symbol of a dimension that a model declares, bytes of UTF-8.
+pub(crate) const LONGEST_SYMBOL: usize = 15;
 
-/// A unit as written, with its meaning.
+/// The symbol of a dimension that a model declares.
+#[derive(Clone, Copy, PartialEq, Eq)]
+struct Symbol {
+    bytes: [u8; LONGEST_SYMBOL],
+    length: u8,
+}
+
+impl Symbol {
+    const EMPTY: Symbol = Symbol { bytes: [0; LONGEST_SYMBOL], length: 0 };
+
+    /// `None` where it is too long.
+    fn new(text: &str) -> Option<Symbol> {
+        let mut symbol = Symbol { length: u8::try_from(text.len()).ok()?, ..Symbol::EMPTY };
+        symbol.bytes.get_mut(..text.len())?.copy_from_slice(text.as_bytes());
+        Some(symbol)
+    }
+
+    fn as_str(&self) -> &str {
+        self.bytes.get(..usize::from(self.length)).and_then(|b| std::str::from_utf8(b).ok()).unwrap_or("")
+    }
+}
+
+/// Exponents of the SI base units m, kg, s, A, K, mol, cd, and of up to [`Dimension::MOST_DECLARED`] dimensions
+/// that a model declares.
+#[derive(Clone, Copy)]
+pub struct Dimension {
+    si: [f64; 7],
+    /// Free where the exponent is zero.
+    declared: [(Symbol, f64); Dimension::MOST_DECLARED],
+}
+
+/// A unit as written, with its meaning: `SI value = factor * value + offset`.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Unit {
     /// As the user wrote it, e.g. `N m/V`.
     pub text: String,
-    /// SI value of one of this unit (`mm` → 1e-3, `deg` → π/180).
+    /// SI value of a difference of one of this unit (`mm` → 1e-3, `deg` → π/180, `degF` → 5/9).
     pub factor: f64,
+    /// SI value of zero of this unit: 273.15 K for `degC`, 0 for every unit but absolute temperatures.
+    pub offset: f64,
     /// Its dimension.
     pub dimension: Dimension,
 }
@@ -36,10 +78,12 @@ pub struct UnitError {
     pub message: String,
     /// How to mend it.
     pub help: Option<String>,
+    /// The symbol, where it is one that is not known. Another model may declare it.
+    pub unknown: Option<String>,
 }
 
 const fn dim(m: f64, kg: f64, s: f64, a: f64) -> Dimension {
-    Dimension([m, kg, s, a, 0.0, 0.0, 0.0])
+    Dimension::from_si([m, kg, s, a, 0.0, 0.0, 0.0])
 }
 
 /// Symbols of the SI base units in the order of [`Dimension`].
@@ -57,9 +101,9 @@ const SYMBOLS: &[(&str, f64, Dimension, bool)] = &[
     ("g", 1e-3, dim(0.0, 1.0, 0.0, 0.0), true),
     ("s", 1.0, dim(0.0, 0.0, 1.0, 0.0), true),
     ("A", 1.0, dim(0.0, 0.0, 0.0, 1.0), true),
-    ("K", 1.0, Dimension([0.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0]), true),
-    ("mol", 1.0, Dimension([0.0, 0.0, 0.0, 0.0, 0.0, 1.0, 0.0]), true),
-    ("cd", 1.0, Dimension([0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0]), true),
+    ("K", 1.0, Dimension::TEMPERATURE, true),
+    ("mol", 1.0, Dimension::from_si([0.0, 0.0, 0.0, 0.0, 0.0, 1.0, 0.0]), true),
+    ("cd", 1.0, Dimension::from_si([0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0]), true),
     ("rad", 1.0, dim(0.0, 0.0, 0.0, 0.0), true),
     ("sr", 1.0, dim(0.0, 0.0, 0.0, 0.0), true),
     ("N", 1.0, dim(1.0, 1.0, -2.0, 0.0), true),
@@ -99,6 +143,36 @@ const SYMBOLS: &[(&str, f64, Dimension, bool)] = &[
     ("ft", 12.0 * INCH, dim(1.0, 0.0, 0.0, 0.0), false),
     ("lbf", POUND * STANDARD_GRAVITY, dim(1.0, 1.0, -2.0, 0.0), false),
     ("psi", POUND * STANDARD_GRAVITY / (INCH * INCH), dim(-1.0, 1.0, -2.0, 0.0), false),
+    // What converters, encoders, cameras and stepper drives count.
+    ("count", 1.0, Dimension::NONE, false),
+    ("counts", 1.0, Dimension::NONE, false),
+    ("LSB", 1.0, Dimension::NONE, false),
+    ("px", 1.0, Dimension::NONE, false),
+    ("step", 1.0, Dimension::NONE, false),
+    ("tick", 1.0, Dimension::NONE, false),
+    ("pulse", 1.0, Dimension::NONE, false),
+    // Differences of temperature; alone they are absolute, see `OFFSETS`.
+    ("degC", 1.0, Dimension::TEMPERATURE, false),
+    ("\u{b0}C", 1.0, Dimension::TEMPERATURE, false),
+    ("\u{2103}", 1.0, Dimension::TEMPERATURE, false),
+    ("degF", RANKINE, Dimension::TEMPERATURE, false),
+    ("\u{b0}F", RANKINE, Dimension::TEMPERATURE, false),
+    ("\u{2109}", RANKINE, Dimension::TEMPERATURE, false),
+];
+
+/// K, exact by definition: the zero of the Celsius scale, a degree and the zero of the Fahrenheit scale.
+const ZERO_CELSIUS: f64 = 273.15;
+const RANKINE: f64 = 5.0 / 9.0;
+const ZERO_FAHRENHEIT: f64 = 459.67 * RANKINE;
+
+/// What stands alone as a unit with a zero of its own, and the SI value of that zero.
+const OFFSETS: [(&str, f64); 6] = [
+    ("degC", ZERO_CELSIUS),
+    ("\u{b0}C", ZERO_CELSIUS),
+    ("\u{2103}", ZERO_CELSIUS),
+    ("degF", ZERO_FAHRENHEIT),
+    ("\u{b0}F", ZERO_FAHRENHEIT),
+    ("\u{2109}", ZERO_FAHRENHEIT),
 ];
 
 const PREFIXES: &[(&str, f64)] = &[
@@ -126,14 +200,59 @@ const MAX_NESTING: usize = 16;
 const MAX_EXPONENT: f64 = 100.0;
 
 impl Dimension {
+    /// Most dimensions of its own that a model may declare.
+    pub const MOST_DECLARED: usize = 4;
     /// No dimension.
-    pub const NONE: Dimension = Dimension([0.0; 7]);
+    pub const NONE: Dimension = Dimension::from_si([0.0; 7]);
     /// Time.
     pub const TIME: Dimension = dim(0.0, 0.0, 1.0, 0.0);
+    /// Temperature.
+    pub const TEMPERATURE: Dimension = Dimension::from_si([0.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0]);
+
+    /// The dimension of these exponents of m, kg, s, A, K, mol, cd.
+    ///
+    /// ```
+    /// use greybox_model::{Dimension, Unit};
+    /// let force = Dimension::from_si([1.0, 1.0, -2.0, 0.0, 0.0, 0.0, 0.0]);
+    /// assert_eq!(force, Unit::parse("N")?.dimension);
+    /// assert_eq!(force.to_string(), "N");
+    /// # Ok::<(), greybox_model::UnitError>(())
+    /// ```
+    pub const fn from_si(exponents: [f64; 7]) -> Dimension {
+        Dimension { si: exponents, declared: [(Symbol::EMPTY, 0.0); Dimension::MOST_DECLARED] }
+    }
+
+    /// The dimension that a model declares under this symbol; `None` where the symbol is too long.
+    fn own(symbol: &str) -> Option<Dimension> {
+        let mut own = Dimension::NONE;
+        own.declared[0] = (Symbol::new(symbol)?, 1.0);
+        Some(own)
+    }
+
+    /// Exponents of m, kg, s, A, K, mol, cd.
+    pub fn si_exponents(&self) -> [f64; 7] {
+        self.si
+    }
+
+    /// Symbols and exponents of the declared dimensions in it, those that are not zero.
+    pub fn declared(&self) -> impl Iterator<Item = (&str, f64)> {
+        self.declared.iter().filter(|(_, e)| *e != 0.0).map(|(symbol, e)| (symbol.as_str(), *e))
+    }
+
+    fn exponent_of(&self, symbol: &Symbol) -> f64 {
+        self.declared.iter().find(|(s, e)| s == symbol && *e != 0.0).map_or(0.0, |(_, e)| *e)
+    }
+
+    /// Whether a test holds of all pairs of exponents.
+    fn all(&self, other: &Dimension, test: impl Fn(f64, f64) -> bool) -> bool {
+        let symbols = self.declared.iter().chain(&other.declared).filter(|(_, e)| *e != 0.0);
+        self.si.iter().zip(other.si).all(|(a, b)| test(*a, b))
+            && symbols.map(|(s, _)| s).all(|s| test(self.exponent_of(s), other.exponent_of(s)))
+    }
 
     /// Whether both are equal up to rounding of fractional exponents (1e-9).
     pub fn same(&self, other: &Dimension) -> bool {
-        self.0.iter().zip(other.0).all(|(a, b)| (a - b).abs() < 1e-9)
+        self.all(other, |a, b| (a - b).abs() < 1e-9)
     }
 
     /// Whether it is [`Dimension::NONE`] up to rounding.
@@ -143,21 +262,61 @@ impl Dimension {
 
     /// Every exponent times `exponent`.
     pub fn pow(self, exponent: f64) -> Dimension {
-        Dimension(self.0.map(|e| e * exponent))
+        self.map(|e| e * exponent)
+    }
+
+    fn map(self, change: impl Fn(f64) -> f64) -> Dimension {
+        Dimension { si: self.si.map(&change), declared: self.declared.map(|(s, e)| (s, change(e))) }
+    }
+
+    /// Exponents plus `scale` times those of the other. More declared dimensions than there is room for, which no
+    /// model has, make one that is the same as no other.
+    fn plus(self, other: Dimension, scale: f64) -> Dimension {
+        let mut sum = self;
+        for (own, e) in sum.si.iter_mut().zip(other.si) {
+            *own += scale * e;
+        }
+        for (symbol, e) in other.declared.iter().filter(|(_, e)| *e != 0.0) {
+            let slot = sum.declared.iter().position(|(s, e)| s == symbol && *e != 0.0);
+            match slot.or_else(|| sum.declared.iter().position(|(_, e)| *e == 0.0)) {
+                Some(i) if slot.is_some() => sum.declared[i].1 += scale * e,
+                Some(i) => sum.declared[i] = (*symbol, scale * e),
+                None => sum.si = [f64::NAN; 7],
+            }
+        }
+        sum
+    }
+}
+
+impl Default for Dimension {
+    fn default() -> Self {
+        Dimension::NONE
+    }
+}
+
+impl PartialEq for Dimension {
+    fn eq(&self, other: &Self) -> bool {
+        self.all(other, |a, b| a == b)
+    }
+}
+
+impl fmt::Debug for Dimension {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        write!(f, "Dimension({self})")
     }
 }
 
 impl Mul for Dimension {
     type Output = Dimension;
     fn mul(self, other: Dimension) -> Dimension {
-        Dimension(std::array::from_fn(|i| self.0[i] + other.0[i]))
+        self.plus(other, 1.0)
     }
 }
 
 impl Div for Dimension {
     type Output = Dimension;
     fn div(self, other: Dimension) -> Dimension {
-        Dimension(std::array::from_fn(|i| self.0[i] - other.0[i]))
+        self.plus(other, -1.0)
     }
 }
 
@@ -177,34 +336,124 @@ impl fmt::Display for Unit {
 impl Unit {
     /// The unit `1`.
     pub fn dimensionless() -> Unit {
-        Unit { text: "1".into(), factor: 1.0, dimension: Dimension::NONE }
+        Unit { text: "1".into(), factor: 1.0, offset: 0.0, dimension: Dimension::NONE }
     }
 
     /// The SI unit of a dimension, written readably: mechanical and electrical derived units where
     /// they make it shorter (`N m`, `N s/m`, `V^0.5/s`), base units else (`kg m^2`). Its text parses
     /// back to the same dimension with factor 1.
     pub fn si(dimension: Dimension) -> Unit {
-        Unit { text: si_text(dimension), factor: 1.0, dimension }
+        Unit { text: si_text(dimension), factor: 1.0, offset: 0.0, dimension }
     }
 
-    /// Parses a unit as engineers write it.
+    /// Parses a unit as engineers write it, with the built-in symbols; [`Units::parse`] knows those of a model as
+    /// well.
     ///
     /// `/` divides by the next factor only: `N/m s` is (N/m)·s, and `N/(m s)` or `N/m/s` divides by
-    /// both. `rad`, `sr` and `1` are dimensionless with factor 1, `%` is 0.01, `deg` π/180, `rpm`
-    /// π/30 s⁻¹, `Hz` 1 s⁻¹. Superscript digits are accepted.
+    /// both. `rad`, `sr`, `count`, `LSB`, `px`, `step`, `tick`, `pulse` and `1` are dimensionless with factor 1, `%`
+    /// is 0.01, `deg` π/180, `rpm` π/30 s⁻¹, `Hz` 1 s⁻¹. Superscript digits are accepted. `degC` and `degF` alone
+    /// have an offset.
     ///
     /// ```
     /// use greybox_model::Unit;
     /// let kt = Unit::parse("N*m/A")?;
     /// assert_eq!(kt.dimension, Unit::parse("V s")?.dimension);
     /// assert_eq!(Unit::parse("mm")?.factor, 1e-3);
+    /// assert_eq!(Unit::parse("count/rev")?.dimension, Unit::parse("1")?.dimension);
+    ///
+    /// let celsius = Unit::parse("degC")?;
+    /// assert_eq!(celsius.to_si(20.0), 293.15);
+    /// assert_eq!(celsius.difference_to_si(20.0), 20.0);
+    /// assert_eq!(Unit::parse("W/degC")?, greybox_model::Unit { text: "W/degC".into(), ..Unit::parse("W/K")? });
     /// # Ok::<(), greybox_model::UnitError>(())
     /// ```
     ///
     /// # Errors
     /// [`UnitError`] names the offending token and its mend.
     pub fn parse(text: &str) -> Result<Unit, UnitError> {
-        let mut parser = UnitParser { text, position: 0 };
+        Units::default().parse(text)
+    }
+
+    /// The SI value of a value in this unit.
+    pub fn to_si(&self, value: f64) -> f64 {
+        // Adding zero would take the sign of a negative zero.
+        if self.offset == 0.0 { value * self.factor } else { value * self.factor + self.offset }
+    }
+
+    /// The value in this unit of an SI value.
+    pub fn from_si(&self, si: f64) -> f64 {
+        if self.offset == 0.0 { si / self.factor } else { (si - self.offset) / self.factor }
+    }
+
+    /// The SI value of a start value of a state in this unit (`primes` 0), or of a derivative of it.
+    pub(crate) fn initial_to_si(&self, primes: usize, value: f64) -> f64 {
+        if primes == 0 { self.to_si(value) } else { self.difference_to_si(value) }
+    }
+
+    /// The SI value of a difference of two values in this unit: of a standard deviation, an error, a step.
+    pub fn difference_to_si(&self, difference: f64) -> f64 {
+        difference * self.factor
+    }
+
+    /// The unit of differences in this unit: the same, without its zero.
+    pub fn of_difference(&self) -> Unit {
+        Unit { offset: 0.0, ..self.clone() }
+    }
+
+    /// The difference in this unit of two SI values that differ by `si`.
+    pub fn difference_from_si(&self, si: f64) -> f64 {
+        si / self.factor
+    }
+}
+
+/// The units that a model declares under `[units]`, in the order of the file.
+///
+/// ```
+/// use greybox_model::Model;
+/// let model = Model::from_toml(r#"
+///     [units]
+///     enc = "2*pi/4096 rad"      # a multiple of a known unit
+///     dose = "own"               # a dimension of its own
+///     [inputs]
+///     u = { unit = "dose/s" }
+///     [states]
+///     theta = { unit = "enc" }
+///     c = { unit = "dose" }
+///     [parameters]
+///     T = { value = 0.5, unit = "s" }
+///     k = { value = 3, unit = "enc/dose" }
+///     [equations]
+///     uptake = "c' = u - c/T"
+///     turn = "T*theta' + theta = k*c"
+/// "#, "uptake.toml")?;
+/// let enc = model.units.parse("enc")?;
+/// assert!((enc.factor - std::f64::consts::TAU / 4096.0).abs() < 1e-18);
+/// assert_eq!(model.units.parse("dose/s")?.dimension.to_string(), "dose/s");
+/// # Ok::<(), Box<dyn std::error::Error>>(())
+/// ```
+#[derive(Debug, Clone, PartialEq, Default)]
+pub struct Units {
+    declared: Vec<DeclaredUnit>,
+}
+
+/// A symbol under `[units]`.
+#[derive(Debug, Clone, PartialEq)]
+pub struct DeclaredUnit {
+    /// The symbol.
+    pub symbol: String,
+    /// What it stands for: `own`, or a number and a unit.
+    pub definition: String,
+    /// Its meaning; the text is the symbol.
+    pub unit: Unit,
+}
+
+impl Units {
+    /// Parses a unit with the built-in symbols and those declared here.
+    ///
+    /// # Errors
+    /// As [`Unit::parse`].
+    pub fn parse(&self, text: &str) -> Result<Unit, UnitError> {
+        let mut parser = UnitParser { text, position: 0, units: self };
         if text.trim().is_empty() {
             return Err(unit_error(
                 0..text.len(),
@@ -222,32 +471,146 @@ impl Unit {
                 Some(help),
             ));
         }
-        if !(factor.is_finite() && factor > 0.0) {
-            return Err(unit_error(
-                0..text.len(),
-                "the unit's factor to SI overflows",
-                Some("use a smaller exponent"),
-            ));
+        usable(text, factor, dimension)?;
+        let text = text.trim().to_owned();
+        let offset = self.offset(&text);
+        Ok(Unit { text, factor, offset, dimension })
+    }
+
+    /// The declared symbols.
+    pub fn iter(&self) -> impl Iterator<Item = &DeclaredUnit> {
+        self.declared.iter()
+    }
+
+    /// SI value of the zero of a symbol that stands alone.
+    fn offset(&self, symbol: &str) -> f64 {
+        let declared = self.declared.iter().find(|d| d.symbol == symbol);
+        let known = OFFSETS.iter().find(|(s, _)| *s == symbol);
+        declared.map(|d| d.unit.offset).or(known.map(|(_, offset)| *offset)).unwrap_or(0.0)
+    }
+
+    fn lookup(&self, symbol: &str) -> Option<(f64, Dimension)> {
+        let declared = self.declared.iter().find(|d| d.symbol == symbol);
+        declared.map(|d| (d.unit.factor, d.unit.dimension)).or_else(|| lookup(symbol))
+    }
+
+    /// Adds a symbol, whose name has been checked, with what it stands for.
+    pub(crate) fn declare(&mut self, symbol: &str, definition: &str) -> Result<(), UnitError> {
+        let unit = self.defined(symbol, definition)?;
+        self.declared.push(DeclaredUnit {
+            symbol: symbol.to_owned(),
+            definition: definition.trim().to_owned(),
+            unit,
+        });
+        Ok(())
+    }
+
+    fn defined(&self, symbol: &str, definition: &str) -> Result<Unit, UnitError> {
+        let whole = 0..definition.len();
+        if definition.trim() == OWN {
+            if self.declared.iter().filter(|d| d.definition == OWN).count() >= Dimension::MOST_DECLARED {
+                let most = Dimension::MOST_DECLARED;
+                let help = "make it a multiple of a known unit, such as `1` or one of the other symbols";
+                let message = format!("a model may declare at most {most} dimensions of its own");
+                return Err(unit_error(whole, message, Some(help)));
+            }
+            let Some(dimension) = Dimension::own(symbol) else {
+                let message = format!("a dimension's symbol is no longer than {LONGEST_SYMBOL} bytes");
+                return Err(unit_error(whole, message, Some("choose a shorter symbol")));
+            };
+            return Ok(Unit { text: symbol.to_owned(), factor: 1.0, offset: 0.0, dimension });
         }
-        // Within it, the unit can be written in SI and read again.
-        if dimension.0.iter().any(|e| e.abs() > MAX_EXPONENT) {
-            return Err(unit_error(
-                0..text.len(),
-                format!("a base unit stands to a power above {MAX_EXPONENT} in it"),
-                Some("use a smaller exponent"),
-            ));
+        // The shortest number behind which the rest is a unit; else the error of the longest.
+        let mut fault = None;
+        let ends = definition.char_indices().filter(|(_, c)| c.is_whitespace()).map(|(i, _)| i);
+        for end in ends.chain([definition.len()]) {
+            let (number, rest) = definition.split_at(end);
+            let constant = parse(number).ok().and_then(|p| p.expr.eval(&constant));
+            let Some(value) = constant else { continue };
+            if !(value.is_finite() && value > 0.0) {
+                let message = format!("a unit is a positive multiple of another, found {value}");
+                return Err(unit_error(0..end, message, Some("write a positive number before the unit")));
+            }
+            match if rest.trim().is_empty() { Ok(Unit::dimensionless()) } else { self.parse(rest) } {
+                Ok(of) => {
+                    let factor = value * of.factor;
+                    usable(definition, factor, of.dimension)?;
+                    return Ok(Unit {
+                        text: symbol.to_owned(),
+                        factor,
+                        offset: 0.0,
+                        dimension: of.dimension,
+                    });
+                }
+                Err(e) => fault = Some(UnitError { span: e.span.start + end..e.span.end + end, ..e }),
+            }
         }
-        Ok(Unit { text: text.trim().to_owned(), factor, dimension })
+        match (self.parse(definition), fault) {
+            (Ok(of), _) => Ok(Unit { text: symbol.to_owned(), ..of }),
+            (Err(_), Some(fault)) => Err(fault),
+            (Err(fault), None) => Err(fault),
+        }
     }
 }
 
+/// What a dimension of its own is declared as.
+pub(crate) const OWN: &str = "own";
+
+/// The names of a number in a definition.
+fn constant(name: &str, primes: u8) -> Option<f64> {
+    (name == "pi" && primes == 0).then_some(PI)
+}
+
+/// Why a symbol cannot be declared under `[units]`, and what to do.
+pub(crate) fn refused_symbol(symbol: &str) -> Option<(String, String)> {
+    if lookup(symbol).is_some() || symbol == OWN {
+        let reason = if symbol == OWN {
+            "the word declares a dimension".to_owned()
+        } else {
+            "it is a built-in unit".to_owned()
+        };
+        return Some((reason, format!("choose another symbol, such as `{symbol}_`")));
+    }
+    if symbol.is_empty() || !symbol.chars().all(|c| c.is_alphabetic() || c == '_') {
+        let letters: String = symbol.chars().filter(|c| c.is_alphabetic() || *c == '_').collect();
+        let help = match lookup(&letters) {
+            None if !letters.is_empty() => format!("write `{letters}`"),
+            _ => "choose a word".to_owned(),
+        };
+        return Some(("a unit's symbol consists of letters and `_`".to_owned(), help));
+    }
+    None
+}
+
+/// Sees that a unit can be computed with.
+fn usable(text: &str, factor: f64, dimension: Dimension) -> Result<(), UnitError> {
+    if !(factor.is_finite() && factor > 0.0) {
+        return Err(unit_error(
+            0..text.len(),
+            "the unit's factor to SI overflows",
+            Some("use a smaller exponent"),
+        ));
+    }
+    // Within it, the unit can be written in SI and read again.
+    let exponents = dimension.si.into_iter().chain(dimension.declared.iter().map(|(_, e)| *e));
+    if exponents.into_iter().any(|e| e.abs() > MAX_EXPONENT) {
+        return Err(unit_error(
+            0..text.len(),
+            format!("a base unit stands to a power above {MAX_EXPONENT} in it"),
+            Some("use a smaller exponent"),
+        ));
+    }
+    Ok(())
+}
+
 fn unit_error(span: Range<usize>, message: impl Into<String>, help: Option<&str>) -> UnitError {
-    UnitError { span, message: message.into(), help: help.map(str::to_owned) }
+    UnitError { span, message: message.into(), help: help.map(str::to_owned), unknown: None }
 }
 
 struct UnitParser<'a> {
     text: &'a str,
     position: usize,
+    units: &'a Units,
 }
 
 impl UnitParser<'_> {
@@ -338,7 +701,8 @@ impl UnitParser<'_> {
                 Some("put it into the value, or use an SI prefix such as `mm`"),
             ));
         }
-        let is_letter = |c: char| c.is_alphabetic() || matches!(c, '%' | '\u{b0}' | '_');
+        let is_letter =
+            |c: char| c.is_alphabetic() || matches!(c, '%' | '\u{b0}' | '\u{2103}' | '\u{2109}' | '_');
         let span = self.take(is_letter);
         if span.is_empty() {
             let message = format!("found `{c}`, expected a unit");
@@ -351,11 +715,12 @@ impl UnitParser<'_> {
             return Err(unit_error(start..start + c.len_utf8(), message, Some(help)));
         }
         let symbol = &self.text[span.clone()];
-        let Some(found) = lookup(symbol) else {
+        let Some(found) = self.units.lookup(symbol) else {
             return Err(UnitError {
                 span,
                 message: format!("unknown unit `{symbol}`"),
-                help: Some(suggestion(symbol)),
+                help: Some(suggestion(symbol, self.units)),
+                unknown: Some(symbol.to_owned()),
             });
         };
         // `m2` is a slip for `m^2`; superscripts are taken by `exponent`.
@@ -444,8 +809,24 @@ fn lookup(symbol: &str) -> Option<(f64, Dimension)> {
     })
 }
 
+/// Words for units that no rule of spelling leads to.
+const MEANT: [(&str, &str); 9] = [
+    ("celsius", "degC"),
+    ("fahrenheit", "degF"),
+    ("kelvin", "K"),
+    ("degK", "K"),
+    ("\u{b0}K", "K"),
+    ("\u{ba}C", "degC"),
+    ("\u{ba}F", "degF"),
+    ("pixel", "px"),
+    ("pixels", "px"),
+];
+
 /// What may have been meant by an unknown symbol.
-fn suggestion(symbol: &str) -> String {
+fn suggestion(symbol: &str, units: &Units) -> String {
+    if let Some((_, meant)) = MEANT.iter().find(|(slip, _)| slip.eq_ignore_ascii_case(symbol)) {
+        return format!("write `{meant}`");
+    }
     // `ohms` is a plural, not `ohm s`.
     if let Some(singular) = symbol.strip_suffix('s').filter(|s| s.chars().count() > 1 && lookup(s).is_some())
     {
@@ -458,9 +839,10 @@ fn suggestion(symbol: &str) -> String {
         }
     }
     let common = ["mm", "cm", "km", "ms", "mA", "mV", "kN", "kW", "kHz"];
-    match nearest(symbol, SYMBOLS.iter().map(|s| s.0).chain(common)) {
+    let declared = units.declared.iter().map(|d| d.symbol.as_str());
+    match nearest(symbol, SYMBOLS.iter().map(|s| s.0).chain(common).chain(declared)) {
         Some(near) => format!("did you mean `{near}`?"),
-        None => "use SI units with prefixes (`m kg s A K N J W Pa V Ohm F H T Wb C S Hz`), `rad`, `deg`, `rpm`, `%` or `1`".into(),
+        None => "use SI units with prefixes (`m kg s A K N J W Pa V Ohm F H T Wb C S Hz`), `rad`, `deg`, `rpm`, `degC`, `count`, `%` or `1`, or declare it under `[units]` of the model".into(),
     }
 }
 
@@ -486,13 +868,14 @@ fn clean(e: f64) -> f64 {
 
 /// The shortest product of at most two derived units and base units.
 fn si_text(dimension: Dimension) -> String {
-    let dimension = Dimension(dimension.0.map(clean));
+    let dimension = dimension.map(clean);
     if dimension.is_none() {
         return "1".into();
     }
     if let Some((text, _)) = CUSTOMARY.iter().find(|(_, d)| d.same(&dimension)) {
         return (*text).into();
     }
+    let own: Vec<(&str, f64)> = dimension.declared().collect();
     let exponents = [1.0, -1.0, 0.5, -0.5, 2.0, -2.0, 1.5, -1.5, 3.0, -3.0];
     let powers: Vec<(&str, f64, Dimension)> =
         DERIVED.iter().flat_map(|(symbol, d)| exponents.map(|e| (*symbol, e, d.pow(e)))).collect();
@@ -506,11 +889,12 @@ fn si_text(dimension: Dimension) -> String {
         let rest = derived.iter().fold(dimension, |rest, (_, _, d)| rest / *d);
         let mut factors: Vec<(&str, f64)> = derived.iter().map(|(symbol, e, _)| (*symbol, *e)).collect();
         for (i, symbol) in BASE.iter().enumerate() {
-            let e = clean(rest.0[i]);
+            let e = clean(rest.si[i]);
             if e != 0.0 {
                 factors.push((symbol, e));
             }
         }
+        factors.extend(&own);
         // What [`Unit::parse`] would not read.
         if !derived.is_empty() && factors.iter().any(|(_, e)| e.abs() > MAX_EXPONENT) {
             continue;
@@ -522,7 +906,8 @@ fn si_text(dimension: Dimension) -> String {
             .sum();
         cost += if factors.iter().all(|(_, e)| *e < 0.0) { 0.1 } else { 0.0 };
         // Kinematics stay kinematics: `m/s^2`, not `N/kg`.
-        cost -= if derived.is_empty() && dimension.0[1] == 0.0 && dimension.0[3] == 0.0 { 1.0 } else { 0.0 };
+        cost -=
+            if derived.is_empty() && dimension.si[1] == 0.0 && dimension.si[3] == 0.0 { 1.0 } else { 0.0 };
         if best.as_ref().is_none_or(|(c, _)| cost < c - 1e-9) {
             best = Some((cost, factors));
         }
@@ -535,7 +920,7 @@ fn si_text(dimension: Dimension) -> String {
     let side = |positive: bool| {
         let mut chosen: Vec<(&str, f64)> =
             factors.iter().filter(|(_, e)| (*e > 0.0) == positive).map(|(s, e)| (*s, e.abs())).collect();
-        if chosen.iter().all(|(s, _)| BASE.contains(s)) {
+        if !chosen.iter().any(|(s, _)| DERIVED.iter().any(|(derived, _)| derived == s)) {
             chosen.sort_by_key(|(s, _)| rank(s));
         }
         chosen.iter().map(power).collect::<Vec<_>>()
@@ -597,11 +982,138 @@ mod tests {
             ("gn", 9.80665, dim(1.0, 0.0, -2.0, 0.0)),
             ("atm", 101_325.0, dim(-1.0, 1.0, -2.0, 0.0)),
             ("mbar", 100.0, dim(-1.0, 1.0, -2.0, 0.0)),
+            ("count", 1.0, Dimension::NONE),
+            ("counts", 1.0, Dimension::NONE),
+            ("LSB", 1.0, Dimension::NONE),
+            ("px", 1.0, Dimension::NONE),
+            ("count/rev", 1.0 / (2.0 * PI), Dimension::NONE),
+            ("V/count", 1.0, dim(2.0, 1.0, -3.0, -1.0)),
+            ("px/mm", 1e3, dim(-1.0, 0.0, 0.0, 0.0)),
+            ("step/s", 1.0, dim(0.0, 0.0, -1.0, 0.0)),
+            ("tick pulse", 1.0, Dimension::NONE),
+            ("W/degC", 1.0, dim(2.0, 1.0, -3.0, 0.0) / Dimension::TEMPERATURE),
+            ("W/(m^2 \u{b0}C)", 1.0, dim(0.0, 1.0, -3.0, 0.0) / Dimension::TEMPERATURE),
+            ("degF/s", 5.0 / 9.0, Dimension::TEMPERATURE / Dimension::TIME),
         ] {
             let unit = Unit::parse(text).unwrap_or_else(|e| panic!("{text}: {e}"));
             assert!((unit.factor / factor - 1.0).abs() < 1e-14, "{text}: {}", unit.factor);
             assert!(unit.dimension.same(&dimension), "{text}: {:?}", unit.dimension);
+            assert_eq!(unit.offset, 0.0, "{text}");
         }
+    }
+
+    #[test]
+    fn a_temperature_alone_is_absolute_and_in_a_product_a_difference() {
+        for (text, value, kelvin) in [
+            ("degC", 20.0, 293.15),
+            ("\u{b0}C", -273.15, 0.0),
+            (" \u{2103} ", 0.0, 273.15),
+            ("degF", 32.0, 273.15),
+            ("\u{b0}F", 212.0, 373.15),
+            ("\u{2109}", -459.67, 0.0),
+            ("K", 293.15, 293.15),
+            ("mK", 293_150.0, 293.15),
+        ] {
+            let unit = Unit::parse(text).unwrap();
+            assert!((unit.to_si(value) - kelvin).abs() < 1e-12, "{text}: {}", unit.to_si(value));
+            assert!((unit.from_si(kelvin) - value).abs() < 1e-9 * (1.0 + value.abs()), "{text}");
+            assert!((unit.difference_to_si(value) - unit.factor * value).abs() < 1e-12);
+            assert!((unit.difference_from_si(unit.difference_to_si(9.0)) - 9.0).abs() < 1e-12);
+            assert_eq!(unit.dimension, Dimension::TEMPERATURE);
+            assert_eq!(unit.of_difference().to_si(0.0), 0.0);
+        }
+        for text in ["degC^1", "1 degC", "(degC)", "degC/K", "degF degC"] {
+            assert_eq!(Unit::parse(text).unwrap().offset, 0.0, "{text}");
+        }
+        // The sign of zero stays where there is no offset.
+        assert!(Unit::parse("mm").unwrap().to_si(-0.0).is_sign_negative());
+    }
+
+    fn declared(definitions: &[(&str, &str)]) -> Units {
+        let mut units = Units::default();
+        for (symbol, definition) in definitions {
+            units.declare(symbol, definition).unwrap_or_else(|e| panic!("{symbol} = {definition}: {e}"));
+        }
+        units
+    }
+
+    #[test]
+    fn a_model_declares_multiples_and_dimensions() {
+        let units = declared(&[
+            ("enc", "2*pi/4096 rad"),
+            ("slug", "14.593903 kg"),
+            ("turn", "4096 enc"),
+            ("dozen", "12"),
+            ("room", "degC"),
+            ("dose", "own"),
+            ("kdose", "1e3 dose"),
+            ("flux", "3 * 2 N m/(rad/s)"),
+            ("alias", "N m"),
+        ]);
+        for (text, factor, dimension) in [
+            ("enc", 2.0 * PI / 4096.0, "1"),
+            ("slug", 14.593_903, "kg"),
+            ("turn/s", 2.0 * PI, "1/s"),
+            ("dozen", 12.0, "1"),
+            ("kdose/s", 1e3, "dose/s"),
+            ("dose^2/kg", 1.0, "dose^2/kg"),
+            ("W/room", 1.0, "W/K"),
+            ("flux", 6.0, "N m s"),
+            ("1/dose", 1.0, "1/dose"),
+            ("alias/dose", 1.0, "N m/dose"),
+            ("kg dose", 1.0, "kg dose"),
+            ("mm", 1e-3, "m"),
+        ] {
+            let unit = units.parse(text).unwrap_or_else(|e| panic!("{text}: {e}"));
+            assert!((unit.factor / factor - 1.0).abs() < 1e-14, "{text}: {}", unit.factor);
+            assert_eq!(unit.dimension.to_string(), dimension, "{text}");
+            let again = units.parse(&Unit::si(unit.dimension).text).unwrap();
+            assert!(again.dimension == unit.dimension && again.factor == 1.0, "{text}");
+        }
+        assert_eq!(units.parse("room").unwrap().to_si(20.0), 293.15);
+        let [dose, kg] = ["dose", "kg"].map(|text| units.parse(text).unwrap().dimension);
+        assert!(dose != kg && !dose.is_none() && (dose / dose).is_none());
+        assert!((dose * kg / dose).same(&kg) && dose.pow(0.5).pow(2.0).same(&dose));
+        // Without the model it is unknown, and the error says which symbol.
+        assert_eq!(Unit::parse("V/dose").unwrap_err().unknown.as_deref(), Some("dose"));
+        assert!(units.parse("dosse").unwrap_err().to_string().contains("did you mean `dose`"));
+    }
+
+    #[test]
+    fn bad_definitions_name_the_token() {
+        for (definition, place, fragment) in [
+            ("", 0..0, "the unit is empty"),
+            ("2 furlong", 2..9, "unknown unit `furlong`"),
+            ("-2 m", 0..2, "a positive multiple"),
+            ("0 m", 0..1, "a positive multiple"),
+            ("1/0 m", 0..3, "a positive multiple"),
+            ("1e300 Gm^2", 0..10, "overflows"),
+            ("2 3 m", 2..3, "found the number `3`"),
+            ("own own", 0..3, "unknown unit `own`"),
+        ] {
+            let error = Units::default().declare("x", definition).expect_err(definition);
+            assert!(error.to_string().contains(fragment), "{definition}: {error}");
+            assert_eq!(error.span, place, "{definition}: {error}");
+        }
+        let mut four = declared(&[("a_", "own"), ("b_", "own"), ("c_", "own"), ("d_", "own")]);
+        assert!(four.declare("e_", "own").unwrap_err().to_string().contains("at most 4"));
+        assert!(four.declare("e_", "2 d_").is_ok());
+        let product = four.parse("a_ b_^2/(c_ e_^0.5)").unwrap();
+        assert_eq!(product.dimension.declared().count(), 4);
+        let long = "x".repeat(LONGEST_SYMBOL + 1);
+        assert!(Units::default().declare(&long, "own").unwrap_err().to_string().contains("15 bytes"));
+        for symbol in ["mm", "count", "degC", "own", "", "x2", "a b", "\u{b0}"] {
+            assert!(refused_symbol(symbol).is_some(), "{symbol}");
+        }
+        assert!(refused_symbol("enc_a").is_none());
+    }
+
+    #[test]
+    fn more_declared_dimensions_than_a_model_has_are_no_other() {
+        let product = ["a", "b", "c", "d", "e"]
+            .iter()
+            .fold(Dimension::NONE, |product, symbol| product * Dimension::own(symbol).unwrap());
+        assert!(!product.same(&product) && !product.is_none());
     }
 
     #[test]
@@ -621,6 +1133,11 @@ mod tests {
             ("[m]", 0..1, "without brackets"),
             ("volt", 0..4, "unknown unit `volt`"),
             ("ohms", 0..4, "did you mean `ohm`"),
+            ("ticks", 0..5, "did you mean `tick`"),
+            ("pixels", 0..6, "write `px`"),
+            ("Celsius", 0..7, "write `degC`"),
+            ("\u{ba}C", 0..3, "write `degC`"),
+            ("degK", 0..4, "write `K`"),
         ] {
             let error = Unit::parse(text).expect_err(text);
             assert!(error.to_string().contains(fragment), "{text}: {error}");

@@ -3,7 +3,7 @@
 use crate::expr::Expr;
 use crate::model::{Equation, Hold, Input, Measurement, Model, Parameter, State};
 use crate::parse::{parse, parse_equation};
-use crate::units::Unit;
+use crate::units::{DeclaredUnit, Unit};
 use toml_edit::{Array, DocumentMut, InlineTable, Item, Table, TableLike, Value};
 
 /// The byte order mark.
@@ -50,6 +50,8 @@ impl Model {
         let measurements = root.get("measurements").cloned();
         // A comment inside an inline table would swallow the rest of its line.
         let may_comment = root.get("parameters").is_none_or(Item::is_table);
+        let units = self.units.iter().map(|u| (u.symbol.as_str(), u));
+        write_section(root, "units", units, write_definition);
         let inputs = self.inputs.iter().map(|i| (i.name.as_str(), i));
         write_section(root, "inputs", inputs, write_input);
         let states = self.states.iter().map(|s| (s.name.as_str(), s));
@@ -206,17 +208,36 @@ fn as_number(item: &Item) -> Option<f64> {
 
 /// Writes the unit where it differs from what stands there; an inferred one may stay unsaid.
 fn write_unit(table: &mut dyn TableLike, unit: &Unit) {
-    let stated = old_str(table, "unit").and_then(|text| Unit::parse(text).ok());
-    if stated.as_ref().is_none_or(|u| u.text != unit.text) {
+    if old_str(table, "unit").map(str::trim) != Some(&unit.text) {
         set(table, "unit", Value::from(unit.text.as_str()));
     }
 }
 
+/// Whether the unit is another than SI, so that it must be said.
+fn is_scaled(unit: &Unit) -> bool {
+    unit.factor != 1.0 || unit.offset != 0.0
+}
+
 /// Writes a number given in SI in the stated unit, unless the old text means the same.
-fn write_number(table: &mut dyn TableLike, key: &str, si: f64, factor: f64) {
-    let unchanged = old_number(table, key).is_some_and(|v| v * factor == si || v == si / factor);
+fn write_number(table: &mut dyn TableLike, key: &str, si: f64, unit: &Unit) {
+    let unchanged = old_number(table, key).is_some_and(|v| unit.to_si(v) == si || v == unit.from_si(si));
     if !unchanged {
-        set(table, key, decimal(si / factor));
+        set(table, key, decimal(unit.from_si(si)));
+    }
+}
+
+/// A declared unit; the old entry where it says the same.
+fn write_definition(old: Option<&Item>, declared: &DeclaredUnit) -> Item {
+    let stated = old.and_then(|item| {
+        let table = item
+            .as_table_like()
+            .and_then(|table| Some(format!("{:?} {}", old_number(table, "value")?, old_str(table, "unit")?)));
+        let text = item.as_str().map(str::to_owned);
+        text.or(as_number(item).map(|v| format!("{v:?}"))).or(table)
+    });
+    match old {
+        Some(item) if stated.as_deref().map(str::trim) == Some(&declared.definition) => item.clone(),
+        _ => text_item(old, declared.definition.clone()),
     }
 }
 
@@ -237,7 +258,7 @@ fn decimal(v: f64) -> Value {
 
 fn write_input(old: Option<&Item>, input: &Input) -> Item {
     edited(old, |table| {
-        if old.is_none() || table.get("unit").is_some() || input.unit.factor != 1.0 {
+        if old.is_none() || table.get("unit").is_some() || is_scaled(&input.unit) {
             write_unit(table, &input.unit);
         }
         let usual = Input::usual_hold(&input.channel);
@@ -248,16 +269,17 @@ fn write_input(old: Option<&Item>, input: &Input) -> Item {
         if old_str(table, "channel").unwrap_or(&input.name) != input.channel {
             set(table, "channel", Value::from(input.channel.as_str()));
         }
-        let factor = input.unit.factor;
         let old = table.get("range").and_then(Item::as_array).map(|list| {
             list.iter()
-                .map(|v| v.as_float().or_else(|| v.as_integer().map(|i| i as f64)).map(|v| v * factor))
+                .map(|v| {
+                    v.as_float().or_else(|| v.as_integer().map(|i| i as f64)).map(|v| input.unit.to_si(v))
+                })
                 .collect::<Option<Vec<f64>>>()
         });
         match input.range {
             Some(range) if old.flatten().is_some_and(|old| old == range) => {}
             Some(range) => {
-                let list: Array = range.iter().map(|v| decimal(v / factor)).collect();
+                let list: Array = range.iter().map(|v| decimal(input.unit.from_si(*v))).collect();
                 set(table, "range", Value::Array(list));
             }
             None => {
@@ -269,7 +291,7 @@ fn write_input(old: Option<&Item>, input: &Input) -> Item {
 
 fn write_state(old: Option<&Item>, state: &State) -> Item {
     edited(old, |table| {
-        if old.is_none() || table.get("unit").is_some() || state.unit.factor != 1.0 {
+        if old.is_none() || table.get("unit").is_some() || is_scaled(&state.unit) {
             write_unit(table, &state.unit);
         }
         match &state.channel {
@@ -290,7 +312,7 @@ fn write_state(old: Option<&Item>, state: &State) -> Item {
                 }
             }
         }
-        let factor = state.unit.factor;
+        let unit = &state.unit;
         let old_initial: Option<Vec<f64>> = table.get("initial").and_then(|item| match item.as_array() {
             Some(list) => {
                 list.iter().map(|v| v.as_float().or_else(|| v.as_integer().map(|i| i as f64))).collect()
@@ -299,16 +321,21 @@ fn write_state(old: Option<&Item>, state: &State) -> Item {
         });
         let same = old_initial.as_ref().is_some_and(|old| {
             old.len() == state.initial.len()
-                && old.iter().zip(&state.initial).all(|(v, si)| v * factor == *si)
+                && old
+                    .iter()
+                    .zip(&state.initial)
+                    .enumerate()
+                    .all(|(k, (v, si))| unit.initial_to_si(k, *v) == *si)
         });
         match state.initial.as_slice() {
             _ if same => {}
             [] => {
                 table.remove("initial");
             }
-            [one] => set(table, "initial", decimal(one / factor)),
-            many => {
-                let list: Array = many.iter().map(|v| decimal(v / factor)).collect();
+            [one] => set(table, "initial", decimal(unit.from_si(*one))),
+            [position, rates @ ..] => {
+                let rates = rates.iter().map(|v| unit.difference_from_si(*v));
+                let list: Array = [unit.from_si(*position)].into_iter().chain(rates).map(decimal).collect();
                 set(table, "initial", Value::Array(list));
             }
         }
@@ -317,15 +344,15 @@ fn write_state(old: Option<&Item>, state: &State) -> Item {
 
 fn write_parameter(old: Option<&Item>, parameter: &Parameter) -> Item {
     edited(old, |table| {
-        let factor = parameter.unit.as_ref().map_or(1.0, |u| u.factor);
-        write_number(table, "value", parameter.value, factor);
+        let written = parameter.unit.clone().unwrap_or_else(Unit::dimensionless);
+        write_number(table, "value", parameter.value, &written);
         if let Some(unit) = &parameter.unit
-            && (old.is_none() || table.get("unit").is_some() || unit.factor != 1.0)
+            && (old.is_none() || table.get("unit").is_some() || is_scaled(unit))
         {
             write_unit(table, unit);
         }
         match parameter.std {
-            Some(std) => write_number(table, "std", std, factor),
+            Some(std) => write_number(table, "std", std, &written.of_difference()),
             None => {
                 table.remove("std");
             }

@@ -393,3 +393,112 @@ fn nothing_makes_loading_panic() {
         let _ = Model::from_toml(&text, "x.toml");
     }
 }
+
+const ROOM: &str = r#"
+[units]
+enc = "2*pi/4096 rad"
+
+[inputs]
+Ta = { unit = "degC" }
+Ph = { unit = "W" }
+
+[states]
+Ti = { unit = "degF", initial = [212] }
+
+[parameters]
+C = { value = 2e6, unit = "J/degC" }
+R = { value = 0.005, unit = "degC/W", std = 0.001 }
+To = { value = -10, unit = "degC", std = 9, positive = true }
+gain = { value = 0 }
+
+[equations]
+room = "C*Ti' + (Ti - Ta)/R + gain*(Ti - To) = Ph"
+
+[measurements]
+rise = "Ti - Ta"
+mean = { expression = "(Ti + Ta)/2", unit = "degC" }
+"#;
+
+#[test]
+fn temperatures_are_absolute_in_kelvin_and_their_differences_differences() {
+    let model = Model::from_toml(ROOM, "room.toml").unwrap();
+    assert!((model.states[0].initial[0] - 373.15).abs() < 1e-9);
+    assert_eq!((model.parameters[0].value, model.parameters[1].value), (2e6, 0.005));
+    assert_eq!((model.parameters[2].value, model.parameters[2].std), (263.15, Some(9.0)));
+    assert_eq!(model.parameters[3].unit.as_ref().unwrap().text, "W/K");
+    let unit = |channel: &str| {
+        let m = model.measurements.iter().find(|m| m.channel == channel).unwrap();
+        (m.unit.text.clone(), m.unit.offset)
+    };
+    assert_eq!(unit("Ti").0, "degF");
+    assert_eq!((unit("rise"), unit("mean")), (("K".to_owned(), 0.0), ("degC".to_owned(), 273.15)));
+    // A difference has no zero.
+    let wrong = ROOM.replace("rise = \"Ti - Ta\"", "rise = { expression = \"Ti - Ta\", unit = \"degC\" }");
+    let error = Model::from_toml(&wrong, "room.toml").unwrap_err();
+    assert!(error.to_string().contains("is a difference; mend: write `unit = \"K\"`"), "{error}");
+}
+
+#[test]
+fn units_that_a_model_declares() {
+    let model = |units: &str| {
+        let text = format!(
+            "[units]\n{units}\n[inputs]\nu = {{ unit = \"bolus/s\" }}\n[states]\nx = {{ unit = \"bolus\", initial = 3 }}\n\
+             [parameters]\nT = {{ value = 2, unit = \"s\" }}\n[equations]\ne = \"x' = u - x/T\"\n"
+        );
+        Model::from_toml(&text, "m.toml")
+    };
+    let own = model("bolus = \"own\"").unwrap();
+    assert_eq!((own.states[0].initial[0], own.states[0].unit.dimension.to_string()), (3.0, "bolus".into()));
+    // A definition may use what stands below it.
+    for units in [
+        "bolus = \"2 half\"\nhalf = \"0.25 kg\"",
+        "bolus = { value = 0.5, unit = \"kg\" }",
+        "lot = \"own\"\nbolus = \"0.5 kg\"",
+    ] {
+        let model = model(units).unwrap();
+        assert_eq!((model.states[0].initial[0], model.states[0].unit.factor), (1.5, 0.5), "{units}");
+    }
+    assert_eq!(model("bolus = 4").unwrap().states[0].initial[0], 12.0);
+    for (units, problem) in [
+        ("", "unknown unit `bolus`"),
+        ("bolus = true", "expected a definition, found true"),
+        (
+            "bolus = \"2 furlong\"",
+            "m.toml:2:12: unit `bolus`: the unit `2 furlong` cannot be read: unknown unit `furlong`",
+        ),
+        (
+            "mm = \"2 kg\"",
+            "m.toml:2:1: `mm` cannot name a unit: it is a built-in unit; mend: choose another symbol, such as `mm_`",
+        ),
+        ("x2 = \"2 kg\"", "a unit's symbol consists of letters and `_`; mend: write `x`"),
+        (
+            "bolus = \"2 lot\"\nlot = \"3 bolus\"",
+            "unit `bolus`: its definition leads through `lot` back to itself",
+        ),
+        ("bolus = \"2 bolus\"", "unit `bolus`: its definition leads through `bolus` back to itself"),
+        ("bolus = { value = 2 }", "unit `bolus` lacks `unit`"),
+        (
+            "bolus = { value = 2, units = \"kg\" }",
+            "unknown key `units` in unit `bolus`; mend: did you mean `unit`?",
+        ),
+        ("a = \"own\"\nb = \"own\"\nc = \"own\"\nd = \"own\"\nbolus = \"own\"", "at most 4 dimensions"),
+        ("bolus = \"own\"\nbolus = \"kg\"", "not TOML"),
+    ] {
+        let error = model(units).unwrap_err().to_string();
+        assert!(error.contains(problem), "{units}: {error}");
+    }
+    let long = format!("bolus = \"2{} kg\"", " ".repeat(2000));
+    assert!(model(&long).unwrap_err().to_string().contains("longer than 1000 bytes"));
+    let many: String = (0..600).map(|k| format!("s_{} = 1\n", "q".repeat(k + 1))).collect();
+    assert!(model(&many).unwrap_err().to_string().contains("at most 500 can be declared"));
+}
+
+#[test]
+fn terms_in_different_declared_dimensions_do_not_add() {
+    let text = "[units]\ndose = \"own\"\nlot = \"own\"\n[states]\nx = { unit = \"dose\" }\ny = { unit = \"lot\" }\n[parameters]\n\
+                T = { value = 2, unit = \"s\" }\nk = { value = 3 }\n[equations]\ne = \"T*x' + x = k*y\"\nf = \"T*y' + y = 0\"\n";
+    let model = Model::from_toml(text, "m.toml").unwrap();
+    assert_eq!(model.parameters[1].unit.as_ref().unwrap().text, "dose/lot");
+    let error = Model::from_toml(&text.replace("k*y", "y"), "m.toml").unwrap_err().to_string();
+    assert!(error.contains("dose") && error.contains("lot"), "{error}");
+}

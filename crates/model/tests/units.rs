@@ -51,7 +51,7 @@ proptest! {
         for (w, e) in wanted.iter_mut().zip(exponents) {
             *w = f64::from(e);
         }
-        prop_assert!(unit.dimension.same(&Dimension(wanted)), "{}: {:?} {:?}", text, unit, wanted);
+        prop_assert!(unit.dimension.same(&Dimension::from_si(wanted)), "{}: {:?} {:?}", text, unit, wanted);
         prop_assert!((unit.factor / si - 1.0).abs() < 1e-12, "{}: {} {}", text, unit.factor, si);
         // Written in SI it is of the same dimension.
         let written = Unit::si(unit.dimension);

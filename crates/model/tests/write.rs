@@ -259,3 +259,56 @@ proptest! {
         }
     }
 }
+
+#[test]
+fn declared_units_and_temperatures_are_written_back() {
+    let text = r#"[units]
+enc   = "2*pi/4096 rad"   # encoder
+dose  = "own"
+gross = { value = 144, unit = "1" }
+score = 20                # bare
+
+[inputs]
+u = { unit = 'dose/s' }
+
+[states]
+theta = { unit = "enc", initial = [4096, 1] }
+c = { unit = "dose" }
+Ti = { unit = "degC", initial = 20 }
+
+[parameters]
+T = { value = 2, unit = "s" }
+k = { value = 5 }
+To = { value = 21.5, unit = "degC", std = 2 }
+
+[equations]
+a = "T^2*theta'' + theta = k*c"
+b = "T*c' + c = T*u"
+r = "T*Ti' + Ti = To"
+"#;
+    let model = Model::from_toml(text, "m.toml").unwrap();
+    assert!((model.states[0].initial[0] - std::f64::consts::TAU).abs() < 1e-12);
+    let same = model.to_toml(&WriteOptions { original: Some(text), ..Default::default() });
+    assert_eq!(same, text);
+    let fresh = model.to_toml(&WriteOptions::default());
+    assert!(fresh.starts_with("[units]\nenc = \"2*pi/4096 rad\"\n"), "{fresh}");
+    let again = Model::from_toml(&fresh, "m.toml").unwrap();
+    assert_eq!(again.units.iter().map(|u| &u.symbol).collect::<Vec<_>>(), ["enc", "dose", "gross", "score"]);
+    let with = |m: &Model| {
+        let mut m = m.clone();
+        m.units = greybox_model::Units::default();
+        m
+    };
+    assert_eq!(with(&again), with(&model), "{fresh}");
+    assert!(fresh.contains("To = { value = 21.5, unit = \"degC\", std = 2.0 }"), "{fresh}");
+
+    // A changed value comes back on its own scale, its deviation as a difference.
+    let mut changed = model.clone();
+    let to = changed.parameter("To").unwrap();
+    (changed.parameters[to].value, changed.parameters[to].std) = (303.15, Some(0.5));
+    changed.states[2].initial = vec![273.15];
+    let written = changed.to_toml(&WriteOptions { original: Some(text), ..Default::default() });
+    assert!(written.contains("To = { value = 30.0, unit = \"degC\", std = 0.5 }"), "{written}");
+    assert!(written.contains("Ti = { unit = \"degC\", initial = 0.0 }"), "{written}");
+    assert!(written.starts_with("[units]\nenc   = \"2*pi/4096 rad\"   # encoder\n"));
+}

@@ -87,9 +87,10 @@ fn names(data: &Data) -> Vec<String> {
     data.channels.iter().map(|c| c.name.clone()).collect()
 }
 
-fn interval(ci: Option<(f64, f64)>, factor: f64) -> Option<Interval> {
+/// An interval in SI as one in the unit that `told` converts to.
+fn interval(ci: Option<(f64, f64)>, told: impl Fn(f64) -> f64) -> Option<Interval> {
     ci.map(|(low, high)| {
-        let (a, b) = (low / factor, high / factor);
+        let (a, b) = (told(low), told(high));
         Interval { low: a.min(b), high: a.max(b) }
     })
 }
@@ -118,13 +119,13 @@ fn reach(d: &Diagnosis) -> Reach {
             Some(ends.map_or([*v, *v], |[low, high]| [low.min(*v), high.max(*v)]))
         });
         let reached = ends.unwrap_or([0.0, 0.0]);
-        let factor = input.unit.factor;
+        let shown = |v: f64| input.unit.from_si(v);
         InputRange {
             name: input.name.clone(),
             unit: input.unit.text.clone(),
-            rms: (known().map(|v| v * v).sum::<f64>() / count).sqrt() / factor,
-            reached: reached.map(|v| v / factor),
-            stated: stated(&d.nominal, u, reached).map(|ends| ends.map(|v| v / factor)),
+            rms: (known().map(|v| shown(*v).powi(2)).sum::<f64>() / count).sqrt(),
+            reached: reached.map(shown),
+            stated: stated(&d.nominal, u, reached).map(|ends| ends.map(shown)),
         }
     });
     let mut coordinates = Ordered::new();
@@ -225,10 +226,11 @@ fn plan(found: &Found, improved: &Model, reach: &Reach) -> Option<Experiment> {
     };
     // A threshold of an input is told in the input's unit.
     let input = found.input.as_deref().or_else(|| reaching(improved, &found.equations));
-    let factor =
-        found.input.as_ref().and_then(|n| improved.input(n)).map_or(1.0, |i| improved.inputs[i].unit.factor);
-    let scaled =
-        |name: &str| value(name).map(|v| if matches!(name, "udz" | "usat") { v / factor } else { v });
+    let unit = found.input.as_ref().and_then(|n| improved.input(n)).map(|i| &improved.inputs[i].unit);
+    let scaled = |name: &str| {
+        let threshold = unit.filter(|_| matches!(name, "udz" | "usat"));
+        value(name).map(|v| threshold.map_or(v, |u| u.from_si(v)))
+    };
     let location = location(&found.location, improved);
     Some(suggest::experiment(
         &Subject {
@@ -245,7 +247,7 @@ fn plan(found: &Found, improved: &Model, reach: &Reach) -> Option<Experiment> {
 
 /// The SI unit in which the equations count what is recorded in `unit`.
 fn coherent(unit: &Unit) -> String {
-    if unit.factor == 1.0 {
+    if unit.factor == 1.0 && unit.offset == 0.0 {
         return unit.text.clone();
     }
     // An angle has no dimension, but its unit has a name.
@@ -263,11 +265,12 @@ fn converted(expression: &str, model: &Model) -> Option<String> {
     let name = first.trim_end_matches('\'');
     let state = model.states.iter().find(|s| s.name == name).map(|s| &s.unit);
     let unit = state.or_else(|| model.inputs.iter().find(|i| i.name == name).map(|i| &i.unit))?;
-    if unit.factor == 1.0 || expression.contains(['*', '/', '^']) {
+    if (unit.factor == 1.0 && unit.offset == 0.0) || expression.contains(['*', '/', '^']) {
         return None;
     }
     let primes = (first.len() - name.len()) as u8;
-    let angle = unit.dimension.is_none() && unit.text != "%";
+    let declared = model.units.iter().any(|d| d.symbol == unit.text);
+    let angle = unit.dimension.is_none() && unit.text != "%" && !declared;
     Some(if angle {
         control::per_second("rad", primes)
     } else {
@@ -335,7 +338,7 @@ fn mechanism(found: &Found, improved: &Model, reach: &Reach) -> Mechanism {
 }
 
 fn estimate(e: &Estimated, unit: String) -> Estimate {
-    Estimate { value: e.value, ci95: interval(e.ci95, 1.0), unit }
+    Estimate { value: e.value, ci95: interval(e.ci95, |v| v), unit }
 }
 
 fn location(l: &Located, model: &Model) -> Location {
@@ -361,15 +364,15 @@ fn parameters(d: &Diagnosis) -> Ordered<Parameter> {
         .iter()
         .map(|p| {
             let parameter = &d.nominal.parameters[p.index];
-            let factor = parameter.unit.as_ref().map_or(1.0, |u| u.factor);
+            let told = |si: f64| parameter.unit.as_ref().map_or(si, |u| u.from_si(si));
             let entry = Parameter {
-                nominal: p.nominal / factor,
-                value: p.improved.value / factor,
-                ci95: interval(p.improved.ci95, factor),
+                nominal: told(p.nominal),
+                value: told(p.improved.value),
+                ci95: interval(p.improved.ci95, told),
                 unit: parameter.unit.as_ref().map(|u| u.text.clone()),
                 fixed: parameter.fixed,
-                calibrated: Some(p.calibrated.value / factor),
-                calibrated_ci95: interval(p.calibrated.ci95, factor),
+                calibrated: Some(told(p.calibrated.value)),
+                calibrated_ci95: interval(p.calibrated.ci95, told),
             };
             (parameter.name.clone(), entry)
         })
@@ -588,10 +591,10 @@ fn times(data: &Data, recording: usize) -> Vec<f64> {
     out
 }
 
-fn output(data: &Data, run: &FreeRun, recording: usize, c: usize, factor: f64) -> Vec<f64> {
+fn output(data: &Data, run: &FreeRun, recording: usize, c: usize) -> Vec<f64> {
     joined(data, recording, |i| {
         let n = data.pieces[i].len;
-        run.y[i][c * n..(c + 1) * n].iter().map(|v| v / factor).collect()
+        run.y[i][c * n..(c + 1) * n].iter().map(|v| data.channels[c].from_si(*v)).collect()
     })
 }
 
@@ -615,12 +618,12 @@ fn recordings(
                 .enumerate()
                 .map(|(c, info)| {
                     let [nominal, calibrated, improved] =
-                        runs.map(|run| run.map_or_else(Vec::new, |run| output(data, run, r, c, info.factor)));
+                        runs.map(|run| run.map_or_else(Vec::new, |run| output(data, run, r, c)));
                     page::Channel {
                         name: info.name.clone(),
                         unit: info.unit.clone(),
                         measured: joined(data, r, |i| {
-                            data.pieces[i].measured[c].iter().map(|v| v / info.factor).collect()
+                            data.pieces[i].measured[c].iter().map(|v| info.from_si(*v)).collect()
                         }),
                         nominal,
                         calibrated,
@@ -636,7 +639,7 @@ fn recordings(
                     name: input.name.clone(),
                     unit: input.unit.text.clone(),
                     values: joined(data, r, |i| {
-                        data.pieces[i].inputs[u].iter().map(|v| v / input.unit.factor).collect()
+                        data.pieces[i].inputs[u].iter().map(|v| input.unit.from_si(*v)).collect()
                     }),
                 })
                 .collect(),
@@ -781,8 +784,8 @@ fn state_map(
         let keep = n.div_ceil(4000).max(1);
         for k in (0..n).step_by(keep) {
             let e = piece.measured[channel][k] - judged.y[i][channel * n + k];
-            x.push(coordinates.x[i][k] / state.unit.factor);
-            y.push(coordinates.x[i][n + k] / state.unit.factor);
+            x.push(state.unit.from_si(coordinates.x[i][k]));
+            y.push(state.unit.difference_from_si(coordinates.x[i][n + k]));
             value.push(e.abs() / info.factor);
         }
     }
@@ -914,19 +917,26 @@ mod tests {
     #[test]
     fn numbers_in_si_are_told_where_the_model_has_other_units() {
         let text = r#"
+            [units]
+            doz = 12
             [inputs]
             q = { unit = "L/min" }
             [states]
             phi = { unit = "deg" }
             psi = { unit = "rad" }
             h = { unit = "cm" }
+            Ti = { unit = "degC" }
+            e = { unit = "doz" }
             [parameters]
             J = { value = 1.0, unit = "s^2" }
             A = { value = 1.0, unit = "m^2" }
+            tau = { value = 1.0, unit = "s" }
             [equations]
             a = "J*phi'' + phi = 0"
             b = "J*psi'' + psi = 0"
             c = "A*h' = q"
+            d = "tau*Ti' + Ti = 0"
+            e = "tau*e' + e = 0"
         "#;
         let model = Model::from_toml(text, "m.toml").unwrap();
         let told = |e: &str| converted(e, &model);
@@ -935,6 +945,11 @@ mod tests {
         assert_eq!(told("abs(h')").as_deref(), Some("m/s"));
         assert_eq!(told("q").as_deref(), Some("m^3/s"));
         assert_eq!(told("phi - psi").as_deref(), Some("rad"));
+        assert_eq!(told("Ti").as_deref(), Some("K"));
+        assert_eq!(told("Ti'").as_deref(), Some("K/s"));
+        assert_eq!(told("e").as_deref(), Some("1"));
+        assert_eq!(coherent(&Unit::parse("degC").unwrap()), "K");
+        assert_eq!(coherent(&Unit::parse("count").unwrap()), "count");
         for plain in ["psi'", "t", "z", "h*q"] {
             assert_eq!(told(plain), None, "{plain}");
         }

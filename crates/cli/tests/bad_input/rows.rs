@@ -606,7 +606,18 @@ fn fits() -> Vec<Row> {
             "greybox check raw.csv --map force=sensor_3",
         ),
         Row::new(S, "`--map` against the unit of the file", NOTHING, "greybox check run.csv --map 'x=x [m]'"),
-        Row::new(S, "`--map` with an unknown unit", NOTHING, "greybox check run.csv --map 'x=x [furlong]'"),
+        Row::new(
+            S,
+            "`--map` with a unit that is no unit",
+            NOTHING,
+            "greybox check run.csv --map 'x=x [N//m]'",
+        ),
+        Row::new(
+            S,
+            "`--map` with an unknown unit",
+            |b| b.write("raw.csv", &line(1, "t,f,x")),
+            "greybox diagnose model.toml raw.csv --map 'x=x [furlong]' --out out",
+        ),
         Row::new(S, "`--map` without a name", NOTHING, "greybox check run.csv --map x"),
         Row::new(
             S,
@@ -711,6 +722,28 @@ fn names() -> Vec<Row> {
         altered!(S, "a function with an argument too many", "k*x = f", "k*x*sin(1, 2) = f"),
         altered!(S, "an unknown unit", "unit = \"N/m\"", "unit = \"N/furlong\""),
         altered!(S, "a unit that is no unit", "unit = \"N/m\"", "unit = \"N//m\""),
+        altered!(S, "a built-in unit declared again", "[inputs]", "[units]\nmm = \"2 m\"\n\n[inputs]"),
+        altered!(S, "a declared unit with a digit", "[inputs]", "[units]\nenc12 = \"2 rad\"\n\n[inputs]"),
+        altered!(S, "a multiple of an unknown unit", "[inputs]", "[units]\nrod = \"16.5 foot\"\n\n[inputs]"),
+        altered!(S, "a negative multiple", "[inputs]", "[units]\nrod = \"-5 m\"\n\n[inputs]"),
+        altered!(
+            S,
+            "units that define each other",
+            "[inputs]",
+            "[units]\nrod = \"2 perch\"\nperch = \"0.5 rod\"\n\n[inputs]"
+        ),
+        altered!(
+            S,
+            "a fifth dimension of its own",
+            "[inputs]",
+            "[units]\npa = \"own\"\npb = \"own\"\npc = \"own\"\npd = \"own\"\npe = \"own\"\n\n[inputs]"
+        ),
+        altered!(
+            S,
+            "a list in the place of a definition",
+            "[inputs]",
+            "[units]\nrod = [5, \"m\"]\n\n[inputs]"
+        ),
         altered!(S, "terms whose units differ", "b*x' + k*x", "b*x + k*x"),
         altered!(S, "the sine of a length", "k*x = f", "k*sin(x) = f"),
         altered!(S, "a length as an exponent", "k*x = f", "k*x^x = f"),

@@ -165,7 +165,7 @@ fn equation(
                 powers: term.powers.iter().cloned().collect(),
                 parameter: own.then(|| term.parameter.clone()),
                 value: term.value / factor,
-                ci95: interval(term.ci95, factor),
+                ci95: interval(term.ci95, |v| v / factor),
                 unit: unit.filter(|_| units).map(|u| u.text.clone()),
                 inclusion: term.inclusion,
             }
@@ -207,11 +207,11 @@ fn delay(found: &FoundDelay, model: &Model, units: bool) -> Delay {
     let factor = gain_unit.map_or(1.0, |u| u.factor);
     let mut delay = Delay {
         value: found.value,
-        ci95: interval(found.ci95, 1.0),
+        ci95: interval(found.ci95, |v| v),
         unit: "s".to_owned(),
         bound: found.bound,
         gain: found.gain / factor,
-        gain_ci95: interval(found.gain_ci95, factor),
+        gain_ci95: interval(found.gain_ci95, |v| v / factor),
         gain_unit: gain_unit.filter(|_| units).map(|u| u.text.clone()),
         correlation: found.correlation,
         warning: None,
@@ -267,7 +267,7 @@ pub fn model_toml(found: &Identification) -> String {
         .chain(feedback)
         .filter_map(|(name, ci95)| {
             let factor = unit_of(&found.model, name).map_or(1.0, |u| u.factor);
-            let ci = interval(ci95, factor)?;
+            let ci = interval(ci95, |v| v / factor)?;
             let (low, high) = (format::significant(ci.low, 4), format::significant(ci.high, 4));
             Some((name.to_owned(), format!("95 % interval {low} to {high}")))
         })

@@ -2,13 +2,12 @@
 #![allow(dead_code, missing_docs, unreachable_pub, clippy::unwrap_used)]
 
 use greybox_model::{
-    Dimension, Equation, Hold, Input, Measurement, Model, Parameter, State, System, Unit, parse,
-    parse_equation,
+    Equation, Hold, Input, Measurement, Model, Parameter, State, System, Unit, Units, parse, parse_equation,
 };
 use greybox_simulate::{Environment, Method, Seeds, Signal, Trajectory, integrate};
 
 pub fn unit() -> Unit {
-    Unit { text: String::new(), factor: 1.0, dimension: Dimension::default() }
+    Unit { text: String::new(), ..Unit::dimensionless() }
 }
 
 /// `states`: (name, order); all are measured unless `measured` lists expressions.
@@ -21,6 +20,7 @@ pub fn model(
 ) -> Model {
     Model {
         name: "test".into(),
+        units: Units::default(),
         inputs: inputs
             .iter()
             .map(|n| Input {
