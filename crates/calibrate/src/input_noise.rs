@@ -5,12 +5,15 @@
 //! simulations, with the input and with the input and as much noise again: it matters where they differ by more than the
 //! noise of an output.
 //!
-//! Noise and the fast content of a command look alike. Three things keep commands from being taken for measurements: what
-//! is kept for several samples or consists of noise alone is no noisy measurement; and a simulation that follows the
-//! outputs more closely than the noise would let it proves that the noise is not there.
+//! Noise and the fast content of a command look alike. Four things keep commands from being taken for measurements: an input
+//! with `hold = "zero"` is one; what is kept for several samples or consists of noise alone is no noisy measurement; the
+//! noise of a sensor is as strong at the top of the band as in its middle, while commands fall off; and a simulation that
+//! follows the outputs more closely than the noise would let it proves that the noise is not there.
 
 use greybox_model::{Hold, Input};
-use greybox_recording::noise::{median, noise_sigma, quantisation_step, spectral_floor_sigma};
+use greybox_recording::noise::{
+    has_white_floor, median, noise_sigma, quantisation_step, spectral_floor_sigma,
+};
 use greybox_recording::{Finding, Severity, interpolate};
 use greybox_simulate::{Environment, FINE, Seeds, Signal, integrate};
 
@@ -23,6 +26,8 @@ const MOST: usize = 20_000;
 const DRAWS: u64 = 3;
 /// Noise of more than this share of an input's spread is its signal.
 const SIGNAL: f64 = 0.3;
+/// Fewest samples of a piece whose noise is looked at.
+const LEAST: usize = 256;
 /// So many of its samples are equal to the one before: an input that is kept, or rounded coarsely.
 const KEPT: f64 = 0.4;
 /// A simulation that leaves less than this part of what the noise would make of it shows that there is none. (A fit takes up
@@ -59,7 +64,8 @@ pub fn input_noise(setup: &Setup, parameters: &[f64], run: &FreeRun) -> Vec<Inpu
     for i in 0..inputs.len() {
         // A derivative goes with its channel, where the channel is an input too.
         let base = |j: &usize| inputs[i].derivative_of() == Some(&inputs[*j].channel);
-        if (0..inputs.len()).any(|j| base(&j)) {
+        let commanded = inputs[i].hold == Hold::Zero && inputs[i].derivative_of().is_none();
+        if commanded || (0..inputs.len()).any(|j| base(&j)) {
             continue;
         }
         let levels: Vec<Level> = data.pieces.iter().map(|p| level(p, i, &inputs[i])).collect();
@@ -126,7 +132,7 @@ fn level(piece: &PieceData, input: usize, of: &Input) -> Level {
     let u = &piece.inputs[input];
     let none = Level { sigma: 0.0, rounded: false };
     let spread = crate::spread(u);
-    if u.len() < 64 || spread <= 0.0 || spread.is_nan() {
+    if u.len() < LEAST || spread <= 0.0 || spread.is_nan() {
         return none;
     }
     let moves: Vec<f64> = u.windows(2).map(|w| (w[1] - w[0]).abs()).collect();
@@ -136,7 +142,7 @@ fn level(piece: &PieceData, input: usize, of: &Input) -> Level {
     // Levels that somebody set go by several steps at a time, a rounded motion mostly by one.
     let set = kept && median(&moved) > 1.5 * step;
     let rounding = if set { 0.0 } else { step / 12f64.sqrt() };
-    let noise = if kept { 0.0 } else { noise_sigma(u).min(spectral_floor_sigma(u)) };
+    let noise = if kept || !has_white_floor(u) { 0.0 } else { noise_sigma(u).min(spectral_floor_sigma(u)) };
     let sigma = noise.max(rounding);
     if sigma.is_nan() || sigma > SIGNAL * spread {
         return none;

@@ -15,6 +15,11 @@ const N: usize = 3000;
 
 /// What is told of an oscillator that `truth` drives, where `logged` stands in the column of the force.
 fn told(truth: &[f64], logged: &[f64], noise: f64) -> (Vec<InputNoise>, Vec<Finding>) {
+    told_by(OSCILLATOR, truth, logged, noise)
+}
+
+/// The same by another model than the truth.
+fn told_by(by: &str, truth: &[f64], logged: &[f64], noise: f64) -> (Vec<InputNoise>, Vec<Finding>) {
     let model = Model::from_toml(OSCILLATOR, "m.toml").unwrap();
     let mut y = measure(&model, truth, DT, &[0.0, 0.0]).remove(0);
     for (y, e) in y.iter_mut().zip(normal(77, N)) {
@@ -24,6 +29,7 @@ fn told(truth: &[f64], logged: &[f64], noise: f64) -> (Vec<InputNoise>, Vec<Find
         |name: &str, values: &[f64]| Channel { name: name.into(), unit: None, values: values.to_vec() };
     let time = (0..N).map(|k| k as f64 * DT).collect();
     let run = Recording::from_columns("run.csv", time, vec![channel("f", logged), channel("x", &y)]).unwrap();
+    let model = Model::from_toml(by, "m.toml").unwrap();
     let setup = Setup::new(&model, Arc::new(Data::new(&model, &[run]).unwrap()), vec![]).unwrap();
     let run = setup.training_run(&setup.values(), &setup.data.sigma);
     (input_noise(&setup, &setup.values(), &run), findings(&setup, &setup.values(), &run, true))
@@ -81,8 +87,21 @@ fn commands_are_no_noisy_measurements() {
         ("sweep", (0..N).map(|k| (0.02 * (k as f64 * DT).powi(3)).sin()).collect()),
         ("constant", vec![2.0; N]),
     ];
+    // A spring that is far off leaves too much to prove anything.
+    let off = OSCILLATOR.replace("20.0", "28.0");
     for (what, u) in commands {
         let (found, _) = told(&u, &u, 1e-5);
         assert!(found.is_empty(), "{what}: {found:?}");
+        let (found, _) = told_by(&off, &u, &u, 2e-4);
+        assert!(found.is_empty(), "{what}, wrong model: {found:?}");
     }
+}
+
+#[test]
+fn an_input_that_is_kept_between_its_samples_is_a_command() {
+    let truth = multisine(&[0.3, 0.7, 1.1, 2.3]);
+    let noisy: Vec<f64> = truth.iter().zip(normal(5, N)).map(|(u, e)| u + 0.2 * e).collect();
+    let held = OSCILLATOR.replace("unit = \"N\" }", "unit = \"N\", hold = \"zero\" }");
+    assert!(held != OSCILLATOR && told_by(&held, &truth, &noisy, 2e-4).0.is_empty());
+    assert_eq!(told(&truth, &noisy, 2e-4).0.len(), 1);
 }

@@ -60,6 +60,35 @@ pub fn spectral_floor_sigma(y: &[f64]) -> f64 {
     (median(&lines[3 * lines.len() / 4..lines.len() - 1]) / (std::f64::consts::LN_2 * window_power)).sqrt()
 }
 
+/// White noise has less than so many times the power in the middle of the band that it has at its top.
+const FLAT: f64 = 2.0;
+
+/// Whether a signal ends in a floor of white noise: its spectrum is as strong about 5/8 of the band as at its top (medians
+/// over an eighth of the band each, within a factor of two). A filtered command falls off there. False below 256 samples.
+///
+/// ```
+/// use greybox_recording::noise::has_white_floor;
+/// let mut seed = 1u32;
+/// let mut white = || {
+///     seed = seed.wrapping_mul(1_664_525).wrapping_add(1_013_904_223);
+///     f64::from(seed >> 8) / 16_777_216.0 - 0.5
+/// };
+/// let noise: Vec<f64> = (0..2000).map(|_| white()).collect();
+/// let mut lag = 0.0;
+/// let filtered: Vec<f64> = noise.iter().map(|e| { lag += 0.2 * (e - lag); lag }).collect();
+/// assert!(has_white_floor(&noise) && !has_white_floor(&filtered));
+/// ```
+pub fn has_white_floor(y: &[f64]) -> bool {
+    let full = fill_missing(y);
+    if full.len() < 256 || full[0].is_nan() {
+        return false;
+    }
+    let power = periodogram(&full, 1.0).power;
+    let (lines, eighth) = (power.len() - 1, power.len() / 8);
+    let middle = median(&power[lines * 9 / 16..lines * 11 / 16]);
+    middle < FLAT * median(&power[lines - eighth..lines])
+}
+
 /// Step of a quantised channel: the largest q such that more than 99 % of the first differences are whole
 /// multiples of it (to a tenth of a step). `None` for a channel that is not quantised, that never moves, or
 /// that knows fewer than five levels (a switch or a binary excitation is not a quantised measurement).
