@@ -8,8 +8,8 @@ use std::ops::Range;
 /// Largest departure of a time from the uniform grid, in steps, at which the rows are taken as they are.
 const JITTER_LIMIT: f64 = 0.01;
 
-/// Departure of the mean step from the median one, in steps, from which a log has several rates.
-const SEVERAL_RATES: f64 = 0.1;
+/// Departure of a stretch from a line, in steps, from which a log has several rates.
+const SEVERAL_RATES: f64 = 1.0;
 
 /// The uniform grid behind the times of a recording.
 #[derive(Debug, Clone, PartialEq)]
@@ -64,7 +64,8 @@ pub(crate) fn find(time: &[f64], resolution: f64) -> Grid {
     stretches.push(first..time.len());
     // Of a log with several rates no line is a fit: most rows decide.
     let slope = pooled_slope(time, &stretches);
-    let dt = if (slope / middle - 1.0).abs() > SEVERAL_RATES && !coarse_clock { middle } else { slope };
+    let several = || stretches.iter().any(|rows| departure(time, rows, slope) > SEVERAL_RATES * slope);
+    let dt = if !coarse_clock && several() { middle } else { slope };
     Grid { dt: tidy(dt, time.len()), stretches, rounding }
 }
 

@@ -74,8 +74,10 @@ const FLAT: f64 = 2.0;
 ///     f64::from(seed >> 8) / 16_777_216.0 - 0.5
 /// };
 /// let noise: Vec<f64> = (0..2000).map(|_| white()).collect();
-/// let mut lag = 0.0;
-/// let filtered: Vec<f64> = noise.iter().map(|e| { lag += 0.2 * (e - lag); lag }).collect();
+/// // Four lags one after the other.
+/// let mut lags = [0.0; 4];
+/// let mut filter = |e: &f64| lags.iter_mut().fold(*e, |u, lag| { *lag += 0.2 * (u - *lag); *lag });
+/// let filtered: Vec<f64> = noise.iter().map(&mut filter).collect();
 /// assert!(has_white_floor(&noise) && !has_white_floor(&filtered));
 /// ```
 pub fn has_white_floor(y: &[f64]) -> bool {
