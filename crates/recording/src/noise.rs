@@ -74,10 +74,7 @@ const FLAT: f64 = 2.0;
 ///     f64::from(seed >> 8) / 16_777_216.0 - 0.5
 /// };
 /// let noise: Vec<f64> = (0..2000).map(|_| white()).collect();
-/// // Four lags one after the other.
-/// let mut lags = [0.0; 4];
-/// let mut filter = |e: &f64| lags.iter_mut().fold(*e, |u, lag| { *lag += 0.2 * (u - *lag); *lag });
-/// let filtered: Vec<f64> = noise.iter().map(&mut filter).collect();
+/// let filtered: Vec<f64> = noise.windows(3).map(|w| 0.25 * (w[0] + 2.0 * w[1] + w[2])).collect();
 /// assert!(has_white_floor(&noise) && !has_white_floor(&filtered));
 /// ```
 pub fn has_white_floor(y: &[f64]) -> bool {
