@@ -63,7 +63,7 @@ pub fn spectral_floor_sigma(y: &[f64]) -> f64 {
 /// White noise has less than so many times the power in the middle of the band that it has at its top.
 const FLAT: f64 = 2.0;
 
-/// Whether a signal ends in a floor of white noise: its spectrum is as strong about 5/8 of the band as at its top (medians
+/// Whether a signal ends in a floor of white noise: its spectrum is as strong at 3/8 of the band as at its top (medians
 /// over an eighth of the band each, within a factor of two). A filtered command falls off there. False below 256 samples.
 ///
 /// ```
@@ -84,7 +84,7 @@ pub fn has_white_floor(y: &[f64]) -> bool {
     }
     let power = periodogram(&full, 1.0).power;
     let (lines, eighth) = (power.len() - 1, power.len() / 8);
-    let middle = median(&power[lines * 9 / 16..lines * 11 / 16]);
+    let middle = median(&power[lines * 5 / 16..lines * 7 / 16]);
     middle < FLAT * median(&power[lines - eighth..lines])
 }
 
