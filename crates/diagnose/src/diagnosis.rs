@@ -826,8 +826,8 @@ const HORIZON: Limits = Limits { iterations: 30, tolerance: 1e-6 };
 const FURTHER: Limits = Limits { iterations: 100, tolerance: 1e-6 };
 
 /// Takes mechanisms away until what is left can be handed back: every one is determined, no inertia is negative, and the
-/// model is no worse than the calibrated one in training. Where it leaves more than noise, or where no round believed it
-/// (`named` false), it also has to predict data left out of its fit better than chance. Nothing is left but the calibrated
+/// model is no worse than the calibrated one in training. Where it leaves more than noise it also predicts data left out of
+/// its fit no worse, and where no round believed it (`named` false) better than chance. Nothing is left but the calibrated
 /// model where that takes all mechanisms.
 fn defend(
     search: &Search<'_>,
@@ -859,7 +859,7 @@ fn defend(
                 return false; // the likelihood has spoken
             }
             let gain = Gain::of(&simpler, &errors(&polished, &scale));
-            !gain.is_beyond_chance()
+            !(if named { gain.is_safe() } else { gain.is_beyond_chance() })
         };
         let fails = undetermined.is_some()
             || worse

@@ -16,10 +16,11 @@ use crate::library::Mechanism;
 use crate::place::{Place, places};
 use crate::screen::{Pair, Scored, first_states, first_values, inner_scales, screen, screen_pairs};
 use crate::uncertainty::Uncertainty;
+use crate::validate::{Gain, errors};
 use crate::{Observer, Stage};
 
-/// Number of segments of the first level, where nothing else decides.
-const SEGMENTS: usize = 60;
+/// Number of segments of the first and last level, where nothing else decides.
+const SEGMENTS: (usize, usize) = (60, 4);
 /// Longest segments of the first level, in periods of the fastest channel: beyond, a wrong stiffness turns
 /// the phase of the response round, and the score test's first order means nothing.
 const PERIODS: f64 = 3.0;
@@ -210,7 +211,12 @@ pub struct Search<'a> {
     lengths: Vec<usize>,
 }
 
-/// Lengths of the segments: from a few periods of the fastest channel, by factors of four, to whole pieces.
+/// Samples of the longest segments that are looked at: whole pieces, as far as the search goes.
+fn whole(setup: &Setup) -> usize {
+    setup.data.lengths().into_iter().max().unwrap_or(0).clamp(SHORTEST, MOST_SAMPLES)
+}
+
+/// Lengths of the segments: from a few periods of the fastest channel, by factors of four, to a quarter of the data.
 fn lengths(setup: &Setup) -> Vec<usize> {
     let total: usize = setup.data.lengths().iter().sum();
     let mut period = f64::INFINITY;
@@ -223,9 +229,8 @@ fn lengths(setup: &Setup) -> Vec<usize> {
             }
         }
     }
-    let piece = setup.data.lengths().into_iter().max().unwrap_or(0);
-    let longest = piece.clamp(SHORTEST, MOST_SAMPLES);
-    let first = ((PERIODS * period) as usize).min(total / SEGMENTS).max(SHORTEST).min(longest);
+    let longest = (total.min(MOST_SAMPLES) / SEGMENTS.1).max(SHORTEST);
+    let first = ((PERIODS * period) as usize).min(total / SEGMENTS.0).max(SHORTEST).min(longest);
     let mut out = vec![first];
     while let Some(&last) = out.last()
         && last < longest
@@ -880,6 +885,7 @@ impl<'a> Search<'a> {
             }
             self.level(&mut calibrated, &mut state);
         }
+        self.go_on_to_the_end(&mut calibrated, &mut state);
         self.anneal(&mut calibrated, &mut state);
         let mut settled = false;
         if self.is_coloured(&state, 0.6) && state.noise_is_coloured() {
@@ -992,20 +998,52 @@ impl<'a> Search<'a> {
             .any(|(p, &n)| (0..n).any(|k| sign(&before, p, k) * sign(&after, p, k) < 0.0))
     }
 
+    /// Goes on with whole pieces where something is left over that is not noise: what acts slowly is hardly seen on a
+    /// quarter of the data. Long free runs of a model that is wrong in small ways also bend it: what was found there counts
+    /// where it predicts data left out of its fit better.
+    fn go_on_to_the_end(&self, calibrated: &mut Fitted, state: &mut State) {
+        let length = whole(&self.nominal);
+        if self.lengths.last().is_some_and(|&last| 2 * last >= length)
+            || !self.leaves_more(state)
+            || self.is_spent()
+        {
+            return;
+        }
+        let before = (calibrated.clone(), state.clone());
+        self.lengthen(calibrated, state, length);
+        self.level(calibrated, state);
+        if !self.predicts_better(&before.1, state) {
+            (*calibrated, *state) = before;
+        }
+    }
+
+    /// Whether more is left over than a single mechanism leaves of noise.
+    fn leaves_more(&self, state: &State) -> bool {
+        let current = &state.current;
+        current.parts.len() > 1 || !current.leaves_white_noise(&state.scale) && state.misfit() >= STUCK
+    }
+
+    /// Whether what another search found predicts data left out of its fit better.
+    fn predicts_better(&self, standing: &State, found: &State) -> bool {
+        let (criterion, reach) =
+            standing.current.setup.criterion(&standing.current.fit.point.parameters, &standing.scale);
+        let error = |s: &State| errors(&s.current, &s.scale, criterion, reach);
+        Gain::of(&error(standing), &error(found)).mean > 0.0
+    }
+
     /// Searches once more from the calibrated model on the longest segments alone. What acts slowly (a light damping) is
     /// hardly seen on short ones, where the free starts of the segments absorb it, and what was taken for it there leaves
     /// more to be explained: the result of fewer mechanisms, or of more evidence, counts. Not where a single mechanism
     /// leaves nothing but white noise.
     fn search_long(&self, calibrated: &Fitted, state: &mut State) {
-        let single = state.current.parts.len() <= 1;
-        if (single && (state.current.leaves_white_noise(&state.scale) || state.misfit() < STUCK))
-            || self.lengths.len() < 2
+        let length = whole(&self.nominal);
+        if !self.leaves_more(state)
+            || self.lengths.last().is_some_and(|&last| last >= length)
             || self.is_spent()
         {
             return;
         }
         let plain = Setup { noise: None, ..calibrated.setup.clone() };
-        let length = self.lengths.last().copied().unwrap_or(SHORTEST);
         let level = self.nominal.windows(length, MOST_SAMPLES);
         let mut baseline =
             self.relevel(&Fitted { setup: plain, ..calibrated.clone() }, level, &state.scale, 20);

@@ -1,7 +1,7 @@
 //! Cross-validation: how well a model simulates what it was not fitted to.
 //!
-//! Recordings are left out one by one. A single one is cut into contiguous blocks, and each but the first is predicted from
-//! those before it: what is asked of a model is the next experiment, and blocks on both sides of a gap tell more of it than
+//! Recordings are left out one by one. The second half of a single one is cut into contiguous blocks, and each is predicted
+//! from all that was before it (less than half tells little of a model): what is asked of a model is the next experiment, and blocks on both sides of a gap tell more of it than
 //! any past does (rolling origin; Hyndman and Athanasopoulos, *Forecasting: Principles and Practice*, section 5.10). The
 //! parameters are refitted without the fold, which is then simulated from a state estimated on its first quarter (Stone, *Cross-validatory choice and
 //! assessment of statistical predictions*, J. R. Stat. Soc. B 36, 1974; contiguous folds since neighbouring samples tell
@@ -15,7 +15,7 @@ use statrs::distribution::{ContinuousCDF, StudentsT};
 
 use crate::search::Fitted;
 
-/// Most folds, and how many a single recording is cut into.
+/// Most folds of several recordings; a single one has one less.
 const FOLDS: usize = 5;
 /// Shortest stretch that is fitted, samples.
 const SHORTEST: usize = 8;
@@ -38,9 +38,12 @@ pub(crate) fn folds(data: &Data) -> Vec<Fold> {
         return folds;
     }
     let total = data.samples();
-    (1..FOLDS)
+    let first = total / 2;
+    let blocks = ((total - first) / SHORTEST).clamp(1, FOLDS - 1);
+    (0..blocks)
         .map(|k| {
-            let wanted = k * total / FOLDS..(k + 1) * total / FOLDS;
+            let at = |k: usize| first + k * (total - first) / blocks;
+            let wanted = at(k)..at(k + 1);
             let mut before = 0;
             let mut fold = Fold::new();
             for (i, piece) in data.pieces.iter().enumerate() {
