@@ -23,7 +23,7 @@ use crate::search::{
 use crate::surface::{Surface, Variable, held_out};
 use crate::twins::{Twin, twins};
 use crate::uncertainty::Uncertainty;
-use crate::validate::Gain;
+use crate::validate::{CLEAR, Gain};
 use crate::{Observer, Stage};
 
 /// Share of each recording held out when no recording is.
@@ -853,7 +853,9 @@ fn defend(
         let undetermined =
             search.undetermined(&polished.origin, &Uncertainty::of(&polished.origin, &scale).widths());
         let misfit = judge.misfit(&fitted.setup, &fitted.fit.point.parameters, &scale);
-        let worse = misfit.total_cmp(&baseline.misfit).is_gt();
+        // Far above the noise, what hardly changes the simulation explains nothing.
+        let counts = if fitted.misfit(&found.scale) > MISFIT { CLEAR } else { 0.0 };
+        let worse = (misfit + counts).total_cmp(&baseline.misfit).is_gt();
         let unsafe_elsewhere = || {
             if named && fitted.misfit(&found.scale) <= MISFIT {
                 return false; // the likelihood has spoken

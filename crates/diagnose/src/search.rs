@@ -885,7 +885,6 @@ impl<'a> Search<'a> {
             }
             self.level(&mut calibrated, &mut state);
         }
-        self.go_on_to_the_end(&mut calibrated, &mut state);
         self.anneal(&mut calibrated, &mut state);
         let mut settled = false;
         if self.is_coloured(&state, 0.6) && state.noise_is_coloured() {
@@ -911,8 +910,13 @@ impl<'a> Search<'a> {
         if !settled {
             self.think_again(&mut calibrated, &mut state);
         }
+        // An answer that stands is not less complete for what was tried beyond it.
+        let (mut limited, standing) = (self.limited.load(Ordering::Relaxed), state.candidates());
+        self.go_on_to_the_end(&mut calibrated, &mut state);
         self.search_long(&calibrated, &mut state);
-        let limited = self.limited.load(Ordering::Relaxed);
+        if state.candidates() != standing {
+            limited = self.limited.load(Ordering::Relaxed);
+        }
         // What was searched through windows is fitted to all data in the end.
         let length = self.lengths.last().copied().unwrap_or(SHORTEST);
         let whole = self.nominal.windows(length, usize::MAX);
@@ -1012,6 +1016,8 @@ impl<'a> Search<'a> {
         let before = (calibrated.clone(), state.clone());
         self.lengthen(calibrated, state, length);
         self.level(calibrated, state);
+        self.anneal(calibrated, state);
+        self.think_again(calibrated, state);
         if !self.predicts_better(&before.1, state) {
             (*calibrated, *state) = before;
         }
@@ -1023,12 +1029,12 @@ impl<'a> Search<'a> {
         current.parts.len() > 1 || !current.leaves_white_noise(&state.scale) && state.misfit() >= STUCK
     }
 
-    /// Whether what another search found predicts data left out of its fit better.
+    /// Whether what another search found predicts data left out of its fit better, beyond chance.
     fn predicts_better(&self, standing: &State, found: &State) -> bool {
         let (criterion, reach) =
             standing.current.setup.criterion(&standing.current.fit.point.parameters, &standing.scale);
         let error = |s: &State| errors(&s.current, &s.scale, criterion, reach);
-        Gain::of(&error(standing), &error(found)).mean > 0.0
+        Gain::of(&error(standing), &error(found)).is_beyond_chance()
     }
 
     /// Searches once more from the calibrated model on the longest segments alone. What acts slowly (a light damping) is
@@ -2165,12 +2171,13 @@ pub fn coloured_channels(f: &Fitted, scale: &[f64]) -> Vec<bool> {
             a.order() > 0
                 && innovation > CLEAR * sigma
                 && rms < SLOWEST * innovation
-                && is_long(*count, rms / innovation)
+                && (*count < MEMORY_SAMPLES || is_long(*count, rms / innovation))
         })
         .collect()
 }
 
-/// Whether so many samples tell coloured noise from what a model leaves over: they hold [`INDEPENDENT`] correlation times.
+/// Whether so many samples tell coloured noise from what a model leaves over (of fewer than [`MEMORY_SAMPLES`] nothing tells
+/// a misfit either, and they are not asked): they hold [`INDEPENDENT`] correlation times.
 /// Noise with a pole ρ, whose RMS is 1/√(1 − ρ²) of its innovations, remembers (1 + ρ)/(1 − ρ) samples (Bartlett): for a
 /// long memory 4 times the square of that ratio.
 fn is_long(samples: usize, ratio: f64) -> bool {

@@ -191,7 +191,7 @@ impl Gain {
 /// Largest ratio of errors on a fold that a model may lose.
 const WORST: f64 = 1.25;
 /// Gain in ln(error) that counts.
-const CLEAR: f64 = 0.05;
+pub(crate) const CLEAR: f64 = 0.05;
 /// Probability of a gain by chance alone that is taken for none.
 const CHANCE: f64 = 0.05;
 
