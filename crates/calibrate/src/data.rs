@@ -180,11 +180,6 @@ impl Data {
         let mut pieces = Vec::new();
         let mut sigmas: Vec<Vec<f64>> = vec![Vec::new(); model.measurements.len()];
         for (index, recording) in recordings.iter().enumerate() {
-            let find =
-                |channel: &str, role: String, name: Option<&str>, unit: &Unit, measured: Option<&Expr>| {
-                    let recorded = |header: Option<&str>| recorded_unit(model, header, unit, measured);
-                    find_channel(recording, channel, role, name, unit, &recorded)
-                };
             let mut inputs = Vec::new();
             for input in &model.inputs {
                 inputs.push(find_input(model, input, recording)?);
@@ -192,9 +187,14 @@ impl Data {
             let mut measured = Vec::new();
             for m in &model.measurements {
                 let state = model.states.iter().find(|s| s.channel.as_ref() == Some(&m.channel));
-                let name = state.map(|s| s.name.as_str());
-                let role = format!("measurement `{}`", m.expr);
-                measured.push(find(&m.channel, role, name, &m.unit, Some(&m.expr))?);
+                let wanted = Wanted {
+                    channel: &m.channel,
+                    role: format!("measurement `{}`", m.expr),
+                    name: state.map(|s| s.name.as_str()),
+                    unit: &m.unit,
+                    measured: Some(&m.expr),
+                };
+                measured.push(find_channel(model, recording, wanted)?);
             }
             let scaled = |(channel, unit): &(usize, Unit), piece: &greybox_recording::Piece| -> Vec<f64> {
                 piece.columns[*channel].iter().map(|v| unit.to_si(*v)).collect()
@@ -219,7 +219,7 @@ impl Data {
                         .iter()
                         .zip(&model.inputs)
                         .map(|(found, input)| {
-                            let values = scaled(&(found.column, found.unit.clone()), piece);
+                            let values = scaled(&found.column, piece);
                             match found.differentiated {
                                 true => derivative(&filled(&values, Hold::Linear), piece.dt, input.hold),
                                 false => filled(&values, input.hold),
@@ -377,9 +377,8 @@ fn mend(channel: &str, name: Option<(&str, &str)>, recording: &Recording) -> Str
 
 /// Where an input is found.
 struct FoundInput {
-    column: usize,
-    /// Before it is differentiated.
-    unit: Unit,
+    /// Column and its unit, before it is differentiated.
+    column: (usize, Unit),
     differentiated: bool,
 }
 
@@ -388,10 +387,9 @@ fn find_input(model: &Model, input: &Input, recording: &Recording) -> Result<Fou
     let role = format!("input `{}`", input.name);
     let base = input.derivative_of().filter(|_| recording.channel(&input.channel).is_none());
     let Some(base) = base else {
-        let recorded = |header: Option<&str>| recorded_unit(model, header, &input.unit, None);
-        let (column, unit) =
-            find_channel(recording, &input.channel, role, Some(&input.name), &input.unit, &recorded)?;
-        return Ok(FoundInput { column, unit, differentiated: false });
+        let (channel, name) = (&input.channel, Some(&*input.name));
+        let wanted = Wanted { channel, role, name, unit: &input.unit, measured: None };
+        return Ok(FoundInput { column: find_channel(model, recording, wanted)?, differentiated: false });
     };
     let refused = |reason: &str, mend: String| DataError::Derivative {
         file: recording.name.clone(),
@@ -438,16 +436,15 @@ fn find_input(model: &Model, input: &Input, recording: &Recording) -> Result<Fou
     }
     unit.dimension = input.unit.dimension * Dimension::TIME;
     let role = format!("{role} (its derivative)");
-    let recorded = |header: Option<&str>| recorded_unit(model, header, &unit, None);
-    let found = find_channel(recording, base, role, None, &unit, &recorded);
-    let (column, unit) = found.map_err(|error| match error {
+    let wanted = Wanted { channel: base, role, name: None, unit: &unit, measured: None };
+    let column = find_channel(model, recording, wanted).map_err(|error| match error {
         DataError::MissingChannel { file, channel, role, available, .. } => {
             let mend = mend(base, Some((&input.name, "'")), recording);
             DataError::MissingChannel { file, channel, role, available, mend }
         }
         other => other,
     })?;
-    Ok(FoundInput { column, unit, differentiated: true })
+    Ok(FoundInput { column, differentiated: true })
 }
 
 /// Samples of the derivative of a signal without missing samples. What stays constant between samples is the slope of the
@@ -480,16 +477,25 @@ pub(crate) fn derivative(u: &[f64], dt: f64, hold: Hold) -> Vec<f64> {
     }
 }
 
-/// Column and unit of a channel. `name` is that of the input or the state which it feeds alone, `recorded` the unit
-/// of a header.
-fn find_channel(
-    recording: &Recording,
-    channel: &str,
+/// What is looked for in a recording.
+struct Wanted<'a> {
+    channel: &'a str,
+    /// What it is for, in words.
     role: String,
-    name: Option<&str>,
-    unit: &Unit,
-    recorded: &dyn Fn(Option<&str>) -> Result<Unit, UnitError>,
+    /// The input or the state which it feeds alone.
+    name: Option<&'a str>,
+    unit: &'a Unit,
+    /// The expression that it measures.
+    measured: Option<&'a Expr>,
+}
+
+/// Column and unit of a channel.
+fn find_channel(
+    model: &Model,
+    recording: &Recording,
+    wanted: Wanted<'_>,
 ) -> Result<(usize, Unit), DataError> {
+    let Wanted { channel, role, name, unit, measured } = wanted;
     let file = recording.name.clone();
     let Some(index) = recording.channels.iter().position(|c| c.name == channel) else {
         let available: Vec<String> = recording.channels.iter().map(|c| format!("`{}`", c.name)).collect();
@@ -505,10 +511,8 @@ fn find_channel(
     if found.values.iter().all(|v| v.is_nan()) {
         return Err(DataError::EmptyChannel { file, channel: channel.to_string() });
     }
-    let recorded = recorded(found.unit.as_deref()).map_err(|e| DataError::UnreadableUnit {
-        file: file.clone(),
-        channel: channel.to_string(),
-        message: e.to_string(),
+    let recorded = recorded_unit(model, found.unit.as_deref(), unit, measured).map_err(|e| {
+        DataError::UnreadableUnit { file: file.clone(), channel: channel.to_string(), message: e.to_string() }
     })?;
     if !recorded.dimension.same(&unit.dimension) {
         return Err(DataError::Unit {

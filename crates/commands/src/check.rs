@@ -6,6 +6,7 @@ use std::path::Path;
 use greybox_calibrate::Data;
 use greybox_model::{Model, Unit};
 use greybox_recording::{Finding, Recording, Severity, health, told};
+use greybox_report::convert::health_finding;
 use greybox_report::notes::{Note, grouped};
 use greybox_report::{contract, format};
 use serde::Serialize;
@@ -199,18 +200,7 @@ fn describe(
 impl Health {
     /// The findings as those of a study of several recordings.
     fn findings(&self) -> impl Iterator<Item = contract::Finding> {
-        self.findings.iter().map(|f| contract::Finding {
-            severity: match f.severity {
-                Severity::Info => contract::Severity::Info,
-                Severity::Warning => contract::Severity::Warning,
-                Severity::Problem => contract::Severity::Error,
-            },
-            code: f.code.to_owned(),
-            recording: Some(self.file.clone()),
-            channel: f.channel.clone(),
-            message: f.message.clone(),
-            mend: f.mend.clone(),
-        })
+        self.findings.iter().map(|f| health_finding(f.clone(), Some(self.file.clone())))
     }
 }
 

@@ -23,7 +23,7 @@ use crate::search::{
 use crate::surface::{Surface, Variable, held_out};
 use crate::twins::{Twin, twins};
 use crate::uncertainty::Uncertainty;
-use crate::validate::{CLEAR, Gain};
+use crate::validate::Gain;
 use crate::{Observer, Stage};
 
 /// Share of each recording held out when no recording is.
@@ -784,12 +784,25 @@ impl Judge {
     }
 
     fn misfit(&self, setup: &Setup, parameters: &[f64], scale: &[f64]) -> f64 {
+        self.criterion.misfit(&self.scores(setup, parameters, scale))
+    }
+
+    fn scores(&self, setup: &Setup, parameters: &[f64], scale: &[f64]) -> Vec<Score> {
         let run = setup.training_run(parameters, scale);
         let window = match self.criterion {
             Criterion::FreeRun => f64::INFINITY,
             Criterion::Windowed => self.window,
         };
-        self.criterion.misfit(&setup.scores(&run, parameters, window, None))
+        setup.scores(&run, parameters, window, None)
+    }
+
+    /// Largest error over the noise of its channel.
+    fn over_noise(&self, scores: &[Score], sigma: &[f64]) -> f64 {
+        let rms = |s: &Score| match self.criterion {
+            Criterion::FreeRun => s.rmse,
+            Criterion::Windowed => s.rmse_windowed,
+        };
+        scores.iter().zip(sigma).map(|(s, sigma)| rms(s) / sigma).fold(0.0, f64::max)
     }
 }
 
@@ -850,28 +863,27 @@ fn defend(
             return baseline.polished.clone();
         }
         let scale = residual_scale(fitted, &found.scale);
-        let undetermined =
-            search.undetermined(&polished.origin, &Uncertainty::of(&polished.origin, &scale).widths());
-        let misfit = judge.misfit(&fitted.setup, &fitted.fit.point.parameters, &scale);
-        // Far above the noise, what hardly changes the simulation explains nothing.
-        let counts = if fitted.misfit(&found.scale) > MISFIT { CLEAR } else { 0.0 };
-        let worse = (misfit + counts).total_cmp(&baseline.misfit).is_gt();
+        let widths = Uncertainty::of(&polished.origin, &scale).widths();
+        let scores = judge.scores(&fitted.setup, &fitted.fit.point.parameters, &scale);
+        let worse = judge.criterion.misfit(&scores).total_cmp(&baseline.misfit).is_gt();
         let unsafe_elsewhere = || {
-            if named && fitted.misfit(&found.scale) <= MISFIT {
+            // (Of the simulation that is handed back: the free starts of short segments absorb what a model leaves.)
+            if named && judge.over_noise(&scores, &fitted.setup.data.sigma) <= MISFIT {
                 return false; // the likelihood has spoken
             }
             let gain = Gain::of(&simpler, &errors(&polished, &scale));
             !(if named { gain.is_safe() } else { gain.is_beyond_chance() })
         };
-        let fails = undetermined.is_some()
+        let fails = search.undetermined(&polished.origin, &widths).is_some()
             || worse
             || search.has_negative_inertia(fitted, &found.scale)
             || unsafe_elsewhere();
         if !fails {
             return polished;
         }
-        let parts: Vec<usize> = undetermined.map_or_else(|| (0..fitted.parts.len()).collect(), |i| vec![i]);
-        let smaller = parts
+        // Without the part that is missed least. (That would be one that is not determined, unless it is so only beside
+        // another that does the same.)
+        let smaller = (0..fitted.parts.len())
             .into_par_iter()
             .filter_map(|i| {
                 let smaller = search.smaller(&found.improved, i, &found.scale)?;

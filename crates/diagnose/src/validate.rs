@@ -1,11 +1,11 @@
 //! Cross-validation: how well a model simulates what it was not fitted to.
 //!
 //! Recordings are left out one by one. The second half of a single one is cut into contiguous blocks, and each is predicted
-//! from all that was before it (less than half tells little of a model): what is asked of a model is the next experiment, and blocks on both sides of a gap tell more of it than
-//! any past does (rolling origin; Hyndman and Athanasopoulos, *Forecasting: Principles and Practice*, section 5.10). The
-//! parameters are refitted without the fold, which is then simulated from a state estimated on its first quarter (Stone, *Cross-validatory choice and
-//! assessment of statistical predictions*, J. R. Stat. Soc. B 36, 1974; contiguous folds since neighbouring samples tell
-//! of each other).
+//! from all that was before it: less than half a recording says little of a model, what is asked of a model is the next
+//! experiment, and blocks on both sides of a gap tell more of it than any past does (rolling origin; Hyndman and
+//! Athanasopoulos, *Forecasting: Principles and Practice*, section 5.10). The parameters are refitted without the fold, which
+//! is then simulated from a state estimated on its first quarter (Stone, *Cross-validatory choice and assessment of
+//! statistical predictions*, J. R. Stat. Soc. B 36, 1974; contiguous folds since neighbouring samples tell of each other).
 
 use std::ops::Range;
 
@@ -191,7 +191,7 @@ impl Gain {
 /// Largest ratio of errors on a fold that a model may lose.
 const WORST: f64 = 1.25;
 /// Gain in ln(error) that counts.
-pub(crate) const CLEAR: f64 = 0.05;
+const CLEAR: f64 = 0.05;
 /// Probability of a gain by chance alone that is taken for none.
 const CHANCE: f64 = 0.05;
 
