@@ -273,7 +273,7 @@ fn a_noisy_input_is_told_and_a_command_is_not() {
     let told = |severity: &str| ("input_noise".to_owned(), "f".to_owned(), severity.to_owned());
     assert!(check("noisy.csv").contains(&told("info")));
     assert!(!check("run.csv").iter().any(|(code, ..)| code == "input_noise"));
-    for command in [&["calibrate"] as &[&str]] {
+    for command in [&["calibrate"] as &[&str], &["diagnose", "--work", "1"]] {
         let findings = |file: &str| {
             let outcome = bench.greybox(&[command, &["model.toml", file, "--out", "out"]].concat());
             assert_eq!(outcome.code, 0, "{}", outcome.stderr);

@@ -1,12 +1,12 @@
 //! A calibration as files and words.
 
-use greybox_calibrate::{Data, Score, Setup, input_noise};
+use greybox_calibrate::{Score, Setup, input_noise};
 use greybox_diagnose::Calibration;
 use greybox_diagnose::diagnosis::ParameterChange;
 use greybox_model::{Model, WriteOptions};
 use greybox_recording::Recording;
 use greybox_report::contract::{self, FitSet, Interval, ModelId, Ordered, Parameter, Producer};
-use greybox_report::convert::{calibrated_recordings, health_finding, health_findings};
+use greybox_report::convert::{calibrated_recordings, health_finding, health_findings, scores};
 use greybox_report::page;
 use serde::Serialize;
 
@@ -158,18 +158,6 @@ fn not_converged() -> contract::Finding {
             .to_owned(),
         mend: Some("calibrate the model that was written once more, or fix parameters that the recordings do not show".to_owned()),
     }
-}
-
-/// Scores by channel, in the units of the model.
-fn scores(data: &Data, scores: &[Score]) -> Ordered<contract::Score> {
-    let finite = |v: f64| Some(v).filter(|v| v.is_finite());
-    let score = |s: &Score, factor: f64| contract::Score {
-        nrmse: s.nrmse,
-        rmse: finite(s.rmse / factor),
-        nrmse_windowed: finite(s.nrmse_windowed),
-        rmse_windowed: finite(s.rmse_windowed / factor),
-    };
-    data.channels.iter().zip(scores).map(|(c, s)| (c.name.clone(), score(s, c.factor))).collect()
 }
 
 /// The parameters before and after, in the units of the model file.

@@ -379,16 +379,18 @@ fn parameters(d: &Diagnosis) -> Ordered<Parameter> {
         .collect()
 }
 
-fn scores(data: &Data, scores: &[greybox_calibrate::Score]) -> Ordered<Score> {
+/// Scores by channel, in the units of the model; what a simulation that diverges has no value for is left out.
+pub fn scores(data: &Data, scores: &[greybox_calibrate::Score]) -> Ordered<Score> {
+    let finite = |v: f64| Some(v).filter(|v| v.is_finite());
     data.channels
         .iter()
         .zip(scores)
         .map(|(c, s)| {
             let score = Score {
                 nrmse: s.nrmse,
-                rmse: Some(s.rmse / c.factor),
-                nrmse_windowed: Some(s.nrmse_windowed),
-                rmse_windowed: Some(s.rmse_windowed / c.factor),
+                rmse: finite(s.rmse / c.factor),
+                nrmse_windowed: finite(s.nrmse_windowed),
+                rmse_windowed: finite(s.rmse_windowed / c.factor),
             };
             (c.name.clone(), score)
         })
@@ -479,8 +481,12 @@ fn findings(d: &Diagnosis, sources: &Sources<'_>) -> Vec<Finding> {
             mend: Some("record the channel at rest, or sample it faster".to_string()),
         });
     }
-    if let Ok(setup) = Setup::new(&d.improved, d.train.data.clone(), Vec::new()) {
-        let run = &d.train.improved.run;
+    // Of what is believed: terms that stand in for something else may fit the noise.
+    let (model, run) = match d.basis {
+        Ground::Named => (&d.improved, &d.train.improved.run),
+        Ground::Proposed | Ground::Calibrated => (&d.calibrated, &d.train.calibrated.run),
+    };
+    if let Ok(setup) = Setup::new(model, d.train.data.clone(), Vec::new()) {
         let found = input_noise::findings(&setup, &setup.values(), run, true);
         out.extend(found.into_iter().map(|f| health_finding(f, None)));
     }
