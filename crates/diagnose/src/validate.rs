@@ -198,6 +198,39 @@ const CHANCE: f64 = 0.05;
 #[cfg(test)]
 mod tests {
     use super::*;
+    use greybox_model::Model;
+    use greybox_recording::{Channel, Recording};
+
+    /// Recordings of so many samples each.
+    fn data(samples: &[usize]) -> Data {
+        let model = "[states]\nx = {}\n[parameters]\na = { value = 1, unit = \"1/s\" }\n[equations]\nlag = \"x' + a*x = 0\"\n";
+        let recording = |(i, &n): (usize, &usize)| {
+            let values = (0..n).map(|k| (0.1 * k as f64).sin()).collect();
+            let channel = Channel { name: "x".into(), unit: None, values };
+            let time = (0..n).map(|k| 0.1 * k as f64).collect();
+            Recording::from_columns(&format!("{i}.csv"), time, vec![channel]).unwrap()
+        };
+        let recordings: Vec<Recording> = samples.iter().enumerate().map(recording).collect();
+        Data::new(&Model::from_toml(model, "lag.toml").unwrap(), &recordings).unwrap()
+    }
+
+    #[test]
+    fn the_origin_of_a_single_recording_rolls_over_its_second_half() {
+        assert_eq!(
+            folds(&data(&[400])),
+            [[(0, 200..250)], [(0, 250..300)], [(0, 300..350)], [(0, 350..400)]]
+        );
+        // Of a short one in as many blocks as have samples enough to be simulated.
+        assert_eq!(folds(&data(&[42])), [[(0, 21..31)], [(0, 31..42)]]);
+    }
+
+    #[test]
+    fn several_recordings_are_left_out_one_by_one() {
+        assert_eq!(folds(&data(&[30, 40, 50])), [[(0, 0..30)], [(1, 0..40)], [(2, 0..50)]]);
+        let many = folds(&data(&[30; 7]));
+        assert_eq!(many.len(), FOLDS);
+        assert_eq!(many[1], [(1, 0..30), (6, 0..30)]);
+    }
 
     /// Four folds of a room's temperature gained by a constant alone, and not in another month: gains that are positive
     /// in three of four are chance.
