@@ -99,19 +99,8 @@ pub enum DataError {
 pub struct ChannelInfo {
     /// Name in the recordings.
     pub name: String,
-    /// Unit as the model writes it.
-    pub unit: String,
-    /// SI value of a difference of one of that unit.
-    pub factor: f64,
-    /// SI value of zero of that unit, see [`Unit::offset`].
-    pub offset: f64,
-}
-
-impl ChannelInfo {
-    /// The value in the channel's unit of an SI value.
-    pub fn from_si(&self, si: f64) -> f64 {
-        if self.offset == 0.0 { si / self.factor } else { (si - self.offset) / self.factor }
-    }
+    /// Unit in the model.
+    pub unit: Unit,
 }
 
 /// The unit in which a channel is recorded: that of its header, else that of the model. `measured` is the expression
@@ -238,12 +227,7 @@ impl Data {
         let channels: Vec<ChannelInfo> = model
             .measurements
             .iter()
-            .map(|m| ChannelInfo {
-                name: m.channel.clone(),
-                unit: m.unit.text.clone(),
-                factor: m.unit.factor,
-                offset: m.unit.offset,
-            })
+            .map(|m| ChannelInfo { name: m.channel.clone(), unit: m.unit.clone() })
             .collect();
         let spread: Vec<f64> = (0..channels.len())
             .map(|c| {

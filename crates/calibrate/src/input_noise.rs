@@ -10,12 +10,15 @@
 //! noise of a sensor is as strong at the top of the band as in its middle, while commands fall off; and a simulation that
 //! follows the outputs more closely than the noise would let it proves that the noise is not there.
 
-use greybox_model::{Hold, Input};
+use greybox_model::{Hold, Input, Unit};
 use greybox_recording::noise::{
     has_white_floor, median, noise_sigma, quantisation_step, spectral_floor_sigma,
 };
 use greybox_recording::{Finding, Severity, interpolate};
 use greybox_simulate::{Environment, FINE, Seeds, Signal, integrate};
+use rand::{RngExt, SeedableRng};
+use rand_distr::StandardNormal;
+use rand_pcg::Pcg64Mcg;
 
 use crate::data::derivative;
 use crate::{FreeRun, PieceData, Setup};
@@ -96,12 +99,12 @@ fn told(setup: &Setup, found: &InputNoise, fitted: bool) -> Finding {
     let output = &setup.data.channels[found.output];
     let severity =
         if fitted && found.effect > LARGE * found.residual { Severity::Warning } else { Severity::Info };
-    let of = |value: f64, factor: f64, unit: &str| match unit {
-        "1" => significant(value / factor),
-        unit => format!("{} {unit}", significant(value / factor)),
+    let of = |value: f64, unit: &Unit| match (significant(unit.difference_from_si(value)), &*unit.text) {
+        (value, "1") => value,
+        (value, unit) => format!("{value} {unit}"),
     };
-    let size = of(found.sigma, input.unit.factor, &input.unit.text);
-    let effect = of(found.effect, output.factor, &output.unit);
+    let size = of(found.sigma, &input.unit);
+    let effect = of(found.effect, &output.unit);
     let message = format!(
         "If this input is a measurement, its {} of {size} moves the simulated `{}` by {effect} RMS, {} times the noise of that \
          channel. Inputs count as exact: gains come out too small, and intervals too narrow.",
@@ -118,7 +121,7 @@ fn told(setup: &Setup, found: &InputNoise, fitted: bool) -> Finding {
     Finding::new(severity, "input_noise", message)
         .on(&input.channel)
         .mend(mend)
-        .value(found.sigma / input.unit.factor, Some(&input.unit.text))
+        .value(input.unit.difference_from_si(found.sigma), Some(&input.unit.text))
 }
 
 /// Noise of an input in a piece.
@@ -231,18 +234,10 @@ fn significant(value: f64) -> String {
     }
 }
 
-/// White noise, the same for the same seed: uniform numbers of SplitMix64, normal ones by Box and Muller.
+/// White noise, the same for the same seed.
 fn white(seed: u64, n: usize, sigma: f64) -> Vec<f64> {
-    let mut state = seed.wrapping_mul(0xA076_1D64_78BD_642F) ^ 0x5DEE_CE66_D1CE_4E5B;
-    let mut uniform = || {
-        state = state.wrapping_add(0x9E37_79B9_7F4A_7C15);
-        let mut z = state;
-        z = (z ^ (z >> 30)).wrapping_mul(0xBF58_476D_1CE4_E5B9);
-        z = (z ^ (z >> 27)).wrapping_mul(0x94D0_49BB_1331_11EB);
-        ((z ^ (z >> 31)) >> 11) as f64 / (1u64 << 53) as f64
-    };
-    let normal = |a: f64, b: f64| (-2.0 * (1.0 - a).ln()).sqrt() * (2.0 * std::f64::consts::PI * b).cos();
-    (0..n).map(|_| sigma * normal(uniform(), uniform())).collect()
+    let random = Pcg64Mcg::seed_from_u64(seed);
+    random.sample_iter(StandardNormal).take(n).map(|e: f64| sigma * e).collect()
 }
 
 #[cfg(test)]

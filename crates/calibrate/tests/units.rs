@@ -65,7 +65,7 @@ fn headers_are_read_on_their_scale() {
         assert!((value - first).abs() < 1e-12, "{header}: {value}");
     }
     let data = Data::new(&model, &[recording(&["u", "Ta", "T", "phi", "rise"])]).unwrap();
-    let back = |name: &str| data.channels.iter().find(|c| c.name == name).unwrap().from_si(293.15);
+    let back = |name: &str| data.channels.iter().find(|c| c.name == name).unwrap().unit.from_si(293.15);
     assert!((back("T") - 20.0).abs() < 1e-12 && back("rise") == 293.15);
 }
 

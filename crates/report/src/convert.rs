@@ -388,9 +388,9 @@ pub fn scores(data: &Data, scores: &[greybox_calibrate::Score]) -> Ordered<Score
         .map(|(c, s)| {
             let score = Score {
                 nrmse: s.nrmse,
-                rmse: finite(s.rmse / c.factor),
+                rmse: finite(s.rmse / c.unit.factor),
                 nrmse_windowed: finite(s.nrmse_windowed),
-                rmse_windowed: finite(s.rmse_windowed / c.factor),
+                rmse_windowed: finite(s.rmse_windowed / c.unit.factor),
             };
             (c.name.clone(), score)
         })
@@ -600,7 +600,7 @@ fn times(data: &Data, recording: usize) -> Vec<f64> {
 fn output(data: &Data, run: &FreeRun, recording: usize, c: usize) -> Vec<f64> {
     joined(data, recording, |i| {
         let n = data.pieces[i].len;
-        run.y[i][c * n..(c + 1) * n].iter().map(|v| data.channels[c].from_si(*v)).collect()
+        run.y[i][c * n..(c + 1) * n].iter().map(|v| data.channels[c].unit.from_si(*v)).collect()
     })
 }
 
@@ -627,9 +627,9 @@ fn recordings(
                         runs.map(|run| run.map_or_else(Vec::new, |run| output(data, run, r, c)));
                     page::Channel {
                         name: info.name.clone(),
-                        unit: info.unit.clone(),
+                        unit: info.unit.text.clone(),
                         measured: joined(data, r, |i| {
-                            data.pieces[i].measured[c].iter().map(|v| info.from_si(*v)).collect()
+                            data.pieces[i].measured[c].iter().map(|v| info.unit.from_si(*v)).collect()
                         }),
                         nominal,
                         calibrated,
@@ -671,8 +671,8 @@ fn residuals(d: &Diagnosis) -> Vec<Residual> {
     for r in 0..data.recordings.len() {
         for (c, info) in data.channels.iter().enumerate() {
             let (calibrated, improved) = (&d.train.calibrated.run, &d.train.improved.run);
-            let before = residual(data, calibrated, r, c, info.factor);
-            let after = residual(data, improved, r, c, info.factor);
+            let before = residual(data, calibrated, r, c, info.unit.factor);
+            let after = residual(data, improved, r, c, info.unit.factor);
             let windows = d
                 .mechanisms
                 .first()
@@ -685,11 +685,11 @@ fn residuals(d: &Diagnosis) -> Vec<Residual> {
                         .collect()
                 })
                 .unwrap_or_default();
-            let sigma = data.sigma[c] / info.factor;
+            let sigma = data.sigma[c] / info.unit.factor;
             out.push(Residual {
                 recording: data.recordings[r].clone(),
                 channel: info.name.clone(),
-                unit: info.unit.clone(),
+                unit: info.unit.text.clone(),
                 t: times(data, r),
                 noise_sigma: sigma,
                 windows,
@@ -792,7 +792,7 @@ fn state_map(
             let e = piece.measured[channel][k] - judged.y[i][channel * n + k];
             x.push(state.unit.from_si(coordinates.x[i][k]));
             y.push(state.unit.difference_from_si(coordinates.x[i][n + k]));
-            value.push(e.abs() / info.factor);
+            value.push(e.abs() / info.unit.factor);
         }
     }
     let unit = &state.unit.text;
@@ -802,7 +802,7 @@ fn state_map(
     Some(StateMap {
         x_label: label(&state.name, unit.clone()),
         y_label: label(&format!("{}'", state.name), format!("{unit}/s")),
-        value_label: label(&format!("|residual of {}|", info.name), info.unit.clone()),
+        value_label: label(&format!("|residual of {}|", info.name), info.unit.text.clone()),
         x,
         y,
         value,

@@ -302,12 +302,12 @@ fn residuals(found: &Identification) -> Vec<Residual> {
     (0..data.recordings.len())
         .flat_map(|r| data.channels.iter().enumerate().map(move |(c, info)| (r, c, info)))
         .map(|(r, c, info)| {
-            let after = residual(data, run, r, c, info.factor);
-            let noise_sigma = data.sigma[c] / info.factor;
+            let after = residual(data, run, r, c, info.unit.factor);
+            let noise_sigma = data.sigma[c] / info.unit.factor;
             Residual {
                 recording: data.recordings[r].clone(),
                 channel: info.name.clone(),
-                unit: info.unit.clone(),
+                unit: info.unit.text.clone(),
                 t: times(data, r),
                 spectrum: spectra(data, r, &[], &after, noise_sigma),
                 map: state_map(&found.model, data, [run, run], r, c),
