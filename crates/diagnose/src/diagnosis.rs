@@ -795,15 +795,11 @@ impl Judge {
         };
         setup.scores(&run, parameters, window, None)
     }
+}
 
-    /// Largest error over the noise of its channel.
-    fn over_noise(&self, scores: &[Score], sigma: &[f64]) -> f64 {
-        let rms = |s: &Score| match self.criterion {
-            Criterion::FreeRun => s.rmse,
-            Criterion::Windowed => s.rmse_windowed,
-        };
-        scores.iter().zip(sigma).map(|(s, sigma)| rms(s) / sigma).fold(0.0, f64::max)
-    }
+/// Largest error of a free run over the noise of its channel.
+fn over_noise(scores: &[Score], sigma: &[f64]) -> f64 {
+    scores.iter().zip(sigma).map(|(s, sigma)| s.rmse / sigma).fold(0.0, f64::max)
 }
 
 /// A model refitted at growing horizons from each of these points of its level: of all fits, and the model as it is, the
@@ -839,9 +835,9 @@ const HORIZON: Limits = Limits { iterations: 30, tolerance: 1e-6 };
 const FURTHER: Limits = Limits { iterations: 100, tolerance: 1e-6 };
 
 /// Takes mechanisms away until what is left can be handed back: every one is determined, no inertia is negative, and the
-/// model is no worse than the calibrated one in training. Where it leaves more than noise it also predicts data left out of
-/// its fit no worse, and where no round believed it (`named` false) better than chance. Nothing is left but the calibrated
-/// model where that takes all mechanisms.
+/// model is no worse than the calibrated one in training. It also predicts data left out of its fit better than chance,
+/// unless a round believed it (`named`) and it leaves no more than noise. Nothing is left but the calibrated model where that
+/// takes all mechanisms.
 fn defend(
     search: &Search<'_>,
     found: &mut Found,
@@ -866,18 +862,13 @@ fn defend(
         let widths = Uncertainty::of(&polished.origin, &scale).widths();
         let scores = judge.scores(&fitted.setup, &fitted.fit.point.parameters, &scale);
         let worse = judge.criterion.misfit(&scores).total_cmp(&baseline.misfit).is_gt();
-        let unsafe_elsewhere = || {
-            // (Of the simulation that is handed back: the free starts of short segments absorb what a model leaves.)
-            if named && judge.over_noise(&scores, &fitted.setup.data.sigma) <= MISFIT {
-                return false; // the likelihood has spoken
-            }
-            let gain = Gain::of(&simpler, &errors(&polished, &scale));
-            !(if named { gain.is_safe() } else { gain.is_beyond_chance() })
-        };
+        // (By the free run: starts that are free absorb what a model leaves, of segments as of windows.)
+        let likely = named && over_noise(&scores, &fitted.setup.data.sigma) <= MISFIT;
+        let predicts = || Gain::of(&simpler, &errors(&polished, &scale)).is_beyond_chance();
         let fails = search.undetermined(&polished.origin, &widths).is_some()
             || worse
             || search.has_negative_inertia(fitted, &found.scale)
-            || unsafe_elsewhere();
+            || !(likely || predicts());
         if !fails {
             return polished;
         }
