@@ -836,8 +836,8 @@ const FURTHER: Limits = Limits { iterations: 100, tolerance: 1e-6 };
 
 /// Takes mechanisms away until what is left can be handed back: every one is determined, no inertia is negative, and the
 /// model is no worse than the calibrated one in training. It also predicts data left out of its fit better than chance,
-/// unless a round believed it (`named`) and it leaves no more than noise. Nothing is left but the calibrated model where that
-/// takes all mechanisms.
+/// unless a round believed it (`named`) and it leaves no more than noise; what is bound to the clock of a single recording
+/// predicts no other. Nothing is left but the calibrated model where that takes all mechanisms.
 fn defend(
     search: &Search<'_>,
     found: &mut Found,
@@ -865,7 +865,9 @@ fn defend(
         // (By the free run: starts that are free absorb what a model leaves, of segments as of windows.)
         let likely = named && over_noise(&scores, &fitted.setup.data.sigma) <= MISFIT;
         let predicts = || Gain::of(&simpler, &errors(&polished, &scale)).is_beyond_chance();
-        let fails = search.undetermined(&polished.origin, &widths).is_some()
+        let bound = if likely { Vec::new() } else { search.bound_to_a_clock(fitted) };
+        let fails = !bound.is_empty()
+            || search.undetermined(&polished.origin, &widths).is_some()
             || worse
             || search.has_negative_inertia(fitted, &found.scale)
             || !(likely || predicts());
@@ -874,7 +876,8 @@ fn defend(
         }
         // Without the part that is missed least. (That would be one that is not determined, unless it is so only beside
         // another that does the same.)
-        let smaller = (0..fitted.parts.len())
+        let open = if bound.is_empty() { (0..fitted.parts.len()).collect() } else { bound };
+        let smaller = open
             .into_par_iter()
             .filter_map(|i| {
                 let smaller = search.smaller(&found.improved, i, &found.scale)?;

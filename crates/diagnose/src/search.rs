@@ -973,6 +973,14 @@ impl<'a> Search<'a> {
         least.map(|(index, _)| index)
     }
 
+    /// The parts that act at certain times of a single recording: when they would act in another nothing tells.
+    pub fn bound_to_a_clock(&self, fitted: &Fitted) -> Vec<usize> {
+        let single = self.nominal.data.recordings.len() == 1;
+        let bound =
+            |i: &usize| single && self.library[fitted.parts[*i].candidate.mechanism].law.mentions("t");
+        (0..fitted.parts.len()).filter(bound).collect()
+    }
+
     /// Whether the mechanisms turn the sign of the mass matrix's determinant somewhere along the recordings: a negative
     /// inertia, or a coupling of accelerations stronger than the inertias that it couples.
     pub fn has_negative_inertia(&self, fitted: &Fitted, scale: &[f64]) -> bool {
@@ -2233,6 +2241,8 @@ fn calibrated_rss(calibrated: &Fitted, scale: &[f64]) -> f64 {
 #[cfg(test)]
 mod tests {
     use super::*;
+    use greybox_calibrate::Data;
+    use greybox_recording::{Channel, Recording};
 
     #[test]
     fn a_slow_residual_is_noise_only_where_the_recordings_outlast_its_memory() {
@@ -2241,5 +2251,119 @@ mod tests {
         assert!(is_long(2000, ratio) && !is_long(700, ratio));
         // A few runs of 15 s with a residual that hardly changes within one.
         assert!(!is_long(733, 7.0));
+    }
+
+    /// Two carts of 1 and 2 kg, each on its spring, that swing freely: x = cos 2t and cos 3t.
+    const CARTS: &str = r#"
+[states]
+x1 = { unit = "m" }
+x2 = { unit = "m" }
+[parameters]
+m1 = { value = 1.0, unit = "kg", fixed = true }
+m2 = { value = 2.0, unit = "kg", fixed = true }
+k1 = { value = 4.0, unit = "N/m" }
+k2 = { value = 18.0, unit = "N/m" }
+[equations]
+first  = "m1*x1'' + k1*x1 = 0"
+second = "m2*x2'' + k2*x2 = 0"
+"#;
+
+    fn carts(recordings: usize) -> Setup {
+        let time: Vec<f64> = (0..400).map(|k| 0.02 * f64::from(k)).collect();
+        let channel = |name: &str, omega: f64| Channel {
+            name: name.into(),
+            unit: None,
+            values: time.iter().map(|t| (omega * t).cos()).collect(),
+        };
+        let record = |i: usize| {
+            let channels = vec![channel("x1", 2.0), channel("x2", 3.0)];
+            Recording::from_columns(&format!("{i}.csv"), time.clone(), channels).unwrap()
+        };
+        let model = Model::from_toml(CARTS, "carts.toml").unwrap();
+        let recordings: Vec<Recording> = (0..recordings).map(record).collect();
+        let data = std::sync::Arc::new(Data::new(&model, &recordings).unwrap());
+        Setup::new(&model, data, free_parameters(&model)).unwrap()
+    }
+
+    /// The nominal equations with the first candidate of such a mechanism, at this value of its only parameter.
+    fn with(search: &Search<'_>, is: impl Fn(&Mechanism) -> bool, value: f64) -> Fitted {
+        let candidate = search.all.iter().find(|c| is(&search.library[c.mechanism])).unwrap().clone();
+        let nominal = &search.nominal;
+        let scale = nominal.data.spread.clone();
+        let level = nominal.level(1);
+        let values = nominal.values();
+        let starts = nominal.starts(&level, &values);
+        let held = Setup { free: Vec::new(), ..nominal.clone() };
+        let fit = held.fit(&level, &scale, &[Point { parameters: values, starts }], limits(3));
+        let base = Fitted { setup: nominal.clone(), parts: Vec::new(), level, fit };
+        search.reassembled(&base, &[(candidate, vec![value], vec![])], &scale, 0).unwrap()
+    }
+
+    #[test]
+    fn the_sign_of_a_determinant_follows_its_rows() {
+        let sign = |rows: [f64; 9]| determinant_sign(&mut rows.to_vec(), 3);
+        assert_eq!(sign([2.0, 0.0, 0.0, 0.0, 3.0, 0.0, 0.0, 0.0, 4.0]), 1.0);
+        assert_eq!(sign([0.0, 3.0, 0.0, 2.0, 0.0, 0.0, 0.0, 0.0, 4.0]), -1.0, "two rows changed");
+        assert_eq!(sign([0.0, 0.0, 4.0, 2.0, 0.0, 0.0, 0.0, 3.0, 0.0]), 1.0, "all three changed round");
+        assert_eq!(sign([1.0, 2.0, 0.0, 2.0, 1.0, 0.0, 0.0, 0.0, 1.0]), -1.0, "1 − 4");
+        assert_eq!(sign([1.0, 2.0, 0.0, 2.0, 4.0, 0.0, 0.0, 0.0, 1.0]), 0.0, "singular");
+    }
+
+    /// An inertia mc between the carts gives the mass matrix [1, mc; mc, 2] kg, one that acts one way [1, mc; 0, 2] kg.
+    #[test]
+    fn an_inertia_that_is_negative_along_the_data_is_not_admissible() {
+        let library = crate::built_in().unwrap();
+        let search = Search::new(carts(1), &library, &crate::Quiet);
+        let scale = search.nominal.data.spread.clone();
+        let negative = |both: bool, mc: f64| {
+            let inertia =
+                |m: &Mechanism| m.kind == "coupling" && m.linear == ["mc"] && m.reaction.is_some() == both;
+            let fitted = with(&search, inertia, mc);
+            let negative = search.has_negative_inertia(&fitted, &scale);
+            assert_eq!(search.admissible(&fitted, &scale), !negative);
+            negative
+        };
+        assert!(!negative(true, 1.3) && !negative(true, -1.3));
+        assert!(negative(true, 1.5) && negative(true, -1.5));
+        assert!(!negative(false, 9.0));
+    }
+
+    #[test]
+    fn a_drift_needs_one_clock() {
+        let library = crate::built_in().unwrap();
+        let drifts = |recordings: usize| {
+            let search = Search::new(carts(recordings), &library, &crate::Quiet);
+            search.all.iter().filter(|c| is_drift(&library[c.mechanism])).count()
+        };
+        assert_eq!((drifts(1), drifts(2)), (2, 0), "k1 and k2; time begins anew with every recording");
+    }
+
+    /// The recording lasts 8 s: a stiffness that would vanish after 10 s may fall so, one that would after 5 s has
+    /// changed its sign.
+    #[test]
+    fn no_stiffness_drifts_through_zero() {
+        let library = crate::built_in().unwrap();
+        let search = Search::new(carts(1), &library, &crate::Quiet);
+        let scale = search.nominal.data.spread.clone();
+        let allowed = |rate: f64| search.admissible(&with(&search, is_drift, rate), &scale);
+        assert!(allowed(0.1) && allowed(-0.1) && !allowed(-0.2));
+    }
+
+    /// A constant force known to ±0.5 N: as many newtons say whether it is there.
+    #[test]
+    fn a_part_whose_interval_holds_zero_is_undetermined() {
+        let library = crate::built_in().unwrap();
+        let search = Search::new(carts(1), &library, &crate::Quiet);
+        let undetermined = |force: f64, width: f64| {
+            let fitted = with(&search, |m| m.kind == "constant_offset", force);
+            let index = fitted.setup.model.parameter(&fitted.parts[0].instance.names[0]).unwrap();
+            let width = |f: &Free| if f.index == index { width } else { 0.1 };
+            search.undetermined(&fitted, &fitted.setup.free.iter().map(width).collect::<Vec<_>>())
+        };
+        assert_eq!((undetermined(0.6, 0.5), undetermined(-0.6, 0.5)), (None, None));
+        assert_eq!((undetermined(0.4, 0.5), undetermined(-0.4, 0.5)), (Some(0), Some(0)));
+        assert_eq!(undetermined(0.0, 0.5), Some(0));
+        assert_eq!(undetermined(0.0, 0.0), Some(0), "0 ± 0 is nothing");
+        assert_eq!(undetermined(0.6, f64::INFINITY), Some(0));
     }
 }
