@@ -4,6 +4,7 @@ use std::ops::Range;
 use std::sync::OnceLock;
 
 use greybox_model::{Dimension, Expr, Hold, Input, Model, Unit, UnitError, nearest};
+use greybox_recording::interpolate::{fill_missing, hold_missing};
 use greybox_recording::{Recording, SIZES, smooth::Smoothed};
 use greybox_simulate::{Environment, FINE, Signal};
 
@@ -208,10 +209,17 @@ impl Data {
                         .iter()
                         .zip(&model.inputs)
                         .map(|(found, input)| {
-                            let values = scaled(&found.column, piece);
-                            match found.differentiated {
-                                true => derivative(&filled(&values, Hold::Linear), piece.dt, input.hold),
-                                false => filled(&values, input.hold),
+                            let (channel, unit) = &found.column;
+                            if found.differentiated {
+                                let values = scaled(&found.column, piece);
+                                derivative(&fill_missing(&values), piece.dt, input.hold)
+                            } else if input.hold == Hold::Zero {
+                                hold_missing(&recording.held(piece, *channel))
+                                    .iter()
+                                    .map(|v| unit.to_si(*v))
+                                    .collect()
+                            } else {
+                                fill_missing(&scaled(&found.column, piece))
                             }
                         })
                         .collect(),
@@ -512,15 +520,6 @@ fn find_channel(
         return Err(DataError::OutOfRange { file, channel: channel.to_string(), largest });
     }
     Ok((index, recorded))
-}
-
-/// An input with its missing samples as its hold has them: a value is held until the next one, or joined with it.
-fn filled(u: &[f64], hold: Hold) -> Vec<f64> {
-    use greybox_recording::interpolate::{fill_missing, hold_missing};
-    match hold {
-        Hold::Zero => hold_missing(u),
-        Hold::Linear | Hold::BandLimited => fill_missing(u),
-    }
 }
 
 /// Noise of a channel. Fourth differences are blind where the signal itself is fast (nine samples per

@@ -326,3 +326,47 @@ mass = "m*x'' + b*x' + k*x = f"
         assert!(worst(&full, &simulated) < 1e-9, "{hold}: {}", worst(&full, &simulated));
     }
 }
+
+/// A log of switching events at times of its own: x' = u, u = 2 in some 40 stretches. What is integrated is what was
+/// delivered, where the input is held; joined by lines, each event is smeared over its neighbours.
+#[test]
+fn between_the_rows_of_a_log_of_events_an_input_does_what_its_hold_says() {
+    let steps: Vec<f64> = normal(5, 400).iter().map(|e| 1.0 + 0.2 * e.clamp(-1.5, 1.5)).collect();
+    let (mut t, mut on, mut delivered) = (0.0, false, 0.0);
+    let [mut time, mut u, mut x] = [const { Vec::new() }; 3];
+    for (k, step) in steps.iter().enumerate() {
+        if k % 9 == 0 || k % 9 == 4 {
+            on = !on;
+        }
+        time.push(t);
+        u.push(if on { 2.0 } else { 0.0 });
+        x.push(delivered);
+        delivered += step * u[k];
+        t += step;
+    }
+    let channel =
+        |name: &str, values: &[f64]| Channel { name: name.into(), unit: None, values: values.to_vec() };
+    let columns = vec![channel("u", &u), channel("x", &x)];
+    let log = Recording::from_columns("events.csv", time, columns).unwrap();
+    assert!(log.pieces[0].resampled);
+    let model = |hold: &str| {
+        format!(
+            "[inputs]\nu = {{ hold = \"{hold}\" }}\n[states]\nx = {{}}\n[parameters]\n\
+             b = {{ value = 1, unit = \"1/s\", fixed = true }}\n[equations]\nfill = \"x' = b*u\"\n"
+        )
+    };
+    let error = |hold: &str| {
+        let setup = laid_out(&model(hold), std::slice::from_ref(&log));
+        let piece = &setup.data.pieces[0];
+        let sums = piece.inputs[0].iter().scan(0.0, |sum, u| {
+            let before = *sum;
+            *sum += u * piece.dt;
+            Some(before)
+        });
+        sums.zip(&piece.measured[0]).map(|(a, b)| (a - b).abs()).fold(0.0, f64::max)
+    };
+    let (held, joined) = (error("zero"), error("linear"));
+    // The level itself is joined by lines, which are wrong by less than a step where it bends.
+    assert!(held < 0.6, "{held}");
+    assert!(joined > 3.0 * held, "{joined} {held}");
+}

@@ -17,6 +17,7 @@ pub mod search;
 pub mod smoother;
 pub mod spectra;
 pub mod surface;
+mod temperature;
 mod twins;
 mod uncertainty;
 mod validate;

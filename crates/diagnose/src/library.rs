@@ -267,6 +267,9 @@ pub struct Mechanism {
     pub rare: bool,
     /// The law acts all the time with one strength: every part of a recording must show it.
     pub steady: bool,
+    /// The law knows the absolute zero of temperature (radiation); the others are offered only where they hold on any
+    /// scale on which the equations do.
+    pub absolute: bool,
     /// Reversals of the motion that the data must show at least (a memory is seen by returning).
     pub reversals: usize,
     /// Whether the mirror image (d → −d) is another candidate.
@@ -364,6 +367,8 @@ struct File {
     rare: bool,
     #[serde(default)]
     steady: bool,
+    #[serde(default)]
+    absolute: bool,
     #[serde(default)]
     reversals: usize,
     #[serde(default)]
@@ -500,6 +505,7 @@ impl Mechanism {
             }),
             rare: raw.rare,
             steady: raw.steady,
+            absolute: raw.absolute,
             reversals: raw.reversals,
             mirror: raw.mirror,
             refines: raw.refines,

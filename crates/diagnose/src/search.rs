@@ -15,6 +15,7 @@ use crate::evidence::{Evidence, Side, folds, kappa, least_kappa, weigh};
 use crate::library::Mechanism;
 use crate::place::{Place, places};
 use crate::screen::{Pair, Scored, first_states, first_values, inner_scales, screen, screen_pairs};
+use crate::temperature::AnyScale;
 use crate::uncertainty::Uncertainty;
 use crate::validate::{Gain, errors};
 use crate::{Observer, Stage};
@@ -314,6 +315,8 @@ impl<'a> Search<'a> {
         let drives =
             |i: usize| nominal.data.input_moves(i) && nominal.model.inputs[i].derivative_of().is_none();
         all.retain(|c| !matches!(c.place, Place::Input(i) if !drives(i)));
+        let scale = AnyScale::of(&nominal.model);
+        all.retain(|c| scale.admits(c, &library[c.mechanism]));
         let (all, doubts) = all.into_iter().partition(|c| library[c.mechanism].doubts.is_empty());
         let lengths = lengths(&nominal);
         Search {

@@ -265,16 +265,24 @@ fn a_calibration_does_not_depend_on_the_scale_of_temperature() {
     }
 }
 
-/// Temperatures on the Celsius scale that are called K, in the model and in the recording.
+/// The model with temperatures on the Celsius scale that are called K.
+fn celsius_called_kelvin() -> Model {
+    Model::from_toml(&ROOM.replace("{To}", "10.0").replace("{T}", "K"), "room.toml").unwrap()
+}
+
+/// The recording of [`celsius_called_kelvin`].
+fn celsius(seed: u64) -> Recording {
+    let mut recording = heated(seed, "degC", true);
+    for channel in recording.channels.iter_mut().filter(|c| c.name != "Ph") {
+        channel.unit = Some("K".into());
+    }
+    recording
+}
+
 #[test]
 fn a_calibration_does_not_depend_on_the_zero_of_temperature() {
     let plain = of_room(&room("K"), &heated(3, "K", true), 273.15);
-    let shifted = Model::from_toml(&ROOM.replace("{To}", "10.0").replace("{T}", "K"), "room.toml");
-    let mut celsius = heated(3, "degC", true);
-    for channel in celsius.channels.iter_mut().filter(|c| c.name != "Ph") {
-        channel.unit = Some("K".into());
-    }
-    let other = of_room(&shifted.unwrap(), &celsius, 0.0);
+    let other = of_room(&celsius_called_kelvin(), &celsius(3), 0.0);
     assert!(close(&plain, &other, false, 1e-6), "{plain:?}\n{other:?}");
 }
 
@@ -298,6 +306,26 @@ fn a_diagnosis_does_not_depend_on_the_scale_of_temperature() {
         let (other_kinds, other_numbers) = found(&other);
         assert_eq!(kinds, other_kinds, "{unit}");
         assert!(close(&numbers, &other_numbers, false, 1e-4), "{unit}: {numbers:?} {other_numbers:?}");
+    }
+}
+
+/// Of the whole library: what would be another law on another scale is not offered.
+#[test]
+fn a_diagnosis_does_not_depend_on_the_zero_of_temperature() {
+    let of = |mut model: Model, recording: Recording| {
+        let to = model.parameter("To").unwrap();
+        model.parameters[to].fixed = true;
+        diagnose(&model, &[recording], &[], &Options::default(), &Quiet).unwrap()
+    };
+    let plain = of(room("K"), heated(3, "K", true));
+    let other = of(celsius_called_kelvin(), celsius(3));
+    let ((kinds, numbers), (other_kinds, other_numbers)) = (found(&plain), found(&other));
+    assert_eq!(kinds, other_kinds);
+    assert!(kinds.contains(&"constant_offset"), "{kinds:?}");
+    // Value and interval of each parameter, to the tolerance of a fit: that is a share of the interval.
+    for (a, b) in numbers.chunks(3).zip(other_numbers.chunks(3)) {
+        let width = a[2] - a[1];
+        assert!(a.iter().zip(b).all(|(a, b)| (a - b).abs() < 0.01 * width), "{kinds:?}: {a:?} {b:?}");
     }
 }
 
