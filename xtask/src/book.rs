@@ -47,10 +47,16 @@ mod tests {
 
     #[test]
     fn the_pages_have_their_markers() {
-        use crate::{bench::page, prove::statistics};
-        for (name, begin) in
-            [(page::NAME, page::BEGIN), (page::NAME, page::SCALE), (statistics::PAGE, statistics::BEGIN)]
-        {
+        use crate::{
+            bench::page,
+            prove::{sets, statistics},
+        };
+        for (name, begin) in [
+            (page::NAME, page::BEGIN),
+            (page::NAME, page::SCALE),
+            (statistics::PAGE, statistics::BEGIN),
+            (sets::PAGE, sets::BEGIN),
+        ] {
             let text = std::fs::read_to_string(place(&crate::root(), name)).unwrap();
             assert!(between(&text, begin, "").is_ok(), "{name}: {begin}");
         }
