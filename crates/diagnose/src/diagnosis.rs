@@ -797,9 +797,12 @@ impl Judge {
     }
 }
 
-/// Largest error of a free run over the noise of its channel.
-fn over_noise(scores: &[Score], sigma: &[f64]) -> f64 {
-    scores.iter().zip(sigma).map(|(s, sigma)| s.rmse / sigma).fold(0.0, f64::max)
+/// Whether free runs leave no more than noise: little more than the white noise of their channel, or a residual that itself passes
+/// for coloured noise.
+fn leaves_noise(scores: &[Score], fitted: &Fitted, scale: &[f64]) -> bool {
+    let coloured = crate::search::coloured_channels(fitted, scale);
+    let over = scores.iter().zip(&fitted.setup.data.sigma).map(|(s, sigma)| s.rmse / sigma);
+    over.zip(coloured).all(|(over, coloured)| coloured || over <= MISFIT)
 }
 
 /// A model refitted at growing horizons from each of these points of its level: of all fits, and the model as it is, the
@@ -836,7 +839,7 @@ const FURTHER: Limits = Limits { iterations: 100, tolerance: 1e-6 };
 
 /// Takes mechanisms away until what is left can be handed back: every one is determined, no inertia is negative, and the
 /// model is no worse than the calibrated one in training. It also predicts data left out of its fit better than chance,
-/// unless a round believed it (`named`) and it leaves no more than noise; what is bound to the clock of a single recording
+/// unless a round believed it (`named`) and it leaves no more than noise, white or coloured; what is bound to the clock of a single recording
 /// predicts no other. Nothing is left but the calibrated model where that takes all mechanisms.
 fn defend(
     search: &Search<'_>,
@@ -863,7 +866,7 @@ fn defend(
         let scores = judge.scores(&fitted.setup, &fitted.fit.point.parameters, &scale);
         let worse = judge.criterion.misfit(&scores).total_cmp(&baseline.misfit).is_gt();
         // (By the free run: starts that are free absorb what a model leaves, of segments as of windows.)
-        let likely = named && over_noise(&scores, &fitted.setup.data.sigma) <= MISFIT;
+        let likely = named && leaves_noise(&scores, &polished.origin, &scale);
         let predicts = || Gain::of(&simpler, &errors(&polished, &scale)).is_beyond_chance();
         let bound = if likely { Vec::new() } else { search.bound_to_a_clock(fitted) };
         let fails = !bound.is_empty()
