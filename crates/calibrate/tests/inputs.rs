@@ -366,7 +366,7 @@ fn between_the_rows_of_a_log_of_events_an_input_does_what_its_hold_says() {
         sums.zip(&piece.measured[0]).map(|(a, b)| (a - b).abs()).fold(0.0, f64::max)
     };
     let (held, joined) = (error("zero"), error("linear"));
-    // The level itself is joined by lines, which are wrong by less than a step where it bends.
-    assert!(held < 0.6, "{held}");
-    assert!(joined > 3.0 * held, "{joined} {held}");
+    // Between its rows the level is a straight line too: nothing but rounding is left.
+    assert!(held < 1e-9, "{held}");
+    assert!(joined > 1.5, "more than half of what a step delivers: {joined}");
 }

@@ -797,7 +797,7 @@ impl Judge {
     }
 }
 
-/// Whether free runs leave no more than noise: little more than the white noise of their channel, or a residual that itself passes
+/// Whether free runs leave no more than noise: in each channel at most [`MISFIT`] of its white noise, or a residual that passes
 /// for coloured noise.
 fn leaves_noise(scores: &[Score], fitted: &Fitted, scale: &[f64]) -> bool {
     let coloured = crate::search::coloured_channels(fitted, scale);
@@ -839,8 +839,9 @@ const FURTHER: Limits = Limits { iterations: 100, tolerance: 1e-6 };
 
 /// Takes mechanisms away until what is left can be handed back: every one is determined, no inertia is negative, and the
 /// model is no worse than the calibrated one in training. It also predicts data left out of its fit better than chance,
-/// unless a round believed it (`named`) and it leaves no more than noise, white or coloured; what is bound to the clock of a single recording
-/// predicts no other. Nothing is left but the calibrated model where that takes all mechanisms.
+/// unless a round believed it (`named`) and it leaves no more than noise, white or coloured. What acts at certain times of a
+/// single recording is never taken for such a prediction. Nothing is left but the calibrated model where that takes all
+/// mechanisms.
 fn defend(
     search: &Search<'_>,
     found: &mut Found,

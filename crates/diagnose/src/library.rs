@@ -942,14 +942,9 @@ impl Mechanism {
         let names = |m: &Mechanism| m.states.iter().map(|s| s.name.clone()).collect::<Vec<_>>();
         let count = |m: &Mechanism| m.expressions().count();
         let alike = self.on == other.on && names(self) == names(other) && count(self) == count(other);
-        // Any number will do for a signal, a different one for each, of either sign.
-        let signal = |k: u8, n: &str, primes: u8| {
-            let name: f64 = n.bytes().map(f64::from).sum();
-            (1.7 * f64::from(k) + 0.9 * f64::from(primes) + name).sin()
-        };
         let at = |k: u8, m: &Mechanism, e: &Expr, value: &dyn Fn(u8, &str) -> Option<f64>| {
             let own = |n: &str| m.own.iter().any(|p| p == n);
-            e.eval(&|n, primes| if own(n) { value(k, n) } else { Some(signal(k, n, primes)) })
+            e.eval(&|n, primes| if own(n) { value(k, n) } else { Some(arbitrary(k, n, primes)) })
         };
         let agree = |k: u8, a: &Expr, b: &Expr| {
             let both = at(k, self, a, mine).zip(at(k, other, b, theirs));
@@ -1211,6 +1206,14 @@ pub fn combine(own: &[(String, String)]) -> Result<Library, MechanismError> {
         })?;
     }
     Ok(Library { mechanisms: files.into_iter().map(|f| f.2).collect(), added, replaced })
+}
+
+/// A number for a name and its derivative at a point, the same every time: any will do where laws are compared, another for
+/// each, of either sign.
+pub(crate) fn arbitrary(point: u8, name: &str, primes: u8) -> f64 {
+    // (The order of the letters counts.)
+    let name = name.bytes().fold(0.0, |sum, b| 1.3 * sum + f64::from(b));
+    (1.7 * f64::from(point) + 0.9 * f64::from(primes) + name).sin()
 }
 
 #[cfg(test)]

@@ -315,8 +315,8 @@ impl<'a> Search<'a> {
         let drives =
             |i: usize| nominal.data.input_moves(i) && nominal.model.inputs[i].derivative_of().is_none();
         all.retain(|c| !matches!(c.place, Place::Input(i) if !drives(i)));
-        let scale = AnyScale::of(&nominal.model);
-        all.retain(|c| scale.admits(c, &library[c.mechanism]));
+        let any_scale = AnyScale::of(&nominal.model);
+        all.retain(|c| any_scale.admits(c, &library[c.mechanism]));
         let (all, doubts) = all.into_iter().partition(|c| library[c.mechanism].doubts.is_empty());
         let lengths = lengths(&nominal);
         Search {
@@ -976,11 +976,10 @@ impl<'a> Search<'a> {
         least.map(|(index, _)| index)
     }
 
-    /// The parts that act at certain times of a single recording: when they would act in another nothing tells.
+    /// The parts that act at certain times of a single recording. Nothing tells when they would act in another.
     pub fn bound_to_a_clock(&self, fitted: &Fitted) -> Vec<usize> {
         let single = self.nominal.data.recordings.len() == 1;
-        let bound =
-            |i: &usize| single && self.library[fitted.parts[*i].candidate.mechanism].law.mentions("t");
+        let bound = |i: &usize| single && is_timed(&self.library[fitted.parts[*i].candidate.mechanism]);
         (0..fitted.parts.len()).filter(bound).collect()
     }
 
@@ -2099,9 +2098,14 @@ impl<'a> Search<'a> {
     }
 }
 
+/// Whether a law depends on the time since a recording began.
+fn is_timed(mechanism: &Mechanism) -> bool {
+    mechanism.law.mentions("t")
+}
+
 /// Whether a mechanism lets a parameter change with time.
 fn is_drift(mechanism: &Mechanism) -> bool {
-    mechanism.on == crate::library::On::Parameter && mechanism.law.mentions("t")
+    mechanism.on == crate::library::On::Parameter && is_timed(mechanism)
 }
 
 /// A fitted linear parameter of a mechanism.

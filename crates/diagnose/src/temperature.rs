@@ -5,10 +5,10 @@
 //! threshold that lies about zero, or a gain in front of a thermometer's reading would be fitted otherwise to the same
 //! recording in another unit.
 
-use greybox_model::{Dimension, Expr, Model, Unit};
+use greybox_model::{Dimension, Expr, Measurement, Model, Unit};
 
 use crate::candidate::Candidate;
-use crate::library::Mechanism;
+use crate::library::{Mechanism, arbitrary};
 
 /// Most parameters that are temperatures, each of which may be one on the scale or a difference.
 const MOST: usize = 8;
@@ -35,18 +35,18 @@ impl<'a> AnyScale<'a> {
     }
 
     pub(crate) fn admits(&self, candidate: &Candidate, mechanism: &Mechanism) -> bool {
-        let Some(moved_before) = &self.moved else { return true };
+        let Some(moved_alone) = &self.moved else { return true };
         if mechanism.absolute {
             return true;
         }
         let mut with = self.model.clone();
         candidate.insert(&mut with, mechanism, &vec![1.0; mechanism.parameters().count()]);
-        with.resolve_units().is_err() || moved(&with, self.model.parameters.len(), moved_before).is_some()
+        with.resolve_units().is_err() || moved(&with, self.model.parameters.len(), moved_alone).is_some()
     }
 }
 
 fn is_temperature(unit: &Unit) -> bool {
-    unit.dimension == Dimension::TEMPERATURE
+    unit.dimension.same(&Dimension::TEMPERATURE)
 }
 
 /// The parameters that move with the scale of temperature where all equations and measurements then hold as before, if
@@ -75,13 +75,8 @@ fn holds(model: &Model, parameters: &[String]) -> bool {
         let signal = state.or_else(|| model.input(name).map(|i| &model.inputs[i].unit));
         primes == 0 && (signal.is_some_and(is_temperature) || parameters.iter().any(|p| p == name))
     };
-    // Any number will do, another for each name, derivative and point, of either sign.
-    let value = |point: u8, name: &str, primes: u8| {
-        let seed = name.bytes().fold(0.0, |s, b| 1.3 * s + f64::from(b));
-        2.0 * (seed + 1.7 * f64::from(point) + 0.9 * f64::from(primes)).sin()
-    };
     let at = |point: u8, expr: &Expr, by: f64| {
-        expr.eval(&|n, p| Some(value(point, n, p) + if moves(n, p) { by } else { 0.0 }))
+        expr.eval(&|n, p| Some(arbitrary(point, n, p) + if moves(n, p) { by } else { 0.0 }))
     };
     let differs = |point: u8, expr: &Expr, by: f64| {
         let Some((before, after)) = at(point, expr, 0.0).zip(at(point, expr, SHIFT)) else { return false };
@@ -90,7 +85,7 @@ fn holds(model: &Model, parameters: &[String]) -> bool {
     };
     (0..POINTS).all(|point| {
         let equations = model.equations.iter().all(|e| !differs(point, &e.residual(), 0.0));
-        let measured = |m: &greybox_model::Measurement| {
+        let measured = |m: &Measurement| {
             let by = if is_temperature(&m.unit) { SHIFT } else { 0.0 };
             !differs(point, &m.expr, by)
         };

@@ -187,7 +187,10 @@ pub(crate) fn pieces(grid: &Grid, time: &[f64], channels: &[Channel]) -> (Vec<Pi
                     number(dt)
                 ),
             )
-            .mend("Record with a hardware clock, or log at a higher rate, if fast motion matters.")
+            .mend(
+                "Record with a hardware clock, or log at a higher rate, if fast motion matters. Of an input with \
+                 `hold = \"zero\"` a model sees the mean over each step instead.",
+            )
             .value(100.0 * worst, Some("%")),
         );
     }

@@ -42,7 +42,8 @@ pub struct Piece {
     pub len: usize,
     /// Per channel (in the order of [`Recording::channels`]) the `len` samples; NaN = missing.
     pub columns: Vec<Vec<f64>>,
-    /// Whether the samples were interpolated linearly onto the grid because the times were not uniform.
+    /// Whether the samples were interpolated linearly onto the grid because the times were not uniform; [`Recording::held`] has
+    /// those of a channel that keeps its values instead.
     pub resampled: bool,
 }
 
@@ -125,12 +126,18 @@ impl Recording {
         Self::assemble(label, name, time, channels, resolution)
     }
 
-    /// The samples of a piece's channel that keeps each value until the next row has another (a command, a switch): what it
-    /// is on average from each point of the grid to the next, so that a system that integrates it ends where the recorded
-    /// one did. NaN before the first value.
+    /// The samples of a piece's channel that keeps each value until the next row (a command, a switch). In a
+    /// [resampled](Piece::resampled) piece sample k is the mean of what was held in the step that begins there,
     ///
-    /// They are those of [`Piece::columns`] unless the piece was [resampled](Piece::resampled), where those are joined by
-    /// straight lines.
+    /// ```text
+    /// u(k) = (1/dt) ∫ u(t) dt   from k dt to (k + 1) dt,
+    /// ```
+    ///
+    /// so that an integrator that it drives ends where the recorded one did; NaN before the first value. In other pieces the
+    /// samples are those of [`Piece::columns`]. One value per sample, in the channel's unit.
+    ///
+    /// # Panics
+    /// If `piece` is of another recording, or there is no such channel.
     ///
     /// ```
     /// use greybox_recording::{Channel, Recording};
