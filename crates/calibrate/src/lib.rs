@@ -14,6 +14,7 @@ pub mod noise_model;
 pub mod problem;
 pub mod qr;
 pub mod setup;
+pub mod stochastic;
 mod student;
 
 pub use data::{Data, DataError, Hats, PieceData, spread};

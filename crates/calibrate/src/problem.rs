@@ -204,7 +204,12 @@ impl Work {
 
     /// Adds a simulation, and says how much it was.
     fn add(&self, trajectory: &Trajectory, lanes: usize, system: &System) -> u64 {
-        let work = (trajectory.evaluations * (1 + lanes) * system.rhs.registers()) as u64;
+        self.add_evaluations(trajectory.evaluations, lanes, system)
+    }
+
+    /// Adds evaluations of the right-hand side with so many tangents, and says how much work they were.
+    pub(crate) fn add_evaluations(&self, evaluations: usize, lanes: usize, system: &System) -> u64 {
+        let work = (evaluations * (1 + lanes) * system.rhs.registers()) as u64;
         self.done.fetch_add(work, Ordering::Relaxed);
         work
     }

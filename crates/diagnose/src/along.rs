@@ -42,31 +42,9 @@ impl<'a> Along<'a> {
         point: &Point,
     ) -> (Along<'a>, Vec<Vec<Vec<f64>>>) {
         let first = Along::smoothed(setup, level, scale, point);
-        // Size of each equation's forces: its terms without highest derivatives, in quadrature.
-        let model = &setup.model;
-        let force: Vec<f64> = model
-            .equations
-            .iter()
-            .map(|equation| {
-                let residual = equation.residual();
-                let own: Vec<Expr> = residual
-                    .terms()
-                    .into_iter()
-                    .map(|(_, t)| t.clone())
-                    .filter(|t| {
-                        !t.variables().iter().any(|(n, p)| {
-                            model.state(n).is_some_and(|j| usize::from(*p) >= model.states[j].order)
-                        })
-                    })
-                    .collect();
-                let Some(values) = first.eval(&own, &[]) else { return 0.0 };
-                let (mut sum, mut count) = (0.0, 0usize);
-                for v in values.iter().flatten().flatten().filter(|v| v.is_finite()) {
-                    sum += v * v;
-                    count += 1;
-                }
-                (sum * own.len() as f64 / count.max(1) as f64).sqrt()
-            })
+        let force: Vec<f64> = first
+            .own_forces()
+            .into_iter()
             .enumerate()
             .map(|(e, f)| {
                 // A mechanism's own equation is exact.
@@ -91,6 +69,53 @@ impl<'a> Along<'a> {
             Along { states: smoothed.states, ..first }
         };
         (along, smoothed.forces)
+    }
+
+    /// RMS of each equation's terms without highest derivatives, in quadrature.
+    fn own_forces(&self) -> Vec<f64> {
+        let model = &self.setup.model;
+        let highest = |t: &Expr| {
+            t.variables()
+                .iter()
+                .any(|(n, p)| model.state(n).is_some_and(|j| usize::from(*p) >= model.states[j].order))
+        };
+        let size = |equation: &greybox_model::Equation| {
+            let residual = equation.residual();
+            let own: Vec<Expr> =
+                residual.terms().into_iter().map(|(_, t)| t.clone()).filter(|t| !highest(t)).collect();
+            let Some(values) = self.eval(&own, &[]) else { return 0.0 };
+            let (mut sum, mut count) = (0.0, 0usize);
+            for v in values.iter().flatten().flatten().filter(|v| v.is_finite()) {
+                sum += v * v;
+                count += 1;
+            }
+            (sum * own.len() as f64 / count.max(1) as f64).sqrt()
+        };
+        model.equations.iter().map(size).collect()
+    }
+
+    /// RMS of all that each equation balances: its terms in quadrature, those with highest derivatives from the smoothed
+    /// measurements.
+    pub fn total_forces(&self) -> Vec<f64> {
+        let (model, own) = (&self.setup.model, self.own_forces());
+        let highest: Vec<(&str, u8)> =
+            model.states.iter().map(|s| (s.name.as_str(), s.order as u8)).collect();
+        let inertial = |equation: &greybox_model::Equation| -> f64 {
+            let Some((mass, _)) = equation.residual().affine_in(&highest) else { return 0.0 };
+            let Some(values) = self.eval(&mass, &[]) else { return 0.0 };
+            let (mut sum, mut count) = (0.0, 0usize);
+            for (j, column) in values.iter().enumerate() {
+                for (p, column) in column.iter().enumerate() {
+                    let Some(z) = &self.setup.hats.highest[p][j] else { continue };
+                    for v in column.iter().zip(z).map(|(c, z)| c * z).filter(|v| v.is_finite()) {
+                        sum += v * v;
+                        count += 1;
+                    }
+                }
+            }
+            (sum * mass.len() as f64 / count.max(1) as f64).sqrt()
+        };
+        model.equations.iter().zip(own).map(|(e, own)| own.hypot(inertial(e))).collect()
     }
 
     /// Smoothed measurements; unmeasured entries from the segments' trajectories.

@@ -478,7 +478,7 @@ fn conclude(
             }
         }
     }
-    let Polished { fitted: improved, origin } = if let Some(proposed) = proposed {
+    let mut polished = if let Some(proposed) = proposed {
         proposed
     } else if found.improved.parts.is_empty() {
         baseline.polished.clone()
@@ -494,6 +494,17 @@ fn conclude(
         let polished = polish(&found.improved, &found.scale, &judge);
         defend(search, &mut found, polished, &baseline, &judge, true)
     };
+    // Where more than noise is left, every model of the machine errs, and output errors do not compare them.
+    let scores = judge.scores(
+        &polished.fitted.setup,
+        &polished.fitted.fit.point.parameters,
+        &residual_scale(&polished.fitted, &found.scale),
+    );
+    if !leaves_noise(&scores, &polished.origin, &residual_scale(&polished.fitted, &found.scale)) {
+        (found, polished, named) = believed(search, (found, polished, named), &baseline, &judge);
+        limited |= found.limited;
+    }
+    let Polished { fitted: improved, origin } = polished;
     let scale = residual_scale(&improved, &found.scale);
     let Baseline { polished: Polished { fitted: calibrated, origin: own }, scale: calibrated_scale, .. } =
         baseline;
@@ -588,23 +599,27 @@ fn conclude(
     // A law that another one, which the library has no name for, stands in for.
     let doubts: Vec<Option<f64>> = (0..improved.parts.len())
         .into_par_iter()
-        .map(|i| search.doubt(&found.improved, i, &found.scale))
+        .map(|i| if found.errs { None } else { search.doubt(&found.improved, i, &found.scale) })
         .collect();
     let beaten = |i: usize| doubts[i].is_some_and(|d| d > UNDECIDED);
     let is_imitation = (0..doubts.len())
         .any(|i| beaten(i) && (lost[i] > CORRECTION || (0..doubts.len()).any(|j| i != j && redundant(i, j))));
     let verdict = match left.verdict(improved.parts.len()) {
         _ if !named && !improved.parts.is_empty() => Verdict::Unexplained,
+        _ if found.errs && share(base - full) < EXPLAINED => Verdict::Unexplained,
         Verdict::MissingPhysics if is_imitation => Verdict::Unexplained,
-        Verdict::MissingPhysics
-            if is_patchwork(&improved, &shares, library, left.steady, redundant)
-                || is_rivalled(&comparable, &found.scale, library) =>
+        verdict
+            if (verdict == Verdict::MissingPhysics || found.errs)
+                && (is_patchwork(&improved, &shares, library, left.steady, redundant)
+                || is_rivalled(&comparable, &found.scale, library)) =>
         {
             Verdict::Unexplained
         }
+        _ if found.errs => Verdict::MissingPhysics,
         verdict => verdict,
     };
-    let significant = left.significant(improved.parts.len()) || verdict == Verdict::Unexplained;
+    let significant =
+        found.errs || left.significant(improved.parts.len()) || verdict == Verdict::Unexplained;
     let mut mechanisms =
         findings(&improved, &found, &nominal.model, library, &scale, &shares, &train_role, &uncertainty);
     let mut subsets = Vec::new();
@@ -617,6 +632,9 @@ fn conclude(
     }
     for (i, m) in mechanisms.iter_mut().enumerate() {
         // What is still missing may be what was taken for this.
+        if found.errs {
+            continue; // the error is in the probability
+        }
         if significant
             || doubts[i].is_some_and(|d| d > -UNDECIDED)
             || is_shared(&improved, &shares, i)
@@ -675,6 +693,39 @@ fn conclude(
         seed: options.seed,
         limited,
     })
+}
+
+/// What the exploration names beside an error of the model, if it can be defended. Else what stands; and where that has no name
+/// either, the likeliest hypothesis if it simulates better. Whether the mechanisms are named.
+fn believed(
+    search: &Search<'_>,
+    standing: (Found, Polished, bool),
+    baseline: &Baseline,
+    judge: &Judge,
+) -> (Found, Polished, bool) {
+    let (found, polished, named) = &standing;
+    let Some(posterior) = search.explore(found) else { return standing };
+    let believes = !posterior.beliefs.is_empty();
+    let likeliest = posterior.tried.as_ref().unwrap_or(&posterior.chosen);
+    let Some(mut adopted) = search.adopt(found, likeliest, &posterior.beliefs) else { return standing };
+    if adopted.improved.parts.is_empty() {
+        return standing;
+    }
+    let own = polish(&adopted.improved, &adopted.scale, judge);
+    let own = defend(search, &mut adopted, own, baseline, judge, false);
+    if own.fitted.parts.is_empty() {
+        return standing;
+    }
+    if believes {
+        return (adopted, own, true);
+    }
+    let misfit = |p: &Polished, scale: &[f64]| {
+        let scale = residual_scale(&p.fitted, scale);
+        judge.misfit(&p.fitted.setup, &p.fitted.fit.point.parameters, &scale)
+    };
+    let is_better = misfit(&own, &adopted.scale).total_cmp(&misfit(polished, &found.scale)).is_lt();
+    let stands = *named && !polished.fitted.parts.is_empty();
+    if is_better && !stands { (adopted, own, false) } else { standing }
 }
 
 fn residual_scale(fitted: &Fitted, scale: &[f64]) -> Vec<f64> {
@@ -1227,6 +1278,9 @@ impl Left {
 const STEADY_DOUBT: f64 = 1.5;
 const STEADY_INNOVATIONS: f64 = 2.5;
 const LIKELIER: f64 = 20.0;
+
+/// Share of the calibrated model's misfit that laws must explain to be the answer where every model errs.
+const EXPLAINED: f64 = 0.5;
 
 /// Most confidence in a mechanism beside which something unexplained remains, or that may be part of another law.
 const DOUBTED: f64 = 0.8;

@@ -9,6 +9,7 @@ pub mod along;
 pub mod candidate;
 pub mod diagnosis;
 pub mod evidence;
+mod explore;
 pub mod library;
 pub mod locate;
 pub mod place;

@@ -16,7 +16,7 @@
 use std::ops::Range;
 use std::sync::Arc;
 
-use greybox_calibrate::{Level, Point, SegmentRows, Setup, qr};
+use greybox_calibrate::{Free, Level, Point, SegmentRows, Setup, qr};
 use greybox_model::{Equation, Expr, Hold, Input, Measurement, Model, Parameter, State, System, Unit};
 use greybox_simulate::{Environment, Method, Seeds, Signal, SignalLanes, integrate};
 use rayon::prelude::*;
@@ -640,6 +640,68 @@ fn project_columns(rows: SegmentRows, nx: usize, columns: Option<&[Range<usize>]
     Projected { rows: m, r, jp, g: signals }
 }
 
+impl Gram {
+    /// No rows yet: of `np` parameters and so many lanes, with the mutual products of these blocks of them.
+    pub fn new(np: usize, lanes: usize, blocks: &[Range<usize>]) -> Gram {
+        Gram {
+            np,
+            jj: vec![0.0; np * np],
+            prior: vec![0.0; np],
+            jr: vec![0.0; np],
+            rr: 0.0,
+            jg: vec![0.0; np * lanes],
+            gr: vec![0.0; lanes],
+            gg: blocks.iter().map(|b| vec![0.0; b.len() * b.len()]).collect(),
+            blocks: blocks.to_vec(),
+            lanes,
+        }
+    }
+
+    /// Adds a row of unit variance: residual, sensitivities, candidate responses.
+    pub fn add_row(&mut self, r: f64, j: &[f64], g: &[f64]) {
+        let (np, lanes) = (self.np, self.lanes);
+        self.rr += r * r;
+        for a in 0..np {
+            self.jr[a] += j[a] * r;
+            for b in 0..np {
+                self.jj[a * np + b] += j[a] * j[b];
+            }
+            let row = &mut self.jg[a * lanes..(a + 1) * lanes];
+            row.iter_mut().zip(g).for_each(|(s, g)| *s += j[a] * g);
+        }
+        self.gr.iter_mut().zip(g).for_each(|(s, g)| *s += g * r);
+        for (block, gg) in self.blocks.iter().zip(&mut self.gg) {
+            let g = &g[block.clone()];
+            for (a, row) in g.iter().zip(gg.chunks_exact_mut(g.len().max(1))) {
+                row.iter_mut().zip(g).for_each(|(s, b)| *s += a * b);
+            }
+        }
+    }
+
+    /// Adds the rows of another of the same shape.
+    pub fn add(&mut self, other: &Gram) {
+        self.rr += other.rr;
+        let add = |a: &mut [f64], b: &[f64]| a.iter_mut().zip(b).for_each(|(a, b)| *a += b);
+        add(&mut self.jj, &other.jj);
+        add(&mut self.jr, &other.jr);
+        add(&mut self.jg, &other.jg);
+        add(&mut self.gr, &other.gr);
+        for (a, b) in self.gg.iter_mut().zip(&other.gg) {
+            add(a, b);
+        }
+    }
+
+    /// Adds what is known of the parameters at these values, where a row's square is worth `weight` of the priors'.
+    pub fn add_priors(&mut self, free: &[Free], parameters: &[f64], weight: f64) {
+        for (i, f) in free.iter().enumerate() {
+            let (g, slope) = f.prior.at(parameters[f.index]);
+            self.jj[i * self.np + i] += slope * slope / weight;
+            self.prior[i] = slope * slope / weight;
+            self.jr[i] -= slope * g / weight;
+        }
+    }
+}
+
 /// Simulates with the lanes and gathers the inner products; `blocks` are the groups of lanes whose
 /// mutual products are wanted.
 pub fn gram(
@@ -700,41 +762,9 @@ pub fn gram(
         })
         .collect();
     // Summed in the order of the segments: the same bytes whatever the number of threads.
-    let mut total: Option<Gram> = None;
-    for part in parts {
-        match &mut total {
-            None => total = Some(part),
-            Some(t) => {
-                t.rr += part.rr;
-                let add = |a: &mut [f64], b: &[f64]| a.iter_mut().zip(b).for_each(|(a, b)| *a += b);
-                add(&mut t.jj, &part.jj);
-                add(&mut t.jr, &part.jr);
-                add(&mut t.jg, &part.jg);
-                add(&mut t.gr, &part.gr);
-                for (a, b) in t.gg.iter_mut().zip(&part.gg) {
-                    add(a, b);
-                }
-            }
-        }
-    }
-    let mut total = total.unwrap_or(Gram {
-        np,
-        jj: vec![0.0; np * np],
-        prior: vec![0.0; np],
-        jr: vec![0.0; np],
-        rr: 0.0,
-        jg: vec![0.0; np * lanes],
-        gr: vec![0.0; lanes],
-        gg: blocks.iter().map(|b| vec![0.0; b.len() * b.len()]).collect(),
-        blocks: blocks.clone(),
-        lanes,
-    });
-    for (i, f) in setup.free.iter().enumerate() {
-        let (g, slope) = f.prior.at(point.parameters[f.index]);
-        total.jj[i * np + i] += slope * slope;
-        total.prior[i] = slope * slope;
-        total.jr[i] -= slope * g;
-    }
+    let mut total = Gram::new(np, lanes, &blocks);
+    parts.iter().for_each(|part| total.add(part));
+    total.add_priors(&setup.free, &point.parameters, 1.0);
     total
 }
 
@@ -999,6 +1029,11 @@ pub fn screen(
     let lanes = lanes(setup, library, candidates, &along, &spectra);
     let blocks: Vec<Range<usize>> = lanes.variants.iter().map(|v| v.columns.clone()).collect();
     let gram = gram(setup, level, scale, point, &lanes.signals, &lanes.columns, blocks);
+    scored(library, candidates, &lanes, &gram)
+}
+
+/// What the inner products say of every candidate, best first.
+pub fn scored(library: &[Mechanism], candidates: &[Candidate], lanes: &Lanes, gram: &Gram) -> Vec<Scored> {
     let mut found: Vec<Vec<Scored>> = vec![Vec::new(); candidates.len()];
     for (index, variant) in lanes.variants.iter().enumerate() {
         let candidate = &candidates[variant.candidate];

@@ -12,6 +12,7 @@ use rayon::prelude::*;
 use crate::along::Along;
 use crate::candidate::{Candidate, Instance, candidates};
 use crate::evidence::{Evidence, Side, folds, kappa, least_kappa, weigh};
+use crate::explore::{Belief, Explorer, Hypothesis, Posterior};
 use crate::library::Mechanism;
 use crate::place::{Place, places};
 use crate::screen::{Pair, Scored, first_states, first_values, inner_scales, screen, screen_pairs};
@@ -190,6 +191,8 @@ pub struct Found {
     pub limited: bool,
     /// With the best single candidate, and the best pair, of the last round that found nothing to be believed.
     pub rejected: Vec<Fitted>,
+    /// The mechanisms are believed beside an error of the model, by their posterior probability.
+    pub errs: bool,
 }
 
 /// The search with everything it needs.
@@ -338,7 +341,7 @@ impl<'a> Search<'a> {
     }
 
     /// The nominal equations plus `parts` (candidate, values, sizes), parameters at `parameters`.
-    fn assemble(
+    pub(crate) fn assemble(
         &self,
         holds: &[Hold],
         parameters: &[f64],
@@ -369,7 +372,7 @@ impl<'a> Search<'a> {
     }
 
     /// Parts of a fitted model with their present values.
-    fn parts(&self, fitted: &Fitted) -> Vec<(Candidate, Vec<f64>, Vec<f64>)> {
+    pub(crate) fn parts(&self, fitted: &Fitted) -> Vec<(Candidate, Vec<f64>, Vec<f64>)> {
         fitted
             .parts
             .iter()
@@ -450,8 +453,20 @@ impl<'a> Search<'a> {
 
     /// Whether every mechanism's requirements on its parameters hold, and no inertia is negative.
     fn admissible(&self, fitted: &Fitted, scale: &[f64]) -> bool {
-        fitted.parts.iter().all(|part| self.allows(part, &fitted.setup, &fitted.fit.point.parameters))
-            && !self.has_negative_inertia(fitted, scale)
+        self.is_admissible(&fitted.parts, &fitted.setup, &fitted.level, &fitted.fit.point, scale)
+    }
+
+    /// The same of parts in a model at a point of a level.
+    pub(crate) fn is_admissible(
+        &self,
+        parts: &[Part],
+        setup: &Setup,
+        level: &Level,
+        point: &Point,
+        scale: &[f64],
+    ) -> bool {
+        parts.iter().all(|part| self.allows(part, setup, &point.parameters))
+            && !self.turns_an_inertia(setup, level, point, scale)
     }
 
     /// Whether a mechanism's requirements on its parameters hold at these values of the model's.
@@ -943,7 +958,69 @@ impl<'a> Search<'a> {
             .map(|i| (i, self.nominal.holds[i], current.setup.holds[i]))
             .collect();
         let (accepted, scale, rejected) = (state.accepted, state.scale, state.rejected);
-        Found { calibrated, improved: current, accepted, better_holds, scale, limited, rejected }
+        Found { calibrated, improved: current, accepted, better_holds, scale, limited, rejected, errs: false }
+    }
+
+    /// Explores what the machine lacks where every model of it errs, from what this search found.
+    pub(crate) fn explore(&self, found: &Found) -> Option<Posterior> {
+        let calibrated = &found.calibrated;
+        Explorer::new(self, &calibrated.setup)
+            .explore(&calibrated.fit.point.parameters, &[&found.improved])
+    }
+
+    /// A hypothesis fitted to the segments of what this search found, in its place.
+    pub(crate) fn adopt(&self, found: &Found, h: &Hypothesis, beliefs: &[Belief]) -> Option<Found> {
+        let at = &h.fitted.at;
+        let n0 = self.nominal.model.parameters.len();
+        let value = |name: &String| at.setup.model.parameter(name).map(|i| at.parameters[i]);
+        let parts: Option<Vec<(Candidate, Vec<f64>, Vec<f64>)>> = h
+            .parts
+            .iter()
+            .map(|p| {
+                let values: Option<Vec<f64>> = p.instance.names.iter().map(value).collect();
+                Some((p.candidate.clone(), values?, p.scales.clone()))
+            })
+            .collect();
+        let (setup, parts) =
+            self.assemble(&at.setup.holds, &at.parameters[..n0], &parts?, &at.setup).ok()?;
+        let setup = Setup { noise: None, ..setup };
+        let level = same_level(&setup, &found.calibrated.level);
+        let starts = setup.starts(&level, &at.parameters);
+        let point = Point { parameters: at.parameters.clone(), starts };
+        let fit = setup.fit(&level, &found.scale, &[point], limits(15));
+        if !fit.cost.is_finite() {
+            return None;
+        }
+        let mut improved = Fitted { setup, parts, level, fit };
+        let scale = next_scale(&improved.fit, &found.scale, &self.nominal.data.sigma);
+        self.method(&mut improved, &scale);
+        improved = self.refit(&improved, &scale, 10);
+        let score = |gain: f64| Evidence { score: 2.0 * gain, ..Evidence::NONE };
+        let accepted = improved.parts.iter().zip(beliefs).map(|(part, belief)| Accepted {
+            candidate: part.candidate.clone(),
+            evidence: score(belief.gain),
+            rivals: belief
+                .others
+                .iter()
+                .map(|other| Rival {
+                    candidate: other.part.candidate.clone(),
+                    instance: other.part.instance.clone(),
+                    evidence: score(belief.gain + (other.probability / belief.probability).ln()),
+                    equivalent: other.equivalent,
+                })
+                .collect(),
+        });
+        let accepted = accepted.collect();
+        Some(Found {
+            calibrated: found.calibrated.clone(),
+            improved,
+            accepted,
+            better_holds: found.better_holds.clone(),
+            scale,
+            limited: found.limited || self.limited.load(Ordering::Relaxed),
+            rejected: Vec::new(),
+            errs: true,
+        })
     }
 
     /// The model without part `index`, on the same segments, refitted.
@@ -978,17 +1055,24 @@ impl<'a> Search<'a> {
 
     /// The parts that act at certain times of a single recording. Nothing tells when they would act in another.
     pub fn bound_to_a_clock(&self, fitted: &Fitted) -> Vec<usize> {
-        let single = self.nominal.data.recordings.len() == 1;
-        let bound = |i: &usize| single && is_timed(&self.library[fitted.parts[*i].candidate.mechanism]);
-        (0..fitted.parts.len()).filter(bound).collect()
+        (0..fitted.parts.len()).filter(|i| self.is_bound_to_a_clock(&fitted.parts[*i].candidate)).collect()
+    }
+
+    /// Whether a candidate acts at certain times of a single recording.
+    pub(crate) fn is_bound_to_a_clock(&self, candidate: &Candidate) -> bool {
+        self.nominal.data.recordings.len() == 1 && is_timed(&self.library[candidate.mechanism])
     }
 
     /// Whether the mechanisms turn the sign of the mass matrix's determinant somewhere along the recordings: a negative
     /// inertia, or a coupling of accelerations stronger than the inertias that it couples.
     pub fn has_negative_inertia(&self, fitted: &Fitted, scale: &[f64]) -> bool {
-        let along = Along::smoothed(&fitted.setup, &fitted.level, scale, &fitted.fit.point);
+        self.turns_an_inertia(&fitted.setup, &fitted.level, &fitted.fit.point, scale)
+    }
+
+    fn turns_an_inertia(&self, setup: &Setup, level: &Level, point: &Point, scale: &[f64]) -> bool {
+        let along = Along::smoothed(setup, level, scale, point);
         let n0 = self.nominal.system.nz;
-        let model = &fitted.setup.model;
+        let model = &setup.model;
         let highest: Vec<(&str, u8)> =
             self.nominal.model.states.iter().map(|s| (s.name.as_str(), s.order as u8)).collect();
         let mass = |model: &Model| -> Option<Vec<greybox_model::Expr>> {
@@ -1100,7 +1184,7 @@ impl<'a> Search<'a> {
 
     /// Whether the work is used up. Asked only between one step of the search and the next: the sum does not
     /// depend on the order in which threads add to it.
-    fn is_spent(&self) -> bool {
+    pub(crate) fn is_spent(&self) -> bool {
         self.would_overspend(0)
     }
 
@@ -1407,7 +1491,7 @@ impl<'a> Search<'a> {
     }
 
     /// The `most` strongest candidates, no more than two of a kind, and up to `more` of other kinds near the best.
-    fn short_list<'s>(
+    pub(crate) fn short_list<'s>(
         &self,
         open: &[Candidate],
         scored: &'s [Scored],

@@ -33,6 +33,7 @@ mod event;
 mod history;
 mod record;
 mod stage;
+mod stepper;
 mod tableau;
 mod tangent;
 
@@ -45,6 +46,7 @@ use self::event::MOST_EVENTS;
 pub use self::history::{Carry, delayed_states, has_history};
 use self::history::{History, LaneMap};
 use self::stage::{Held, Rates, Stage, dot};
+pub use self::stepper::Stepper;
 use self::tableau::{DOP853, DP5, RK4, Tableau};
 use self::tangent::width;
 use crate::aligned::Aligned;

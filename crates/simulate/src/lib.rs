@@ -12,7 +12,7 @@ mod signal;
 pub mod small;
 
 pub use integrate::{
-    Carry, Environment, Force, MOST_TRIALS, Method, Seeds, SignalLanes, Simulation, Trajectory,
+    Carry, Environment, Force, MOST_TRIALS, Method, Seeds, SignalLanes, Simulation, Stepper, Trajectory,
     delayed_states, has_history, integrate,
 };
 pub use signal::{FINE, Signal};

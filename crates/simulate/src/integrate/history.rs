@@ -81,6 +81,14 @@ impl History {
         (value, slope, i, w)
     }
 
+    /// Without its first entries.
+    pub(super) fn cut(&mut self, entries: usize, lanes: usize) {
+        self.s.drain(..entries);
+        self.value.drain(..entries);
+        self.slope.drain(..entries);
+        self.lanes.drain(..entries * lanes);
+    }
+
     /// What a stretch from `s` on may still read with a delay of at most `tau`.
     pub(super) fn recent(&self, s: f64, tau: f64, lanes: usize) -> History {
         let from = self.s.partition_point(|&t| t <= s - tau).saturating_sub(1);

@@ -1,0 +1,856 @@
+//! Which laws a machine lacks, where its model errs whatever is added: hypotheses with a model error of their own, compared
+//! by their posterior probability.
+//!
+//! A hypothesis is a set of laws beside the machine's equations. Its likelihood is the composite one of
+//! [`greybox_calibrate::stochastic`], in which every equation of the machine may err by a random force. Its evidence is
+//! Laplace's, with the likelihood tempered by the inflation c, since samples tell of each other:
+//!
+//! ```text
+//! ln Z = ln L/c + ln π(p̂) − ½ ln |I/c + Λ| + ½ n ln 2π − k ln N
+//! ```
+//!
+//! | part | prior |
+//! |---|---|
+//! | a law | one of the N candidates: 1/N each |
+//! | a strength | normal about zero, as wide as the strength whose force is all the force that the equation has |
+//! | an inner parameter | even in its logarithm between the bounds of its file |
+//! | a parameter of the machine | as stated, or Cauchy about its value ([`greybox_calibrate::free_parameters`]) |
+//! | ln q, ln r | even over the range that a fit may use |
+
+use greybox_calibrate::stochastic::{Filter, Fitted as Filtered, Pass, Stochastic};
+use greybox_calibrate::{Level, Point, Prior, Setup};
+use greybox_simulate::SignalLanes;
+use rayon::prelude::*;
+
+use crate::along::Along;
+use crate::candidate::Candidate;
+use crate::library::First;
+use crate::screen::{Gram, Lanes, Scored, first_states, lanes, scored};
+use crate::search::{Fitted, Part, Search};
+use crate::spectra::Spectra;
+use crate::{Observer, Stage};
+
+/// Probability from which a family of laws is named.
+pub(crate) const NAMED: f64 = 0.95;
+/// Probabilities whose ratio is less than e to this stay undecided.
+const UNDECIDED: f64 = 1.5;
+/// Hypotheses of each number of laws that are followed.
+const BEAM: usize = 2;
+/// Most laws.
+const MOST: usize = 4;
+/// Most candidates that are fitted to each hypothesis, and of these to the end.
+const SHORT_LIST: usize = 9;
+const FINALISTS: usize = 5;
+/// Steps that tell which these are, further steps that tell which of them go to the end, how many do, and the steps of their
+/// fits.
+const FIRST_STEPS: usize = 3;
+const MORE_STEPS: usize = 6;
+const BEST: usize = 3;
+const LAST_STEPS: usize = 25;
+/// Steps of the fit of the machine's own equations, and rounds of doubt.
+const CALIBRATION: usize = 40;
+const ROUNDS: usize = 3;
+/// Gain in nats that a candidate must promise to be fitted.
+const PROMISING: f64 = 1.0;
+/// Departure of a parameter from what is stated, in units of its prior, from which candidates are also tried where it is
+/// stated: a calibrated parameter may stand in for what is missing.
+const FAR: f64 = 1.0;
+/// Range of a logarithm, ln q or ln r, and the least share of the highest value of an inner parameter that its logarithm
+/// reaches.
+const RANGE: f64 = 37.0;
+const LEAST: f64 = 1e-3;
+/// Segments along which candidates are evaluated.
+const SEGMENTS: usize = 20;
+
+/// What is known of a law's parameter before the data.
+#[derive(Debug, Clone, PartialEq)]
+enum Known {
+    /// Normal about zero, with this deviation.
+    Strength(f64),
+    /// Its logarithm is even over so much.
+    Inner(f64),
+    /// An angle.
+    Angle,
+}
+
+/// A law of a hypothesis with its parameters.
+#[derive(Debug, Clone)]
+struct Member {
+    candidate: Candidate,
+    values: Vec<f64>,
+    scales: Vec<f64>,
+    known: Vec<Known>,
+}
+
+/// The machine's equations with some laws, fitted.
+#[derive(Debug, Clone)]
+pub(crate) struct Hypothesis {
+    members: Vec<Member>,
+    /// The laws as they stand in the model.
+    pub(crate) parts: Vec<Part>,
+    /// The fit.
+    pub(crate) fitted: Filtered,
+}
+
+impl Hypothesis {
+    fn holds(&self, candidate: &Candidate) -> bool {
+        self.members.iter().any(|m| m.candidate == *candidate)
+    }
+
+    /// Whether it has the same laws.
+    fn is(&self, others: &[&Candidate]) -> bool {
+        self.members.len() == others.len() && others.iter().all(|c| self.holds(c))
+    }
+
+    fn at(&self) -> &Stochastic {
+        &self.fitted.at
+    }
+
+    /// What is known before the data of everything that is free: logarithm of the density, precision.
+    fn priors(&self) -> (f64, Vec<f64>) {
+        let at = self.at();
+        let machine = at.setup.free.len() - self.members.iter().map(|m| m.values.len()).sum::<usize>();
+        let mut log = 0.0;
+        let mut precision = Vec::new();
+        for f in &at.setup.free[..machine] {
+            let value = at.parameters[f.index];
+            log -= 0.5 * f.prior.at(value).0.powi(2);
+            precision.push(f.prior.precision(value));
+        }
+        let laws = self.members.iter().flat_map(|m| &m.known);
+        for (f, known) in at.setup.free[machine..].iter().zip(laws) {
+            let value = at.parameters[f.index];
+            match known {
+                Known::Strength(width) => {
+                    log -= 0.5 * ((value / width).powi(2) + (2.0 * std::f64::consts::PI * width * width).ln());
+                    precision.push(1.0 / (width * width));
+                }
+                Known::Inner(range) => {
+                    let size = (value.abs() * range).max(1e-300);
+                    log -= size.ln();
+                    precision.push(12.0 / (size * size));
+                }
+                Known::Angle => {
+                    let turn = 2.0 * std::f64::consts::PI;
+                    log -= turn.ln();
+                    precision.push(12.0 / (turn * turn));
+                }
+            }
+        }
+        precision.resize(self.fitted.pass.gradient.len(), 12.0 / (RANGE * RANGE));
+        (log, precision)
+    }
+
+    /// ln Z with the likelihood tempered by `c`, among `candidates` laws.
+    fn evidence(&self, c: f64, candidates: usize) -> f64 {
+        let (prior, precision) = self.priors();
+        let Pass { log, information, .. } = &self.fitted.pass;
+        let n = precision.len();
+        let mut h: Vec<f64> = information.iter().map(|i| i / c).collect();
+        for (a, p) in precision.iter().enumerate() {
+            h[a * n + a] += p;
+        }
+        let laws = self.members.len() as f64 * (candidates.max(1) as f64).ln();
+        let normal = 0.5 * n as f64 * (2.0 * std::f64::consts::PI).ln();
+        log / c + prior + normal - 0.5 * log_determinant(&h, n) - laws
+    }
+}
+
+/// ln of the determinant of a positive definite matrix, from Cholesky's factor of the matrix with a unit diagonal.
+fn log_determinant(a: &[f64], n: usize) -> f64 {
+    let d: Vec<f64> = (0..n).map(|i| a[i * n + i].max(1e-300).sqrt()).collect();
+    let mut l: Vec<f64> = (0..n * n).map(|i| a[i] / (d[i / n] * d[i % n])).collect();
+    let mut log = 0.0;
+    for j in 0..n {
+        let mut pivot = l[j * n + j] + 1e-12;
+        for k in 0..j {
+            pivot -= l[j * n + k] * l[j * n + k];
+        }
+        let pivot = pivot.max(1e-12);
+        log += pivot.ln() + 2.0 * d[j].ln();
+        let root = pivot.sqrt();
+        l[j * n + j] = root;
+        for i in j + 1..n {
+            let mut v = l[i * n + j];
+            for k in 0..j {
+                v -= l[i * n + k] * l[j * n + k];
+            }
+            l[i * n + j] = v / root;
+        }
+    }
+    log
+}
+
+/// Another law in the place of one of the chosen.
+#[derive(Debug, Clone)]
+pub(crate) struct Other {
+    /// The law as it would stand in the model.
+    pub(crate) part: Part,
+    /// Its probability.
+    pub(crate) probability: f64,
+    /// The data cannot separate the two.
+    pub(crate) equivalent: bool,
+}
+
+/// A law of the chosen hypothesis.
+#[derive(Debug, Clone)]
+pub(crate) struct Belief {
+    /// Its probability, all others given.
+    pub(crate) probability: f64,
+    /// Probability of its family and of what the data cannot separate from it, all others given.
+    pub(crate) family: f64,
+    /// ln of its evidence over that of the hypothesis without it.
+    pub(crate) gain: f64,
+    /// What could stand in its place.
+    pub(crate) others: Vec<Other>,
+}
+
+/// What the exploration believes.
+#[derive(Debug, Clone)]
+pub(crate) struct Posterior {
+    /// The machine's equations with the laws whose families are all named.
+    pub(crate) chosen: Hypothesis,
+    /// Per law of it.
+    pub(crate) beliefs: Vec<Belief>,
+    /// Where no law is named: the likeliest hypothesis that has some.
+    pub(crate) tried: Option<Hypothesis>,
+}
+
+/// The exploration with everything it needs.
+pub(crate) struct Explorer<'a, 'b> {
+    search: &'a Search<'b>,
+    machine: Setup,
+    filter: Filter,
+    /// What is known of the parameters of each candidate before the data.
+    known: Vec<Vec<Known>>,
+    /// All hypotheses that were fitted.
+    rows: Vec<Hypothesis>,
+    /// Which of them have their extensions among the others.
+    extended: Vec<bool>,
+    /// How much the likelihood overstates what the samples tell.
+    inflation: f64,
+}
+
+impl<'a, 'b> Explorer<'a, 'b> {
+    /// Of a machine with its inputs held as a search decided.
+    pub(crate) fn new(search: &'a Search<'b>, machine: &Setup) -> Explorer<'a, 'b> {
+        let machine = Setup { noise: None, ..machine.clone() };
+        let filter = Filter::new(&machine);
+        Explorer { search, machine, filter, known: Vec::new(), rows: Vec::new(), extended: Vec::new(), inflation: 1.0 }
+    }
+
+    fn observer(&self) -> &dyn Observer {
+        self.search.observer
+    }
+
+    fn evidence(&self, h: &Hypothesis) -> f64 {
+        h.evidence(self.inflation, self.search.candidates().len())
+    }
+
+    /// The machine's equations alone, from parameters that another fit found or from those that are stated.
+    fn machine_alone(&self, found: &[f64]) -> Option<Hypothesis> {
+        let stated = self.machine.values();
+        let start = |parameters: &[f64]| Stochastic {
+            setup: self.machine.clone(),
+            parameters: parameters.to_vec(),
+            errors: self.filter.first_errors(),
+            starts: Vec::new(),
+        };
+        let fits: Vec<Option<Filtered>> = [found, &stated]
+            .par_iter()
+            .map(|parameters| self.filter.fit(start(parameters), self.weight(), CALIBRATION))
+            .collect();
+        let fitted = fits.into_iter().flatten().max_by(|a, b| a.objective.total_cmp(&b.objective))?;
+        Some(Hypothesis { members: Vec::new(), parts: Vec::new(), fitted })
+    }
+
+    /// Weight of the likelihood in a fit.
+    fn weight(&self) -> f64 {
+        1.0 / self.inflation.max(self.filter.strides().len() as f64)
+    }
+
+    /// The same hypothesis where the machine's parameters are as stated, if some are far from it.
+    fn as_stated(&self, h: &Hypothesis) -> Option<Hypothesis> {
+        let at = h.at();
+        let far = self.machine.free.iter().any(|f| f.prior.at(at.parameters[f.index]).0.abs() > FAR);
+        if !far || !h.members.is_empty() {
+            return None;
+        }
+        let held = Setup { free: Vec::new(), ..self.machine.clone() };
+        let start = Stochastic { setup: held, parameters: self.machine.values(), ..at.clone() };
+        let mut fitted = self.filter.fit(start, self.weight(), LAST_STEPS)?;
+        fitted.at.setup.free.clone_from(&self.machine.free);
+        Some(Hypothesis { members: Vec::new(), parts: Vec::new(), fitted })
+    }
+
+    /// Segments over all data, with the starts that a hypothesis gives them.
+    fn level(&self, h: &Hypothesis) -> (Level, Point) {
+        let at = h.at();
+        let level = at.setup.level(SEGMENTS);
+        let starts = at.setup.starts(&level, &at.parameters);
+        (level, Point { parameters: at.parameters.clone(), starts })
+    }
+
+    /// The score test of all open candidates in the innovations of a hypothesis, best first.
+    fn proposals(&self, h: &Hypothesis, open: &[Candidate]) -> Vec<Scored> {
+        let library = self.search.library;
+        let at = h.at();
+        let setup = &at.setup;
+        let (level, point) = self.level(h);
+        let scale: Vec<f64> = at.errors.sensor.iter().map(|r| (0.5 * r).exp()).collect();
+        let (along, forces) = Along::observed(setup, &level, &scale, &point);
+        let spectra = Spectra::new(setup, &level, &scale, &point, &along, &forces);
+        let lanes = lanes(setup, library, open, &along, &spectra);
+        let blocks: Vec<_> = lanes.variants.iter().map(|v| v.columns.clone()).collect();
+        let (np, columns) = (setup.free.len(), lanes.columns.len());
+        let new = || (Gram::new(np, columns, &blocks), vec![0.0; np], vec![0.0; columns]);
+        let run = self.filter.run(at, true, Some(&lanes.signals), new, |(gram, j, g), i| {
+            let root = i.s.sqrt();
+            j.iter_mut().zip(i.by_parameters).for_each(|(j, de)| *j = -de / root);
+            for (g, range) in g.iter_mut().zip(&lanes.columns) {
+                *g = -i.by_signals[range.clone()].iter().sum::<f64>() / root;
+            }
+            gram.add_row(i.e / root, j, g);
+        });
+        let Some(parts) = run else { return Vec::new() };
+        let mut gram = Gram::new(np, columns, &blocks);
+        parts.iter().for_each(|part| gram.add(&part.0));
+        gram.add_priors(&setup.free, &at.parameters, self.weight());
+        let promised = |s: &Scored| 0.5 * s.gain * gram.remaining() * self.weight();
+        scored(library, open, &lanes, &gram).into_iter().filter(|s| promised(s) > PROMISING).collect()
+    }
+
+    /// What is known of the parameters of all candidates before the data.
+    fn all_known(&self, machine: &Hypothesis) -> Vec<Vec<Known>> {
+        let candidates = self.search.candidates();
+        let setup = &machine.at().setup;
+        let (level, point) = self.level(machine);
+        let scale = &setup.data.spread;
+        let (along, forces) = Along::observed(setup, &level, scale, &point);
+        let spectra = Spectra::new(setup, &level, scale, &point, &along, &forces);
+        let lanes = lanes(setup, self.search.library, candidates, &along, &spectra);
+        let total = totals(setup, &along);
+        (0..candidates.len()).map(|c| self.known_of(c, &lanes, &total)).collect()
+    }
+
+    fn known_of(&self, index: usize, lanes: &Lanes, total: &Totals) -> Vec<Known> {
+        let mechanism = &self.search.library[self.search.candidates()[index].mechanism];
+        let variants = || lanes.variants.iter().filter(|v| v.candidate == index);
+        // Of a strength: the widest of what any choice of the inner parameters says.
+        let width = |i: usize| {
+            variants()
+                .filter(|v| v.secant.is_none())
+                .filter_map(|v| v.columns.clone().nth(i))
+                .map(|column| total.width(lanes, column))
+                .filter(|w| w.is_finite() && *w > 0.0)
+                .fold(0.0, f64::max)
+        };
+        let widest = (0..mechanism.linear.len()).map(width).fold(0.0, f64::max);
+        let or_one = |w: f64| if w > 0.0 { w } else { 1.0 };
+        mechanism
+            .parameters()
+            .map(|name| {
+                if let Some((_, inner)) = mechanism.inner(name) {
+                    return Known::Inner((inner.high / inner.low.max(LEAST * inner.high)).ln().max(1.0));
+                }
+                match mechanism.linear.iter().position(|l| l == name) {
+                    Some(i) => Known::Strength(or_one(width(i))),
+                    None => match mechanism.first.iter().find(|f| f.0 == name) {
+                        Some((_, First::Angle(..))) => Known::Angle,
+                        _ => Known::Strength(or_one(widest)),
+                    },
+                }
+            })
+            .collect()
+    }
+
+    fn member(&self, candidate: &Candidate, values: Vec<f64>, scales: Vec<f64>) -> Option<Member> {
+        let index = self.search.candidates().iter().position(|c| c == candidate)?;
+        Some(Member { candidate: candidate.clone(), values, scales, known: self.known.get(index)?.clone() })
+    }
+
+    /// What another search found, as a hypothesis.
+    fn adopted(&self, machine: &Hypothesis, other: &Fitted) -> Option<Hypothesis> {
+        if other.parts.is_empty() {
+            return None;
+        }
+        let members: Option<Vec<Member>> = self
+            .search
+            .parts(other)
+            .into_iter()
+            .map(|(candidate, values, scales)| self.member(&candidate, values, scales))
+            .collect();
+        let members = members?;
+        let n0 = self.machine.model.parameters.len();
+        let point = &other.fit.point;
+        let mut fresh = vec![Vec::new(); self.machine.data.pieces.len()];
+        for (segment, start) in other.level.segments.iter().zip(&point.starts).filter(|s| s.0.range.start == 0) {
+            for (j, state) in other.setup.model.states.iter().enumerate() {
+                if self.machine.model.state(&state.name).is_none() {
+                    let at = other.setup.system.offsets[j];
+                    fresh[segment.piece].extend_from_slice(&start[at..at + state.order]);
+                }
+            }
+        }
+        let (mut start, parts) = self.assembled(machine, &members, &point.parameters[..n0], &fresh)?;
+        start.setup.method = other.setup.method;
+        let fitted = self.filter.fit(start, self.weight(), LAST_STEPS)?;
+        Some(Hypothesis { members, parts, fitted })
+    }
+
+    /// A hypothesis with these laws and the parameters of the machine, to be fitted; new states start as `fresh` says.
+    fn assembled(
+        &self,
+        base: &Hypothesis,
+        members: &[Member],
+        machine: &[f64],
+        fresh: &[Vec<f64>],
+    ) -> Option<(Stochastic, Vec<Part>)> {
+        let at = base.at();
+        let parts: Vec<_> =
+            members.iter().map(|m| (m.candidate.clone(), m.values.clone(), m.scales.clone())).collect();
+        let (mut setup, parts) = self.search.assemble(&self.machine.holds, machine, &parts, &at.setup).ok()?;
+        setup.noise = None;
+        let first = self.machine.free.len();
+        for (f, known) in setup.free[first..].iter_mut().zip(members.iter().flat_map(|m| &m.known)) {
+            if let Known::Strength(width) = known {
+                f.prior = Prior::Normal { mean: 0.0, std: *width };
+            }
+        }
+        let starts = (0..setup.data.pieces.len())
+            .map(|p| {
+                let mut x = vec![f64::NAN; setup.system.nx];
+                let mut new = fresh.get(p).into_iter().flatten();
+                for (j, state) in setup.model.states.iter().enumerate() {
+                    let known = at.setup.model.state(&state.name).map(|i| at.setup.system.offsets[i]);
+                    for k in 0..state.order {
+                        let of = |from: usize| at.starts.get(p).and_then(|s| s.get(from + k)).copied();
+                        x[setup.system.offsets[j] + k] = match known {
+                            Some(from) => of(from).unwrap_or(f64::NAN),
+                            None => new.next().copied().unwrap_or(0.0),
+                        };
+                    }
+                }
+                x
+            })
+            .collect();
+        let parameters = setup.values();
+        Some((Stochastic { setup, parameters, errors: at.errors.clone(), starts }, parts))
+    }
+
+    /// Values of a hypothesis's laws now.
+    fn members(&self, h: &Hypothesis) -> Vec<Member> {
+        let mut members = h.members.clone();
+        for (member, part) in members.iter_mut().zip(&h.parts) {
+            let names = part.instance.names.iter();
+            for (v, name) in member.values.iter_mut().zip(names) {
+                if let Some(i) = h.at().setup.model.parameter(name) {
+                    *v = h.at().parameters[i];
+                }
+            }
+        }
+        members
+    }
+
+    /// Starts of a fit of a hypothesis with one law more, the likeliest first.
+    fn first_points(&self, h: &Hypothesis, member: &Member, s: &Scored) -> Option<(Stochastic, Vec<Part>)> {
+        let n0 = self.machine.model.parameters.len();
+        let at = h.at();
+        let mechanism = &self.search.library[member.candidate.mechanism];
+        let fresh = if mechanism.states.is_empty() {
+            Vec::new()
+        } else {
+            let (level, point) = self.level(h);
+            let scale: Vec<f64> = at.errors.sensor.iter().map(|r| (0.5 * r).exp()).collect();
+            let along = Along::smoothed(&at.setup, &level, &scale, &point);
+            first_states(&at.setup, mechanism, &member.candidate, &along)?
+        };
+        let mut members = self.members(h);
+        members.push(member.clone());
+        let (mut start, parts) = self.assembled(h, &members, &at.parameters[..n0], &fresh)?;
+        if !mechanism.states.is_empty() {
+            // What it brings along may be faster than the machine.
+            let tolerance: Vec<f64> = start.setup.data.spread.iter().map(|s| 1e-3 * s).collect();
+            start.setup.choose_method(&tolerance, usize::MAX);
+        }
+        let own = start.parameters.len() - member.values.len();
+        let point = |values: &[f64], shift: Option<&[f64]>| {
+            let mut point = start.clone();
+            point.parameters[own..].copy_from_slice(values);
+            if let Some(shift) = shift {
+                for (f, d) in at.setup.free.iter().zip(shift) {
+                    point.parameters[f.index] = (point.parameters[f.index] + d).max(f.lower).min(f.upper);
+                }
+            }
+            point
+        };
+        let mut points = vec![point(&s.values, None), point(&s.values, Some(&s.shift))];
+        points.extend(s.faint.iter().map(|faint| point(faint, None)));
+        for (_, values, shift) in &s.others {
+            points.push(point(values, None));
+            points.push(point(values, Some(shift)));
+        }
+        let worth = |p: &Stochastic| self.filter.pass(p, false).map_or(f64::NEG_INFINITY, |pass| pass.log);
+        let priced: Vec<f64> = points.iter().map(worth).collect();
+        let best = (0..points.len()).max_by(|a, b| priced[*a].total_cmp(&priced[*b]))?;
+        priced[best].is_finite().then(|| (points.swap_remove(best), parts))
+    }
+
+    /// The hypothesis with one law more, for each that promises something, fitted.
+    fn extensions(&self, base: &Hypothesis) -> Vec<Hypothesis> {
+        let library = self.search.library;
+        let taken = |c: &Candidate| {
+            base.members.iter().any(|m| {
+                let (own, kind) = (&library[m.candidate.mechanism], &library[c.mechanism].kind);
+                m.candidate == *c
+                    || m.candidate.place == c.place
+                        && (own.refines.contains(kind) || library[c.mechanism].refines.contains(&own.kind))
+            })
+        };
+        // (What a single recording shows at certain times may not come back: it is never handed back beside an error.)
+        let all = self.search.candidates().iter();
+        let open: Vec<Candidate> =
+            all.filter(|c| !taken(c) && !self.search.is_bound_to_a_clock(c)).cloned().collect();
+        self.observer().stage(Stage::Screening { candidates: open.len(), found: base.members.len() });
+        let stated = self.as_stated(base);
+        let mut out: Vec<Hypothesis> = Vec::new();
+        for (anchor, h) in [Some(base), stated.as_ref()].into_iter().flatten().enumerate() {
+            let scored = self.proposals(h, &open);
+            let short = self.search.short_list(&open, &scored, 0.0, SHORT_LIST, 0);
+            self.observer().stage(Stage::Fitting { candidates: short.len() });
+            if greybox_debug() {
+                eprintln!("anchor {anchor} log {:.1} q {:?} r {:?} e {:?}", h.fitted.pass.log, h.at().errors.force, h.at().errors.sensor, h.fitted.pass.errors);
+                for s in &short {
+                    eprintln!("     {:.3} {} {:?} {:?}", s.gain, library[open[s.candidate].mechanism].kind, s.values, s.shift);
+                }
+            }
+            // (What starts at stated parameters has far to go: a few steps tell nothing.)
+            let (steps, most) = if anchor == 0 { (FIRST_STEPS, short.len()) } else { (0, FINALISTS) };
+            let mut trials: Vec<Hypothesis> = short[..most.min(short.len())]
+                .par_iter()
+                .filter_map(|s| {
+                    let member = self.member(&open[s.candidate], s.values.clone(), s.scales.clone())?;
+                    let (start, parts) = self.first_points(h, &member, s)?;
+                    let fitted = self.filter.fit(start, self.weight(), steps)?;
+                    let mut members = self.members(h);
+                    members.push(member);
+                    Some(Hypothesis { members, parts, fitted })
+                })
+                .collect();
+            if anchor == 0 {
+                trials.sort_by(|a, b| self.evidence(b).total_cmp(&self.evidence(a)));
+                trials.truncate(FINALISTS);
+            }
+            let go_on = |trials: Vec<Hypothesis>, steps: usize| -> Vec<Hypothesis> {
+                trials
+                    .into_par_iter()
+                    .filter_map(|h| {
+                        let fitted = self.filter.fit(h.fitted.at, self.weight(), steps)?;
+                        Some(Hypothesis { fitted, ..h })
+                    })
+                    .filter(|h| self.is_admissible(h))
+                    .collect()
+            };
+            if anchor == 0 {
+                trials = go_on(trials, MORE_STEPS);
+                trials.sort_by(|a, b| self.evidence(b).total_cmp(&self.evidence(a)));
+            }
+            let rest = if anchor == 0 { trials.split_off(trials.len().min(BEST)) } else { Vec::new() };
+            let mut finished = go_on(trials, LAST_STEPS);
+            finished.extend(rest);
+            for h in finished {
+                let same = |o: &Hypothesis| o.members[o.members.len() - 1].candidate == h.members[h.members.len() - 1].candidate;
+                match out.iter_mut().find(|o| same(o)) {
+                    Some(known) if self.evidence(&h) > self.evidence(known) => *known = h,
+                    Some(_) => {}
+                    None => out.push(h),
+                }
+            }
+        }
+        if greybox_debug() {
+            let mut told: Vec<&Hypothesis> = out.iter().collect();
+            told.sort_by(|a, b| self.evidence(b).total_cmp(&self.evidence(a)));
+            eprintln!("base {:?} {:.1} c {:.1} q {:?} steps {:?}", self.name(base), self.evidence(base), self.inflation, base.at().errors.force, base.fitted.pass.errors);
+            for h in told {
+                let p: Vec<f64> = h.at().setup.free.iter().map(|f| h.at().parameters[f.index]).collect();
+                eprintln!("   {:.1} {} {:.4?} q {:.2?} e {:.4?}", self.evidence(h), self.name(h), p, h.at().errors.force, h.fitted.pass.errors);
+            }
+        }
+        out
+    }
+
+    fn name(&self, h: &Hypothesis) -> String {
+        let of = |p: &Part| format!("{}[{}]", self.search.library[p.candidate.mechanism].kind, p.instance.expression);
+        h.parts.iter().map(of).collect::<Vec<_>>().join(" + ")
+    }
+
+    /// Whether every law's requirements hold, and no inertia is negative.
+    fn is_admissible(&self, h: &Hypothesis) -> bool {
+        let at = h.at();
+        let (level, point) = self.level(h);
+        let scale = vec![1.0; at.errors.sensor.len()];
+        self.search.is_admissible(&h.parts, &at.setup, &level, &point, &scale)
+    }
+
+    /// The hypothesis without one of its laws, fitted.
+    fn without(&self, h: &Hypothesis, index: usize) -> Option<Hypothesis> {
+        let mut members = self.members(h);
+        members.remove(index);
+        let others: Vec<&Candidate> = members.iter().map(|m| &m.candidate).collect();
+        if let Some(known) = self.rows.iter().find(|row| row.is(&others)) {
+            return Some(known.clone());
+        }
+        let n0 = self.machine.model.parameters.len();
+        let (start, parts) = self.assembled(h, &members, &h.at().parameters[..n0], &[])?;
+        let fitted = self.filter.fit(start, self.weight(), LAST_STEPS)?;
+        Some(Hypothesis { members, parts, fitted })
+    }
+
+    /// Keeps a hypothesis, or the better of two fits of it; its index.
+    fn keep(&mut self, h: Hypothesis) -> usize {
+        let candidates: Vec<&Candidate> = h.members.iter().map(|m| &m.candidate).collect();
+        match self.rows.iter().position(|row| row.is(&candidates)) {
+            Some(i) => {
+                if self.evidence(&h) > self.evidence(&self.rows[i]) {
+                    self.rows[i] = h;
+                }
+                i
+            }
+            None => {
+                self.rows.push(h);
+                self.extended.push(false);
+                self.rows.len() - 1
+            }
+        }
+    }
+
+    /// Keeps the extensions of a row.
+    fn extend(&mut self, row: usize) {
+        if !std::mem::replace(&mut self.extended[row], true) {
+            for h in self.extensions(&self.rows[row]) {
+                self.keep(h);
+            }
+        }
+    }
+
+    /// Row of the highest evidence among some.
+    fn best(&self, of: impl Fn(&Hypothesis) -> bool) -> Option<usize> {
+        let rows = self.rows.iter().enumerate().filter(|(_, h)| of(h));
+        rows.map(|(i, h)| (i, self.evidence(h))).max_by(|a, b| a.1.total_cmp(&b.1)).map(|b| b.0)
+    }
+
+    /// Takes the inflation of a row over.
+    fn temper(&mut self, row: usize) {
+        let h = &self.rows[row];
+        let horizons = self.filter.strides().len() as f64;
+        self.inflation = h.fitted.pass.inflation(h.at().setup.free.len()).max(horizons);
+    }
+
+    fn is_spent(&self) -> bool {
+        self.search.is_spent()
+    }
+
+    /// Explores from parameters of the machine that another search found, and what it found beside them; `None` where the
+    /// filter cannot follow the machine.
+    pub(crate) fn explore(mut self, found: &[f64], others: &[&Fitted]) -> Option<Posterior> {
+        self.observer().stage(Stage::Calibrating);
+        self.inflation = self.filter.strides().len() as f64;
+        let machine = self.machine_alone(found)?;
+        self.known = self.all_known(&machine);
+        self.keep(machine);
+        self.temper(0);
+        for other in others {
+            if let Some(h) = self.adopted(&self.rows[0], other)
+                && self.is_admissible(&h)
+            {
+                if greybox_debug() {
+                    eprintln!("seed {:.1} {} q {:?} e {:?} {:?} machine {:.1}", self.evidence(&h), self.name(&h), h.at().errors.force, h.fitted.pass.errors, h.at().parameters, self.evidence(&self.rows[0]));
+                }
+                self.keep(h);
+            }
+        }
+        let mut beam = vec![0];
+        for laws in 1..=MOST {
+            if self.is_spent() {
+                break;
+            }
+            let before = self.best(|h| h.members.len() < laws).map(|i| self.evidence(&self.rows[i]))?;
+            beam.iter().for_each(|row| self.extend(*row));
+            let mut next: Vec<usize> =
+                (0..self.rows.len()).filter(|i| self.rows[*i].members.len() == laws).collect();
+            next.sort_by(|a, b| self.evidence(&self.rows[*b]).total_cmp(&self.evidence(&self.rows[*a])));
+            next.truncate(BEAM);
+            let Some(&first) = next.first() else { break };
+            let after = self.evidence(&self.rows[first]);
+            // Of one law alone: two may only help together.
+            if after <= before && laws > 1 {
+                break;
+            }
+            if after > before {
+                self.temper(first);
+            }
+            beam = next;
+        }
+        let mut best = self.best(|_| true)?;
+        for _ in 0..ROUNDS {
+            if self.is_spent() || self.rows[best].members.is_empty() {
+                break;
+            }
+            let laws = self.rows[best].members.len();
+            for index in 0..laws {
+                if let Some(base) = self.without(&self.rows[best], index) {
+                    let row = self.keep(base);
+                    self.extend(row);
+                }
+            }
+            let now = self.best(|_| true)?;
+            if now == best {
+                break;
+            }
+            best = now;
+        }
+        self.conclude(best)
+    }
+
+    /// Lets laws go whose families are not named, from the best row on.
+    fn conclude(&mut self, best: usize) -> Option<Posterior> {
+        self.temper(best);
+        let mut chosen = best;
+        loop {
+            let beliefs = self.beliefs(chosen);
+            let weakest = (0..beliefs.len()).min_by(|a, b| beliefs[*a].family.total_cmp(&beliefs[*b].family));
+            match weakest {
+                Some(index) if beliefs[index].family < NAMED => {
+                    let smaller = self.without(&self.rows[chosen], index)?;
+                    chosen = self.keep(smaller);
+                }
+                _ => {
+                    let some = self.best(|h| !h.members.is_empty());
+                    let tried = if beliefs.is_empty() { some.map(|i| self.rows[i].clone()) } else { None };
+                    return Some(Posterior { chosen: self.rows[chosen].clone(), beliefs, tried });
+                }
+            }
+        }
+    }
+
+    /// What is believed of each law of a row, all others given.
+    fn beliefs(&self, row: usize) -> Vec<Belief> {
+        let h = &self.rows[row];
+        let own = self.evidence(h);
+        let library = self.search.library;
+        let family = |c: &Candidate| &library[c.mechanism].family;
+        (0..h.members.len())
+            .map(|index| {
+                let rest: Vec<&Candidate> =
+                    h.members.iter().enumerate().filter(|(i, _)| *i != index).map(|(_, m)| &m.candidate).collect();
+                let (mut total, mut kin) = (1.0, 1.0);
+                let mut gain = f64::INFINITY;
+                let mut others = Vec::new();
+                for other in self.rows.iter().filter(|o| rest.iter().all(|c| o.holds(c))) {
+                    let odds = (self.evidence(other) - own).clamp(-700.0, 700.0).exp();
+                    if other.members.len() == rest.len() {
+                        gain = own - self.evidence(other);
+                        total += odds;
+                    } else if other.members.len() == h.members.len() {
+                        let Some(at) = other.members.iter().position(|m| !rest.contains(&&m.candidate)) else { continue };
+                        let candidate = &other.members[at].candidate;
+                        if *candidate == h.members[index].candidate {
+                            continue;
+                        }
+                        total += odds;
+                        if family(candidate) == family(&h.members[index].candidate) || is_equal(odds) {
+                            kin += odds;
+                        }
+                        others.push((other.parts[at].clone(), odds));
+                    }
+                }
+                let mut others: Vec<Other> = others
+                    .into_iter()
+                    .map(|(part, odds)| Other {
+                        part,
+                        probability: odds / total,
+                        equivalent: is_equal(odds),
+                    })
+                    .collect();
+                others.sort_by(|a, b| b.probability.total_cmp(&a.probability));
+                Belief { probability: 1.0 / total, family: kin / total, gain, others }
+            })
+            .collect()
+    }
+}
+
+/// Whether no one would bet on one of two.
+fn is_equal(odds: f64) -> bool {
+    odds.ln().abs() < UNDECIDED
+}
+
+fn greybox_debug() -> bool {
+    std::env::var_os("EXPLORE").is_some()
+}
+
+/// Sizes of what acts on a machine.
+struct Totals {
+    /// Per equation: RMS of its force.
+    forces: Vec<f64>,
+    /// Per input and per channel: spread.
+    inputs: Vec<f64>,
+    outputs: Vec<f64>,
+}
+
+impl Totals {
+    /// The strength at which a column is as large as all that acts where it does.
+    fn width(&self, lanes: &Lanes, column: usize) -> f64 {
+        let mut width = f64::INFINITY;
+        let rms = |of: &dyn Fn(&SignalLanes, usize) -> Option<f64>, lane: usize| -> f64 {
+            let (mut sum, mut n) = (0.0, 0usize);
+            for signals in &lanes.signals {
+                let samples = signals.force.len() / signals.lanes.max(1);
+                for v in (0..samples).filter_map(|k| of(signals, k * signals.lanes + lane)) {
+                    sum += v * v;
+                    n += 1;
+                }
+            }
+            (sum / n.max(1) as f64).sqrt()
+        };
+        for lane in lanes.columns[column].clone() {
+            let force = rms(&|s, at| s.force.get(at).copied(), lane);
+            let weights = lanes.signals.first().map_or(&[][..], |s| &s.weights[..]);
+            for (e, total) in self.forces.iter().enumerate() {
+                let count = lanes.signals.first().map_or(1, |s| s.lanes);
+                let size = force * weights.get(e * count + lane).map_or(0.0, |w| w.abs());
+                if size > 0.0 {
+                    width = width.min(total / size);
+                }
+            }
+            for (i, total) in self.inputs.iter().enumerate() {
+                let size = rms(&|s, at| s.inputs.iter().find(|t| t.0 == i).and_then(|t| t.1.get(at)).copied(), lane);
+                if size > 0.0 {
+                    width = width.min(total / size);
+                }
+            }
+            for (c, total) in self.outputs.iter().enumerate() {
+                let size = rms(&|s, at| s.outputs.iter().find(|t| t.0 == c).and_then(|t| t.1.get(at)).copied(), lane);
+                if size > 0.0 {
+                    width = width.min(total / size);
+                }
+            }
+        }
+        width
+    }
+}
+
+/// How large all is that acts on a machine.
+fn totals(setup: &Setup, along: &Along<'_>) -> Totals {
+    let spread = |series: &mut dyn Iterator<Item = &Vec<f64>>| -> f64 {
+        series.map(|v| greybox_calibrate::spread(v)).fold(0.0, f64::max)
+    };
+    let data = &setup.data;
+    Totals {
+        forces: along.total_forces(),
+        inputs: (0..setup.model.inputs.len())
+            .map(|i| spread(&mut data.pieces.iter().filter_map(|p| p.inputs.get(i))))
+            .collect(),
+        outputs: data.spread.clone(),
+    }
+}
+
