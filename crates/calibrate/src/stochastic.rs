@@ -325,9 +325,11 @@ impl Filter {
             .iter()
             .enumerate()
             .map(|(j, state)| {
-                let seen: Vec<&Vec<f64>> = nominal.hats.highest.iter().filter_map(|h| h[j].as_ref()).collect();
+                let seen: Vec<&Vec<f64>> =
+                    nominal.hats.highest.iter().filter_map(|h| h[j].as_ref()).collect();
                 let rate = size(offset[j] + order[j] - 1);
-                let highest = if seen.is_empty() { rate / dt / FIRST_MEMORY } else { rms(seen.into_iter().flatten()) };
+                let highest =
+                    if seen.is_empty() { rate / dt / FIRST_MEMORY } else { rms(seen.into_iter().flatten()) };
                 let first = (FIRST_ERROR * highest).powi(2) * FIRST_MEMORY * dt;
                 Row {
                     state: state.name.clone(),
@@ -418,9 +420,21 @@ impl Filter {
     pub fn pass(&self, at: &Stochastic, derivatives: bool) -> Option<Pass> {
         let n = if derivatives { at.setup.free.len() + self.variances() } else { 0 };
         let horizons = self.strides.len();
-        let parts = self.run(at, derivatives, None, || Pass::new(n, horizons), |pass, i| pass.add(self, i))?;
+        let parts =
+            self.run(at, derivatives, None, || Pass::new(n, horizons), |pass, i| pass.add(self, i))?;
         let pass = Pass::sum(parts, n, horizons);
         pass.log.is_finite().then_some(pass)
+    }
+
+    /// ln L of the longer half of the horizons alone: enough to tell which of several points is the best to begin with.
+    pub fn glance(&self, at: &Stochastic) -> Option<f64> {
+        let half = self.strides.len() / 2;
+        let longer = Filter {
+            strides: self.strides[half..].to_vec(),
+            phases: self.phases[half..].to_vec(),
+            ..self.clone()
+        };
+        longer.pass(at, false).map(|pass| pass.log)
     }
 
     /// First state of a piece with its variances.
@@ -545,7 +559,8 @@ impl Filter {
                     }
                     let tangents = stepper.output_tangents(c);
                     row.copy_from_slice(&tangents[np..np + nx]);
-                    let moved: f64 = row.iter().zip(x.iter().zip(&before)).map(|(r, (a, b))| r * (a - b)).sum();
+                    let moved: f64 =
+                        row.iter().zip(x.iter().zip(&before)).map(|(r, (a, b))| r * (a - b)).sum();
                     let e = y - stepper.output(c) - moved;
                     for i in 0..nx {
                         pc[i] = qr::dot(&p[i * nx..(i + 1) * nx], &row);
@@ -598,9 +613,8 @@ impl Filter {
                             let dki = dk[l * nx + i];
                             dx[l * nx + i] += dki * e + gain[i] * by_e[l];
                             for j in 0..nx {
-                                dp[(l * nx + i) * nx + j] -= dki * pc[j]
-                                    + gain[i] * by_s[l] * gain[j]
-                                    + pc[i] * dk[l * nx + j];
+                                dp[(l * nx + i) * nx + j] -=
+                                    dki * pc[j] + gain[i] * by_s[l] * gain[j] + pc[i] * dk[l * nx + j];
                             }
                         }
                     }
@@ -729,10 +743,16 @@ impl Filter {
             let ((low, high), v) = (bounds(a), value(a));
             let mut step = step[a] / d[a];
             if a >= np {
-                step = step.max(-LONGEST).min(LONGEST);
+                step = step.clamp(-LONGEST, LONGEST);
             }
             let to = v + step;
-            let to = if to <= low { 0.5 * (v + low) } else if to >= high { 0.5 * (v + high) } else { to };
+            let to = if to <= low {
+                0.5 * (v + low)
+            } else if to >= high {
+                0.5 * (v + high)
+            } else {
+                to
+            };
             match a.checked_sub(np) {
                 None => next.parameters[free[a].index] = to,
                 Some(l) if l < self.rows.len() => next.errors.force[l] = to,
@@ -904,8 +924,7 @@ decay = "x' + a*x = 0"
                 cov[k * n + j] = decay * cov[(k - 1) * n + j];
                 cov[j * n + k] = cov[k * n + j];
             }
-            cov[k * n + k] =
-                decay * decay * cov[(k - 1) * n + k - 1] + 0.5 * q * 0.1 * (1.0 + decay * decay);
+            cov[k * n + k] = decay * decay * cov[(k - 1) * n + k - 1] + 0.5 * q * 0.1 * (1.0 + decay * decay);
         }
         let seen: Vec<usize> = (0..n).step_by(stride).collect();
         let m = seen.len();
@@ -940,9 +959,8 @@ decay = "x' + a*x = 0"
         assert!(filter.strides.len() > 1);
         let (q, r) = (0.3f64, 0.015f64);
         let gradient = filter.pass(&at(&setup, 0.7, q, r), true).unwrap().gradient;
-        let log = |dq: f64, dr: f64| {
-            filter.pass(&at(&setup, 0.7, q * dq.exp(), r * dr.exp()), false).unwrap().log
-        };
+        let log =
+            |dq: f64, dr: f64| filter.pass(&at(&setup, 0.7, q * dq.exp(), r * dr.exp()), false).unwrap().log;
         let h = 1e-4;
         let by_q = (log(h, 0.0) - log(-h, 0.0)) / (2.0 * h);
         let by_r = (log(0.0, h) - log(0.0, -h)) / (2.0 * h);
@@ -973,7 +991,10 @@ decay = "x' + a*x = 0"
             let n = values.len() as f64;
             let mean = values.iter().sum::<f64>() / n;
             let std = (values.iter().map(|v| (v - mean).powi(2)).sum::<f64>() / (n - 1.0)).sqrt();
-            assert!((mean - 1.0).abs() < 2.5 * std / n.sqrt() + 0.01 && std < 0.2, "{mean} ± {std}: {values:?}");
+            assert!(
+                (mean - 1.0).abs() < 2.5 * std / n.sqrt() + 0.01 && std < 0.2,
+                "{mean} ± {std}: {values:?}"
+            );
         }
     }
 

@@ -108,6 +108,8 @@ pub enum Verdict {
 pub enum Basis {
     /// Mechanisms that are believed.
     Named,
+    /// Mechanisms that are believed, and beside them some that stand in for something without a name.
+    NamedAndProposed,
     /// Mechanisms that predict data they were not fitted to, and that stand in for something without a name.
     Proposed,
     /// The given equations, refitted.
@@ -495,13 +497,26 @@ fn conclude(
         defend(search, &mut found, polished, &baseline, &judge, true)
     };
     // Where more than noise is left, every model of the machine errs, and output errors do not compare them.
-    let scores = judge.scores(
-        &polished.fitted.setup,
-        &polished.fitted.fit.point.parameters,
-        &residual_scale(&polished.fitted, &found.scale),
-    );
-    if !leaves_noise(&scores, &polished.origin, &residual_scale(&polished.fitted, &found.scale)) {
-        (found, polished, named) = believed(search, (found, polished, named), &baseline, &judge);
+    let of = |found: &Found, polished: &Polished, named: bool| {
+        let scale = residual_scale(&polished.fitted, &found.scale);
+        Judged::of(search, found, &polished.fitted, &scale, (&baseline.polished.fitted, named), library)
+    };
+    let scale = residual_scale(&polished.fitted, &found.scale);
+    let scores = judge.scores(&polished.fitted.setup, &polished.fitted.fit.point.parameters, &scale);
+    let mut judged = of(&found, &polished, named);
+    let mut agreed = Vec::new();
+    if judged.verdict == Verdict::Unexplained || !leaves_noise(&scores, &polished.origin, &scale) {
+        let names = judged.verdict == Verdict::MissingPhysics;
+        if names {
+            agreed = polished.fitted.parts.iter().map(|p| named_as(p, library, &nominal.model)).collect();
+        }
+        let in_both = |part: &Part| agreed.contains(&named_as(part, library, &nominal.model));
+        let standing = (&found, &polished);
+        if let Some((other, simulates, named)) = believed(search, standing, in_both, names, &baseline, &judge)
+        {
+            judged = of(&other, &simulates, named);
+            (found, polished) = (other, simulates);
+        }
         limited |= found.limited;
     }
     let Polished { fitted: improved, origin } = polished;
@@ -570,60 +585,18 @@ fn conclude(
     let criterion = if elsewhere == Criterion::Windowed { elsewhere } else { judge.criterion };
 
     // Mechanisms, remainder, verdict.
-    // Where nothing was found, what the search's own noise model leaves white.
-    let surface = if found.improved.parts.is_empty() && found.improved.setup.noise.is_some() {
-        surface(&found.improved, &found.scale)
-    } else {
-        surface(&improved, &scale)
-    };
-    // Two refits, for those tests that need them.
-    let comparable = LazyCell::new(|| search.comparable(&found));
-    let full: f64 = raw_rss(&improved, &found.scale).iter().sum();
-    let base = search.rss_at(&calibrated, &improved, &found.scale);
-    let left = Left::of(&improved, &found, &comparable, surface.as_ref(), base);
-    let without: Vec<f64> = (0..improved.parts.len())
-        .into_par_iter()
-        .map(|i| search.rss_without(&improved, &[i], &calibrated, &found.scale).unwrap_or(base))
-        .collect();
+    // Of laws that are not believed together those stand that another comparison has named.
+    let stands = |part: &Part| found.errs && agreed.contains(&named_as(part, library, &nominal.model));
+    let all = judged.verdict == Verdict::MissingPhysics;
+    let believed: Vec<bool> = improved.parts.iter().map(|part| all || stands(part)).collect();
+    let verdict = if believed.contains(&true) { Verdict::MissingPhysics } else { judged.verdict };
+    let Judged { shares, left, surface, alone, without, full, base, doubts, .. } = judged;
     let share = |rss: f64| (rss / base.max(1e-300)).clamp(0.0, 1.0);
-    let alone = rss_alone(search, (&calibrated, &improved), &found.scale, &without, base);
-    let lost: Vec<f64> = without.iter().map(|rss| share(rss - full)).collect();
-    let gained: Vec<f64> = alone.iter().map(|rss| share(base - rss)).collect();
-    let shares = divided(&lost, &gained, share(base - full));
-    // Two laws that share one work lose little each when the other takes over, and all together.
-    let redundant = |a: usize, b: usize| {
-        let both = search.rss_without(&improved, &[a.max(b), a.min(b)], &calibrated, &found.scale);
-        let both = both.unwrap_or(base);
-        (both - full) / base.max(1e-300) > REDUNDANT * (lost[a] + lost[b])
-    };
-    // A law that another one, which the library has no name for, stands in for.
-    let doubts: Vec<Option<f64>> = (0..improved.parts.len())
-        .into_par_iter()
-        .map(|i| if found.errs { None } else { search.doubt(&found.improved, i, &found.scale) })
-        .collect();
-    let beaten = |i: usize| doubts[i].is_some_and(|d| d > UNDECIDED);
-    let is_imitation = (0..doubts.len())
-        .any(|i| beaten(i) && (lost[i] > CORRECTION || (0..doubts.len()).any(|j| i != j && redundant(i, j))));
-    let verdict = match left.verdict(improved.parts.len()) {
-        _ if !named && !improved.parts.is_empty() => Verdict::Unexplained,
-        _ if found.errs && share(base - full) < EXPLAINED => Verdict::Unexplained,
-        Verdict::MissingPhysics if is_imitation => Verdict::Unexplained,
-        verdict
-            if (verdict == Verdict::MissingPhysics || found.errs)
-                && (is_patchwork(&improved, &shares, library, left.steady, redundant)
-                || is_rivalled(&comparable, &found.scale, library)) =>
-        {
-            Verdict::Unexplained
-        }
-        _ if found.errs => Verdict::MissingPhysics,
-        verdict => verdict,
-    };
-    let significant =
-        found.errs || left.significant(improved.parts.len()) || verdict == Verdict::Unexplained;
+    let significant = found.errs || left.significant(improved.parts.len()) || verdict == Verdict::Unexplained;
     let mut mechanisms =
         findings(&improved, &found, &nominal.model, library, &scale, &shares, &train_role, &uncertainty);
     let mut subsets = Vec::new();
-    if verdict == Verdict::MissingPhysics {
+    if verdict == Verdict::MissingPhysics && believed.iter().all(|b| *b) {
         subsets = subsets_of(
             &shares,
             [&alone, &without].map(|rss| rss.iter().copied().map(share).collect()),
@@ -632,9 +605,6 @@ fn conclude(
     }
     for (i, m) in mechanisms.iter_mut().enumerate() {
         // What is still missing may be what was taken for this.
-        if found.errs {
-            continue; // the error is in the probability
-        }
         if significant
             || doubts[i].is_some_and(|d| d > -UNDECIDED)
             || is_shared(&improved, &shares, i)
@@ -644,7 +614,8 @@ fn conclude(
             m.alternatives.iter_mut().for_each(|a| a.confidence = a.confidence.min(DOUBTED));
         }
     }
-    mechanisms.sort_by(|a, b| b.share_explained.total_cmp(&a.share_explained));
+    let mut mechanisms: Vec<(Finding, bool)> = mechanisms.into_iter().zip(believed).collect();
+    mechanisms.sort_by(|a, b| b.0.share_explained.total_cmp(&a.0.share_explained));
     let unexplained = verdict != Verdict::MissingPhysics && !improved.parts.is_empty();
     // What is not believed explains nothing: all that the equations lack is what is missing. (Where too little is
     // known of the noise for that, what those mechanisms leave over shows the place.)
@@ -665,10 +636,14 @@ fn conclude(
     let unknown_noise = (0..estimated.len()).filter(|&c| reached(c) < BELOW_NOISE * estimated[c]).collect();
     let holds = nominal.holds.iter().copied().zip(improved.setup.holds.iter().copied()).collect();
     // What no name reaches is proposed without one: it predicts data that it was not fitted to.
+    let (named, proposed): (Vec<_>, Vec<_>) = mechanisms.into_iter().partition(|m| m.1);
+    let [mechanisms, candidates] =
+        [named, proposed].map(|of| of.into_iter().map(|m| m.0).collect::<Vec<_>>());
     let (basis, mechanisms, candidates) = match verdict {
-        Verdict::MissingPhysics => (Basis::Named, mechanisms, Vec::new()),
-        _ if mechanisms.is_empty() => (Basis::Calibrated, Vec::new(), Vec::new()),
-        _ => (Basis::Proposed, Vec::new(), mechanisms),
+        Verdict::MissingPhysics if candidates.is_empty() => (Basis::Named, mechanisms, candidates),
+        Verdict::MissingPhysics => (Basis::NamedAndProposed, mechanisms, candidates),
+        _ if candidates.is_empty() => (Basis::Calibrated, Vec::new(), candidates),
+        _ => (Basis::Proposed, Vec::new(), candidates),
     };
     Ok(Diagnosis {
         verdict,
@@ -695,37 +670,125 @@ fn conclude(
     })
 }
 
-/// What the exploration names beside an error of the model, if it can be defended. Else what stands; and where that has no name
-/// either, the likeliest hypothesis if it simulates better. Whether the mechanisms are named.
+/// The name of a part and the equations that it enters.
+fn named_as(part: &Part, library: &[Mechanism], nominal: &Model) -> (String, Vec<String>) {
+    let kind = library[part.candidate.mechanism].kind.clone();
+    (kind, part.candidate.place.equations(nominal))
+}
+
+/// What an improved model explains, and what it leaves.
+struct Judged {
+    verdict: Verdict,
+    /// Share of the calibrated model's misfit that each part explains.
+    shares: Vec<f64>,
+    left: Left,
+    surface: Option<Surface>,
+    /// Residual sum of squares with each part alone, without each, with all, with none.
+    alone: Vec<f64>,
+    without: Vec<f64>,
+    full: f64,
+    base: f64,
+    /// How far above each part the law is that casts doubt on it.
+    doubts: Vec<Option<f64>>,
+}
+
+impl Judged {
+    /// Of a model with a residual like `scale` beside a calibrated one; whether its parts are named.
+    fn of(
+        search: &Search<'_>,
+        found: &Found,
+        improved: &Fitted,
+        scale: &[f64],
+        (calibrated, named): (&Fitted, bool),
+        library: &[Mechanism],
+    ) -> Judged {
+        // Where nothing was found, what the search's own noise model leaves white.
+        let surface = if found.improved.parts.is_empty() && found.improved.setup.noise.is_some() {
+            surface(&found.improved, &found.scale)
+        } else {
+            surface(improved, scale)
+        };
+        // Two refits, for those tests that need them.
+        let comparable = LazyCell::new(|| search.comparable(found));
+        let full: f64 = raw_rss(improved, &found.scale).iter().sum();
+        let base = search.rss_at(calibrated, improved, &found.scale);
+        let left = Left::of(improved, found, &comparable, surface.as_ref(), base);
+        let without: Vec<f64> = (0..improved.parts.len())
+            .into_par_iter()
+            .map(|i| search.rss_without(improved, &[i], calibrated, &found.scale).unwrap_or(base))
+            .collect();
+        let share = |rss: f64| (rss / base.max(1e-300)).clamp(0.0, 1.0);
+        let alone = rss_alone(search, (calibrated, improved), &found.scale, &without, base);
+        let lost: Vec<f64> = without.iter().map(|rss| share(rss - full)).collect();
+        let gained: Vec<f64> = alone.iter().map(|rss| share(base - rss)).collect();
+        let shares = divided(&lost, &gained, share(base - full));
+        // Two laws that share one work lose little each when the other takes over, and all together.
+        let redundant = |a: usize, b: usize| {
+            let both = search.rss_without(improved, &[a.max(b), a.min(b)], calibrated, &found.scale);
+            let both = both.unwrap_or(base);
+            (both - full) / base.max(1e-300) > REDUNDANT * (lost[a] + lost[b])
+        };
+        // A law that another one, which the library has no name for, stands in for.
+        let doubts: Vec<Option<f64>> = (0..improved.parts.len())
+            .into_par_iter()
+            .map(|i| if found.errs { None } else { search.doubt(&found.improved, i, &found.scale) })
+            .collect();
+        let beaten = |i: usize| doubts[i].is_some_and(|d| d > UNDECIDED);
+        let is_imitation = (0..doubts.len()).any(|i| {
+            beaten(i) && (lost[i] > CORRECTION || (0..doubts.len()).any(|j| i != j && redundant(i, j)))
+        });
+        let verdict = match left.verdict(improved.parts.len()) {
+            _ if !named && !improved.parts.is_empty() => Verdict::Unexplained,
+            _ if found.errs && share(base - full) < EXPLAINED => Verdict::Unexplained,
+            Verdict::MissingPhysics if is_imitation => Verdict::Unexplained,
+            verdict
+                if (verdict == Verdict::MissingPhysics || found.errs)
+                    && (is_patchwork(improved, &shares, library, left.steady, redundant)
+                        || is_rivalled(&comparable, &found.scale, library)) =>
+            {
+                Verdict::Unexplained
+            }
+            _ if found.errs => Verdict::MissingPhysics,
+            verdict => verdict,
+        };
+        Judged { verdict, shares, left, surface, alone, without, full, base, doubts }
+    }
+}
+
+/// What the exploration finds beside an error of the model, if it can be defended and says more than what stands: it names
+/// laws that do not stand with a name yet; or it simulates better and takes no name away, having one of the `agreed` where
+/// there are any. Whether its mechanisms are named, which those of an exploration that did not come to its end are not.
 fn believed(
     search: &Search<'_>,
-    standing: (Found, Polished, bool),
+    (found, polished): (&Found, &Polished),
+    agreed: impl Fn(&Part) -> bool,
+    names: bool,
     baseline: &Baseline,
     judge: &Judge,
-) -> (Found, Polished, bool) {
-    let (found, polished, named) = &standing;
-    let Some(posterior) = search.explore(found) else { return standing };
-    let believes = !posterior.beliefs.is_empty();
+) -> Option<(Found, Polished, bool)> {
+    let posterior = search.explore(found)?;
+    let believes = !posterior.beliefs.is_empty() && !posterior.limited;
     let likeliest = posterior.tried.as_ref().unwrap_or(&posterior.chosen);
-    let Some(mut adopted) = search.adopt(found, likeliest, &posterior.beliefs) else { return standing };
+    let mut adopted = search.adopt(found, likeliest, &posterior.beliefs)?;
     if adopted.improved.parts.is_empty() {
-        return standing;
+        return None;
     }
     let own = polish(&adopted.improved, &adopted.scale, judge);
     let own = defend(search, &mut adopted, own, baseline, judge, false);
-    if own.fitted.parts.is_empty() {
-        return standing;
-    }
-    if believes {
-        return (adopted, own, true);
+    let (parts, standing) = (&own.fitted.parts, &polished.fitted.parts);
+    let known = |part: &Part| standing.iter().any(|p| p.candidate == part.candidate);
+    let is_same = parts.len() == standing.len() && parts.iter().all(known);
+    if parts.is_empty() || names && is_same {
+        return None;
     }
     let misfit = |p: &Polished, scale: &[f64]| {
         let scale = residual_scale(&p.fitted, scale);
         judge.misfit(&p.fitted.setup, &p.fitted.fit.point.parameters, &scale)
     };
-    let is_better = misfit(&own, &adopted.scale).total_cmp(&misfit(polished, &found.scale)).is_lt();
-    let stands = *named && !polished.fitted.parts.is_empty();
-    if is_better && !stands { (adopted, own, false) } else { standing }
+    let is_better = || misfit(&own, &adopted.scale).total_cmp(&misfit(polished, &found.scale)).is_lt();
+    let takes_over = believes || (!names || parts.iter().any(agreed)) && is_better();
+    adopted.limited |= posterior.limited;
+    if takes_over { Some((adopted, own, believes)) } else { None }
 }
 
 fn residual_scale(fitted: &Fitted, scale: &[f64]) -> Vec<f64> {

@@ -17,8 +17,10 @@
 //! | a parameter of the machine | as stated, or Cauchy about its value ([`greybox_calibrate::free_parameters`]) |
 //! | ln q, ln r | even over the range that a fit may use |
 
+use std::sync::Arc;
+
 use greybox_calibrate::stochastic::{Filter, Fitted as Filtered, Pass, Stochastic};
-use greybox_calibrate::{Level, Point, Prior, Setup};
+use greybox_calibrate::{Level, Point, Prior, Setup, Work};
 use greybox_simulate::SignalLanes;
 use rayon::prelude::*;
 
@@ -43,13 +45,15 @@ const SHORT_LIST: usize = 9;
 const FINALISTS: usize = 5;
 /// Steps that tell which these are, further steps that tell which of them go to the end, how many do, and the steps of their
 /// fits.
-const FIRST_STEPS: usize = 3;
+const FIRST_STEPS: usize = 2;
 const MORE_STEPS: usize = 6;
-const BEST: usize = 3;
+const BEST: usize = 2;
 const LAST_STEPS: usize = 25;
 /// Steps of the fit of the machine's own equations, and rounds of doubt.
 const CALIBRATION: usize = 40;
 const ROUNDS: usize = 3;
+/// The work of a search over that of an exploration.
+const SHARE_OF_WORK: u64 = 4;
 /// Gain in nats that a candidate must promise to be fitted.
 const PROMISING: f64 = 1.0;
 /// Departure of a parameter from what is stated, in units of its prior, from which candidates are also tried where it is
@@ -122,7 +126,8 @@ impl Hypothesis {
             let value = at.parameters[f.index];
             match known {
                 Known::Strength(width) => {
-                    log -= 0.5 * ((value / width).powi(2) + (2.0 * std::f64::consts::PI * width * width).ln());
+                    log -=
+                        0.5 * ((value / width).powi(2) + (2.0 * std::f64::consts::PI * width * width).ln());
                     precision.push(1.0 / (width * width));
                 }
                 Known::Inner(range) => {
@@ -214,6 +219,8 @@ pub(crate) struct Posterior {
     pub(crate) beliefs: Vec<Belief>,
     /// Where no law is named: the likeliest hypothesis that has some.
     pub(crate) tried: Option<Hypothesis>,
+    /// The work ran out before the exploration had come to its end.
+    pub(crate) limited: bool,
 }
 
 /// The exploration with everything it needs.
@@ -234,9 +241,20 @@ pub(crate) struct Explorer<'a, 'b> {
 impl<'a, 'b> Explorer<'a, 'b> {
     /// Of a machine with its inputs held as a search decided.
     pub(crate) fn new(search: &'a Search<'b>, machine: &Setup) -> Explorer<'a, 'b> {
-        let machine = Setup { noise: None, ..machine.clone() };
+        // With a limit of work of its own.
+        let work = Arc::new(Work::of_fits_within(search.most_work / SHARE_OF_WORK));
+        search.observer.begins(&work);
+        let machine = Setup { noise: None, work, ..machine.clone() };
         let filter = Filter::new(&machine);
-        Explorer { search, machine, filter, known: Vec::new(), rows: Vec::new(), extended: Vec::new(), inflation: 1.0 }
+        Explorer {
+            search,
+            machine,
+            filter,
+            known: Vec::new(),
+            rows: Vec::new(),
+            extended: Vec::new(),
+            inflation: 1.0,
+        }
     }
 
     fn observer(&self) -> &dyn Observer {
@@ -384,7 +402,9 @@ impl<'a, 'b> Explorer<'a, 'b> {
         let n0 = self.machine.model.parameters.len();
         let point = &other.fit.point;
         let mut fresh = vec![Vec::new(); self.machine.data.pieces.len()];
-        for (segment, start) in other.level.segments.iter().zip(&point.starts).filter(|s| s.0.range.start == 0) {
+        for (segment, start) in
+            other.level.segments.iter().zip(&point.starts).filter(|s| s.0.range.start == 0)
+        {
             for (j, state) in other.setup.model.states.iter().enumerate() {
                 if self.machine.model.state(&state.name).is_none() {
                     let at = other.setup.system.offsets[j];
@@ -409,7 +429,8 @@ impl<'a, 'b> Explorer<'a, 'b> {
         let at = base.at();
         let parts: Vec<_> =
             members.iter().map(|m| (m.candidate.clone(), m.values.clone(), m.scales.clone())).collect();
-        let (mut setup, parts) = self.search.assemble(&self.machine.holds, machine, &parts, &at.setup).ok()?;
+        let (mut setup, parts) =
+            self.search.assemble(&self.machine.holds, machine, &parts, &at.setup).ok()?;
         setup.noise = None;
         let first = self.machine.free.len();
         for (f, known) in setup.free[first..].iter_mut().zip(members.iter().flat_map(|m| &m.known)) {
@@ -486,11 +507,8 @@ impl<'a, 'b> Explorer<'a, 'b> {
         };
         let mut points = vec![point(&s.values, None), point(&s.values, Some(&s.shift))];
         points.extend(s.faint.iter().map(|faint| point(faint, None)));
-        for (_, values, shift) in &s.others {
-            points.push(point(values, None));
-            points.push(point(values, Some(shift)));
-        }
-        let worth = |p: &Stochastic| self.filter.pass(p, false).map_or(f64::NEG_INFINITY, |pass| pass.log);
+        points.extend(s.others.iter().map(|(_, values, shift)| point(values, Some(shift))));
+        let worth = |p: &Stochastic| self.filter.glance(p).unwrap_or(f64::NEG_INFINITY);
         let priced: Vec<f64> = points.iter().map(worth).collect();
         let best = (0..points.len()).max_by(|a, b| priced[*a].total_cmp(&priced[*b]))?;
         priced[best].is_finite().then(|| (points.swap_remove(best), parts))
@@ -518,12 +536,6 @@ impl<'a, 'b> Explorer<'a, 'b> {
             let scored = self.proposals(h, &open);
             let short = self.search.short_list(&open, &scored, 0.0, SHORT_LIST, 0);
             self.observer().stage(Stage::Fitting { candidates: short.len() });
-            if greybox_debug() {
-                eprintln!("anchor {anchor} log {:.1} q {:?} r {:?} e {:?}", h.fitted.pass.log, h.at().errors.force, h.at().errors.sensor, h.fitted.pass.errors);
-                for s in &short {
-                    eprintln!("     {:.3} {} {:?} {:?}", s.gain, library[open[s.candidate].mechanism].kind, s.values, s.shift);
-                }
-            }
             // (What starts at stated parameters has far to go: a few steps tell nothing.)
             let (steps, most) = if anchor == 0 { (FIRST_STEPS, short.len()) } else { (0, FINALISTS) };
             let mut trials: Vec<Hypothesis> = short[..most.min(short.len())]
@@ -559,7 +571,9 @@ impl<'a, 'b> Explorer<'a, 'b> {
             let mut finished = go_on(trials, LAST_STEPS);
             finished.extend(rest);
             for h in finished {
-                let same = |o: &Hypothesis| o.members[o.members.len() - 1].candidate == h.members[h.members.len() - 1].candidate;
+                let same = |o: &Hypothesis| {
+                    o.members[o.members.len() - 1].candidate == h.members[h.members.len() - 1].candidate
+                };
                 match out.iter_mut().find(|o| same(o)) {
                     Some(known) if self.evidence(&h) > self.evidence(known) => *known = h,
                     Some(_) => {}
@@ -567,21 +581,7 @@ impl<'a, 'b> Explorer<'a, 'b> {
                 }
             }
         }
-        if greybox_debug() {
-            let mut told: Vec<&Hypothesis> = out.iter().collect();
-            told.sort_by(|a, b| self.evidence(b).total_cmp(&self.evidence(a)));
-            eprintln!("base {:?} {:.1} c {:.1} q {:?} steps {:?}", self.name(base), self.evidence(base), self.inflation, base.at().errors.force, base.fitted.pass.errors);
-            for h in told {
-                let p: Vec<f64> = h.at().setup.free.iter().map(|f| h.at().parameters[f.index]).collect();
-                eprintln!("   {:.1} {} {:.4?} q {:.2?} e {:.4?}", self.evidence(h), self.name(h), p, h.at().errors.force, h.fitted.pass.errors);
-            }
-        }
         out
-    }
-
-    fn name(&self, h: &Hypothesis) -> String {
-        let of = |p: &Part| format!("{}[{}]", self.search.library[p.candidate.mechanism].kind, p.instance.expression);
-        h.parts.iter().map(of).collect::<Vec<_>>().join(" + ")
     }
 
     /// Whether every law's requirements hold, and no inertia is negative.
@@ -646,8 +646,10 @@ impl<'a, 'b> Explorer<'a, 'b> {
         self.inflation = h.fitted.pass.inflation(h.at().setup.free.len()).max(horizons);
     }
 
+    /// Whether the work is used up, or nobody waits for the answer any more.
     fn is_spent(&self) -> bool {
-        self.search.is_spent()
+        let work = &self.machine.work;
+        work.is_given_up() || work.done() > self.search.most_work / SHARE_OF_WORK
     }
 
     /// Explores from parameters of the machine that another search found, and what it found beside them; `None` where the
@@ -663,9 +665,6 @@ impl<'a, 'b> Explorer<'a, 'b> {
             if let Some(h) = self.adopted(&self.rows[0], other)
                 && self.is_admissible(&h)
             {
-                if greybox_debug() {
-                    eprintln!("seed {:.1} {} q {:?} e {:?} {:?} machine {:.1}", self.evidence(&h), self.name(&h), h.at().errors.force, h.fitted.pass.errors, h.at().parameters, self.evidence(&self.rows[0]));
-                }
                 self.keep(h);
             }
         }
@@ -727,7 +726,8 @@ impl<'a, 'b> Explorer<'a, 'b> {
                 _ => {
                     let some = self.best(|h| !h.members.is_empty());
                     let tried = if beliefs.is_empty() { some.map(|i| self.rows[i].clone()) } else { None };
-                    return Some(Posterior { chosen: self.rows[chosen].clone(), beliefs, tried });
+                    let limited = self.is_spent();
+                    return Some(Posterior { chosen: self.rows[chosen].clone(), beliefs, tried, limited });
                 }
             }
         }
@@ -741,8 +741,13 @@ impl<'a, 'b> Explorer<'a, 'b> {
         let family = |c: &Candidate| &library[c.mechanism].family;
         (0..h.members.len())
             .map(|index| {
-                let rest: Vec<&Candidate> =
-                    h.members.iter().enumerate().filter(|(i, _)| *i != index).map(|(_, m)| &m.candidate).collect();
+                let rest: Vec<&Candidate> = h
+                    .members
+                    .iter()
+                    .enumerate()
+                    .filter(|(i, _)| *i != index)
+                    .map(|(_, m)| &m.candidate)
+                    .collect();
                 let (mut total, mut kin) = (1.0, 1.0);
                 let mut gain = f64::INFINITY;
                 let mut others = Vec::new();
@@ -752,7 +757,10 @@ impl<'a, 'b> Explorer<'a, 'b> {
                         gain = own - self.evidence(other);
                         total += odds;
                     } else if other.members.len() == h.members.len() {
-                        let Some(at) = other.members.iter().position(|m| !rest.contains(&&m.candidate)) else { continue };
+                        let Some(at) = other.members.iter().position(|m| !rest.contains(&&m.candidate))
+                        else {
+                            continue;
+                        };
                         let candidate = &other.members[at].candidate;
                         if *candidate == h.members[index].candidate {
                             continue;
@@ -766,11 +774,7 @@ impl<'a, 'b> Explorer<'a, 'b> {
                 }
                 let mut others: Vec<Other> = others
                     .into_iter()
-                    .map(|(part, odds)| Other {
-                        part,
-                        probability: odds / total,
-                        equivalent: is_equal(odds),
-                    })
+                    .map(|(part, odds)| Other { part, probability: odds / total, equivalent: is_equal(odds) })
                     .collect();
                 others.sort_by(|a, b| b.probability.total_cmp(&a.probability));
                 Belief { probability: 1.0 / total, family: kin / total, gain, others }
@@ -782,10 +786,6 @@ impl<'a, 'b> Explorer<'a, 'b> {
 /// Whether no one would bet on one of two.
 fn is_equal(odds: f64) -> bool {
     odds.ln().abs() < UNDECIDED
-}
-
-fn greybox_debug() -> bool {
-    std::env::var_os("EXPLORE").is_some()
 }
 
 /// Sizes of what acts on a machine.
@@ -823,13 +823,17 @@ impl Totals {
                 }
             }
             for (i, total) in self.inputs.iter().enumerate() {
-                let size = rms(&|s, at| s.inputs.iter().find(|t| t.0 == i).and_then(|t| t.1.get(at)).copied(), lane);
+                let size =
+                    rms(&|s, at| s.inputs.iter().find(|t| t.0 == i).and_then(|t| t.1.get(at)).copied(), lane);
                 if size > 0.0 {
                     width = width.min(total / size);
                 }
             }
             for (c, total) in self.outputs.iter().enumerate() {
-                let size = rms(&|s, at| s.outputs.iter().find(|t| t.0 == c).and_then(|t| t.1.get(at)).copied(), lane);
+                let size = rms(
+                    &|s, at| s.outputs.iter().find(|t| t.0 == c).and_then(|t| t.1.get(at)).copied(),
+                    lane,
+                );
                 if size > 0.0 {
                     width = width.min(total / size);
                 }
@@ -854,3 +858,120 @@ fn totals(setup: &Setup, along: &Along<'_>) -> Totals {
     }
 }
 
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::library::{Mechanism, built_in};
+    use greybox_calibrate::{Data, free_parameters};
+    use greybox_model::Model;
+    use greybox_recording::{Channel, Recording};
+    use rand::SeedableRng;
+    use rand_distr::{Distribution, StandardNormal};
+
+    const MASS: &str = r#"
+[inputs]
+f = { unit = "N" }
+[states]
+x = { unit = "m" }
+[parameters]
+m = { value = 1.0, unit = "kg", fixed = true }
+k = { value = 20.0, unit = "N/m" }
+[equations]
+mass = "m*x'' + k*x = f"
+"#;
+
+    /// A mass on a spring of 22 N/m with a damper, driven by two sines, pushed by a slow random force (0.3 s) of this size, and
+    /// measured to a tenth of a millimetre.
+    fn mass(damping: f64, push: f64, seed: u64) -> Setup {
+        let mut rng = rand_pcg::Pcg64::seed_from_u64(seed);
+        let mut normal = || -> f64 { StandardNormal.sample(&mut rng) };
+        let (dt, n, fine) = (0.02, 1500usize, 10usize);
+        let drive = |t: f64| 2.0 * (2.1 * t).sin() + 1.5 * (5.3 * t).cos();
+        let (mut x, mut v, mut w) = (0.0, 0.0, 0.0);
+        let (mut xs, mut fs, mut time) = (Vec::new(), Vec::new(), Vec::new());
+        for k in 0..n {
+            let t = dt * k as f64;
+            time.push(t);
+            fs.push(drive(t));
+            xs.push(x + 1e-4 * normal());
+            let h = dt / fine as f64;
+            let decay = (-h / 0.3f64).exp();
+            for i in 0..fine {
+                w = decay * w + push * (1.0 - decay * decay).sqrt() * normal();
+                let a = drive(t + (i as f64 + 0.5) * h) + w - 22.0 * x - damping * v;
+                v += h * a;
+                x += h * v;
+            }
+        }
+        let channel = |name: &str, values: Vec<f64>| Channel { name: name.into(), unit: None, values };
+        let channels = vec![channel("f", fs), channel("x", xs)];
+        let recording = Recording::from_columns("mass.csv", time, channels).unwrap();
+        let model = Model::from_toml(MASS, "mass.toml").unwrap();
+        let data = Arc::new(Data::new(&model, &[recording]).unwrap());
+        Setup::new(&model, data, free_parameters(&model)).unwrap()
+    }
+
+    fn some_laws() -> Vec<Mechanism> {
+        let kinds =
+            ["viscous_friction", "coulomb_friction", "cubic_stiffness", "constant_offset", "input_delay"];
+        built_in().unwrap().into_iter().filter(|m| kinds.contains(&m.kind.as_str())).collect()
+    }
+
+    /// What is named, the library's kinds in the order of the hypothesis.
+    fn named(setup: &Setup, library: &[Mechanism]) -> Vec<String> {
+        let search = Search::new(setup.clone(), library, &crate::Quiet);
+        let posterior = Explorer::new(&search, setup).explore(&setup.values(), &[]).unwrap();
+        assert!(!posterior.limited);
+        let kind = |p: &Part| library[p.candidate.mechanism].kind.clone();
+        posterior.chosen.parts.iter().map(kind).collect()
+    }
+
+    #[test]
+    fn a_determinant_is_the_product_of_its_factors() {
+        let a = [4.0, 2.0, 0.0, 2.0, 9.0, 3.0, 0.0, 3.0, 16.0];
+        // 4·(9·16 − 9) − 2·(2·16)
+        assert!((log_determinant(&a, 3) - 476f64.ln()).abs() < 1e-9);
+        let scaled: Vec<f64> = a.iter().map(|v| v * 1e-20).collect();
+        assert!((log_determinant(&scaled, 3) - 476f64.ln() + 60.0 * 10f64.ln()).abs() < 1e-9);
+    }
+
+    /// A damper of a fifth of the critical damping among pushes half as large as the drive is named, and alone; without
+    /// it nothing is.
+    #[test]
+    fn a_damper_is_named_among_random_forces_and_nothing_is_where_there_is_none() {
+        let library = some_laws();
+        let seeds = 6u64;
+        let right =
+            (0..seeds).filter(|seed| named(&mass(1.9, 1.0, 40 + seed), &library) == ["viscous_friction"]);
+        let right = right.count() as u64;
+        let wrong = (0..seeds).filter(|seed| !named(&mass(0.0, 1.0, 80 + seed), &library).is_empty()).count();
+        assert!(right >= seeds - 1, "{right} of {seeds}");
+        assert_eq!(wrong, 0);
+    }
+
+    /// The prior of a strength is as wide as the strength whose force is all that the equation balances.
+    #[test]
+    fn a_strength_is_expected_to_be_as_large_as_the_forces() {
+        let setup = mass(1.9, 0.1, 3);
+        let library = some_laws();
+        let search = Search::new(setup.clone(), &library, &crate::Quiet);
+        let mut explorer = Explorer::new(&search, &setup);
+        let machine = explorer.machine_alone(&setup.values()).unwrap();
+        explorer.known = explorer.all_known(&machine);
+        let width = |kind: &str| {
+            let index = search.candidates().iter().position(|c| library[c.mechanism].kind == kind).unwrap();
+            match explorer.known[index][0] {
+                Known::Strength(width) => width,
+                _ => panic!("{kind} has a strength"),
+            }
+        };
+        let (level, point) = explorer.level(&machine);
+        let along = Along::smoothed(&machine.at().setup, &level, &setup.data.spread, &point);
+        let force = along.total_forces()[0];
+        assert!((width("constant_offset") / force - 1.0).abs() < 0.05);
+        assert!((width("coulomb_friction") / force - 1.0).abs() < 0.05);
+        let rate = &machine.at().setup.hats.states[0][1].clone().unwrap();
+        let rms = (rate.iter().map(|v| v * v).sum::<f64>() / rate.len() as f64).sqrt();
+        assert!((width("viscous_friction") * rms / force - 1.0).abs() < 0.1);
+    }
+}

@@ -964,8 +964,7 @@ impl<'a> Search<'a> {
     /// Explores what the machine lacks where every model of it errs, from what this search found.
     pub(crate) fn explore(&self, found: &Found) -> Option<Posterior> {
         let calibrated = &found.calibrated;
-        Explorer::new(self, &calibrated.setup)
-            .explore(&calibrated.fit.point.parameters, &[&found.improved])
+        Explorer::new(self, &calibrated.setup).explore(&calibrated.fit.point.parameters, &[&found.improved])
     }
 
     /// A hypothesis fitted to the segments of what this search found, in its place.
@@ -973,17 +972,13 @@ impl<'a> Search<'a> {
         let at = &h.fitted.at;
         let n0 = self.nominal.model.parameters.len();
         let value = |name: &String| at.setup.model.parameter(name).map(|i| at.parameters[i]);
-        let parts: Option<Vec<(Candidate, Vec<f64>, Vec<f64>)>> = h
-            .parts
-            .iter()
-            .map(|p| {
-                let values: Option<Vec<f64>> = p.instance.names.iter().map(value).collect();
-                Some((p.candidate.clone(), values?, p.scales.clone()))
-            })
-            .collect();
-        let (setup, parts) =
-            self.assemble(&at.setup.holds, &at.parameters[..n0], &parts?, &at.setup).ok()?;
-        let setup = Setup { noise: None, ..setup };
+        let of = |p: &Part| {
+            let values: Option<Vec<f64>> = p.instance.names.iter().map(value).collect();
+            Some((p.candidate.clone(), values?, p.scales.clone()))
+        };
+        let parts: Option<Vec<_>> = h.parts.iter().map(of).collect();
+        let (setup, parts) = self.assemble(&at.setup.holds, &at.parameters[..n0], &parts?, &at.setup).ok()?;
+        let setup = Setup { noise: None, work: self.nominal.work.clone(), ..setup };
         let level = same_level(&setup, &found.calibrated.level);
         let starts = setup.starts(&level, &at.parameters);
         let point = Point { parameters: at.parameters.clone(), starts };
@@ -1017,7 +1012,7 @@ impl<'a> Search<'a> {
             accepted,
             better_holds: found.better_holds.clone(),
             scale,
-            limited: found.limited || self.limited.load(Ordering::Relaxed),
+            limited: found.limited,
             rejected: Vec::new(),
             errs: true,
         })
@@ -1184,7 +1179,7 @@ impl<'a> Search<'a> {
 
     /// Whether the work is used up. Asked only between one step of the search and the next: the sum does not
     /// depend on the order in which threads add to it.
-    pub(crate) fn is_spent(&self) -> bool {
+    fn is_spent(&self) -> bool {
         self.would_overspend(0)
     }
 

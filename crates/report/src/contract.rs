@@ -117,6 +117,8 @@ pub enum Verdict {
 pub enum Basis {
     /// The mechanisms listed, which are believed.
     Named,
+    /// The mechanisms listed, which are believed, and the candidates listed, which are not.
+    NamedAndProposed,
     /// The candidates listed, which are not.
     Proposed,
     /// The given equations with refitted parameters.

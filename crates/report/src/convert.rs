@@ -46,6 +46,7 @@ pub fn report(diagnosis: &Diagnosis, sources: &Sources<'_>) -> Report {
         summary: Vec::new(),
         basis: match d.basis {
             Ground::Named => Basis::Named,
+            Ground::NamedAndProposed => Basis::NamedAndProposed,
             Ground::Proposed => Basis::Proposed,
             Ground::Calibrated => Basis::Calibrated,
         },
@@ -484,7 +485,9 @@ fn findings(d: &Diagnosis, sources: &Sources<'_>) -> Vec<Finding> {
     // Of what is believed: terms that stand in for something else may fit the noise.
     let (model, run) = match d.basis {
         Ground::Named => (&d.improved, &d.train.improved.run),
-        Ground::Proposed | Ground::Calibrated => (&d.calibrated, &d.train.calibrated.run),
+        Ground::NamedAndProposed | Ground::Proposed | Ground::Calibrated => {
+            (&d.calibrated, &d.train.calibrated.run)
+        }
     };
     if let Ok(setup) = Setup::new(model, d.train.data.clone(), Vec::new()) {
         let found = input_noise::findings(&setup, &setup.values(), run, true);

@@ -61,7 +61,10 @@ pub fn summary(report: &Report) -> Vec<String> {
                     .map(|e| format!("To find out what it is: {}.", e.trim_end_matches('.'))),
             );
         }
-        Verdict::MissingPhysics => missing(report, &mut out),
+        Verdict::MissingPhysics => {
+            missing(report, &mut out);
+            out.extend(beside(report));
+        }
     }
     if report.verdict != Verdict::Unexplained && report.remainder.significant {
         out.push(format!(
@@ -95,11 +98,7 @@ fn proposed(report: &Report) -> Vec<String> {
     if report.candidates.is_empty() {
         return Vec::new();
     }
-    let laws: Vec<String> = report
-        .candidates
-        .iter()
-        .map(|c| format!("{} ({})", format::kind_in_sentence(&c.kind), expression::text(&c.expression)))
-        .collect();
+    let laws: Vec<String> = report.candidates.iter().map(law).collect();
     let change = error_change(&report.fit, Baseline::Calibrated)
         .map(|c| format!(": the held-out error{} falls from {} to {}", c.of, c.from, c.to))
         .unwrap_or_default();
@@ -112,8 +111,30 @@ fn proposed(report: &Report) -> Vec<String> {
     out
 }
 
+/// What the improved model holds beside the mechanisms that are believed.
+fn beside(report: &Report) -> Option<String> {
+    let laws: Vec<String> = report.candidates.iter().map(law).collect();
+    let change = error_change(&report.fit, Baseline::Calibrated)
+        .map(|c| format!(": the held-out error{} falls from {} to {}", c.of, c.from, c.to))
+        .unwrap_or_default();
+    (!laws.is_empty()).then(|| {
+        format!(
+            "The improved model also has {} and predicts what it was not fitted to better than the calibrated \
+             one{change}. What stands beside the named may be something else.",
+            joined(&laws, "and")
+        )
+    })
+}
+
+/// A candidate and its law.
+fn law(candidate: &Mechanism) -> String {
+    format!("{} ({})", format::kind_in_sentence(&candidate.kind), expression::text(&candidate.expression))
+}
+
 fn missing(report: &Report, out: &mut Vec<String>) {
-    let change = error_change(&report.fit, Baseline::Calibrated);
+    // (What others do beside them is told with these.)
+    let all = report.candidates.is_empty();
+    let change = all.then(|| error_change(&report.fit, Baseline::Calibrated)).flatten();
     let single = report.mechanisms.len() == 1;
     for mechanism in &report.mechanisms {
         let mut sentence = mechanism_sentence(mechanism);
