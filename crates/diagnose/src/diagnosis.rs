@@ -755,9 +755,9 @@ impl Judged {
     }
 }
 
-/// What the exploration finds beside an error of the model, if it can be defended and says more than what stands: it names
-/// laws that do not stand with a name yet; or it simulates better and takes no name away, having one of the `agreed` where
-/// there are any. Whether its mechanisms are named, which those of an exploration that did not come to its end are not.
+/// What the exploration finds beside an error of the model, if it can be defended and says more than what stands. Where
+/// nothing is named yet, it names laws or simulates better. Where laws are named, it has one of them (`agreed`) and simulates
+/// better. Whether its mechanisms are named, which those of an exploration that did not come to its end are not.
 fn believed(
     search: &Search<'_>,
     (found, polished): (&Found, &Polished),
@@ -769,10 +769,10 @@ fn believed(
     let posterior = search.explore(found)?;
     let believes = !posterior.beliefs.is_empty() && !posterior.limited;
     let likeliest = posterior.tried.as_ref().unwrap_or(&posterior.chosen);
-    let mut adopted = search.adopt(found, likeliest, &posterior.beliefs)?;
-    if adopted.improved.parts.is_empty() {
+    if likeliest.parts.is_empty() {
         return None;
     }
+    let mut adopted = search.adopt(found, likeliest, &posterior.beliefs)?;
     let own = polish(&adopted.improved, &adopted.scale, judge);
     let own = defend(search, &mut adopted, own, baseline, judge, false);
     let (parts, standing) = (&own.fitted.parts, &polished.fitted.parts);
@@ -786,7 +786,7 @@ fn believed(
         judge.misfit(&p.fitted.setup, &p.fitted.fit.point.parameters, &scale)
     };
     let is_better = || misfit(&own, &adopted.scale).total_cmp(&misfit(polished, &found.scale)).is_lt();
-    let takes_over = believes || (!names || parts.iter().any(agreed)) && is_better();
+    let takes_over = if names { parts.iter().any(agreed) && is_better() } else { believes || is_better() };
     adopted.limited |= posterior.limited;
     if takes_over { Some((adopted, own, believes)) } else { None }
 }
