@@ -505,7 +505,7 @@ fn conclude(
     let scores = judge.scores(&polished.fitted.setup, &polished.fitted.fit.point.parameters, &scale);
     let mut judged = of(&found, &polished, named);
     let mut agreed = Vec::new();
-    if judged.verdict == Verdict::Unexplained || !leaves_noise(&scores, &polished.origin, &scale) {
+    if !leaves_noise(&scores, &polished.origin, &scale) {
         let names = judged.verdict == Verdict::MissingPhysics;
         if names {
             agreed = polished.fitted.parts.iter().map(|p| named_as(p, library, &nominal.model)).collect();
@@ -1153,18 +1153,32 @@ fn is_patchwork(
         let here = |l: &&(usize, &Motion, &str, bool)| l.3 && l.1.coefficients == motion.coefficients;
         laws.iter().filter(here).filter(|l| considerable(l.0)).count()
     };
-    // A force that depends on nothing.
+    // What it adds depends on nothing: a constant force, or the offset of an input.
+    let model = &improved.setup.model;
     let is_constant = |part: &Part| {
-        let mut depends = false;
-        part.instance.expression.walk(&mut |e| {
-            depends |= matches!(e, Expr::Var { name, .. } if improved.setup.model.parameter(name).is_none());
+        let law = &part.instance.expression;
+        let input = match &part.candidate.place {
+            Place::Input(i) => Some(&*model.inputs[*i].name),
+            _ => None,
+        };
+        let mut depends = input.is_some_and(|input| law.derivative(input, 0) != Expr::Num(1.0));
+        law.walk(&mut |e| {
+            depends |= matches!(e, Expr::Var { name, .. }
+                if model.parameter(name).is_none() && input != Some(&**name));
         });
         !depends
     };
     let beside_constant = |motion: &Motion| {
-        improved.parts.iter().enumerate().any(|(i, part)| match &part.candidate.place {
-            Place::Equation(e) => motion.weights[*e] != 0.0 && considerable(i) && is_constant(part),
-            _ => false,
+        improved.parts.iter().enumerate().any(|(i, part)| {
+            let acts = match &part.candidate.place {
+                Place::Equation(e) => motion.weights[*e] != 0.0,
+                Place::Input(i) => {
+                    let moved = model.equations.iter().zip(&motion.weights).filter(|(_, w)| **w != 0.0);
+                    moved.into_iter().any(|(e, _)| e.residual().mentions(&model.inputs[*i].name))
+                }
+                _ => false,
+            };
+            acts && considerable(i) && is_constant(part)
         })
     };
     laws.iter().any(|l| considerable(l.0) && patches(l.1) >= PATCHES)
