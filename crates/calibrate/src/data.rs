@@ -312,6 +312,17 @@ impl Data {
         self.pieces.iter().map(|p| p.len).sum()
     }
 
+    /// Periods of the channels of all pieces that move, samples: 2π·(RMS about the mean)/(RMS of the rate), which is a sine's
+    /// own period.
+    pub fn periods(&self) -> Vec<f64> {
+        let period = |swing: f64, rate: &[f64], dt: f64| {
+            let rate = (rate.iter().map(|v| v * v).sum::<f64>() / rate.len().max(1) as f64).sqrt();
+            (swing > 0.0 && rate > 0.0).then(|| 2.0 * std::f64::consts::PI * swing / rate / dt)
+        };
+        let channels = self.pieces.iter().flat_map(|piece| piece.smooth.iter().map(|s| (s, piece.dt)));
+        channels.filter_map(|(s, dt)| period(spread(&s.value), &s.d1, dt)).collect()
+    }
+
     /// Number of samples of each piece.
     pub fn lengths(&self) -> Vec<usize> {
         self.pieces.iter().map(|p| p.len).collect()

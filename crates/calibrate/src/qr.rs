@@ -121,6 +121,27 @@ fn norm(a: &[f64]) -> f64 {
     dot(a, a).sqrt()
 }
 
+/// P ← F P Fᵀ of a symmetric P, both `n × n`; `scratch` is as large as they are.
+pub fn sandwich(f: &[f64], p: &mut [f64], scratch: &mut [f64], n: usize) {
+    scratch[..n * n].fill(0.0);
+    for i in 0..n {
+        for (l, f) in f[i * n..(i + 1) * n].iter().enumerate() {
+            if *f != 0.0 {
+                let row = &mut scratch[i * n..(i + 1) * n];
+                row.iter_mut().zip(&p[l * n..(l + 1) * n]).for_each(|(s, p)| *s += f * p);
+            }
+        }
+    }
+    for i in 0..n {
+        for j in 0..=i {
+            let (row, f) = (&scratch[i * n..(i + 1) * n], &f[j * n..(j + 1) * n]);
+            let v: f64 = row.iter().zip(f).map(|(s, f)| s * f).sum();
+            p[i * n + j] = v;
+            p[j * n + i] = v;
+        }
+    }
+}
+
 /// Solves the symmetric positive (semi)definite `n × n` system by Cholesky with a relative floor on
 /// the pivots; small systems only (fold tests, Gram blocks).
 pub fn solve_spd(a: &[f64], n: usize, b: &[f64]) -> Vec<f64> {

@@ -25,6 +25,56 @@
 //! all with the same parameters (Varin, Reid, Firth, *An overview of composite likelihood methods*, Statistica Sinica 21,
 //! 2011). It counts the same samples several times; by how much its curvature overstates what they tell is the ratio of
 //! the variance of its score to that curvature ([`Pass::inflation`]).
+//!
+//! What a pass is given by, `n` = free parameters, then equations of the machine, then channels:
+//!
+//! | | shape | unit |
+//! |---|---|---|
+//! | [`Errors::force`], [`Errors::sensor`] | equations, channels | ln of (unit of the highest derivative)²·s, of (SI unit)² |
+//! | [`Pass::gradient`] | n | 1/SI, 1 |
+//! | [`Pass::information`] | n × n | the same, squared |
+//!
+//! ```
+//! use std::sync::Arc;
+//!
+//! use greybox_calibrate::stochastic::{Filter, Stochastic};
+//! use greybox_calibrate::{Data, Setup, free_parameters};
+//! use greybox_model::Model;
+//! use greybox_recording::{Channel, Recording};
+//!
+//! // A tank that runs empty. Beside a pulsing inflow that the model does not know, its level falls with 0.5 1/s.
+//! let model = Model::from_toml(
+//!     r#"
+//! [states]
+//! h = { unit = "m", initial = 2.0 }
+//! [parameters]
+//! a = { value = 0.3, unit = "1/s" }
+//! [equations]
+//! tank = "h' + a*h = 0"
+//! "#,
+//!     "tank.toml",
+//! )?;
+//! let (dt, mut h) = (0.02, 2.0);
+//! let (mut time, mut values) = (Vec::new(), Vec::new());
+//! for k in 0..400 {
+//!     let t = dt * f64::from(k);
+//!     time.push(t);
+//!     values.push(h);
+//!     h += dt * (-0.5 * h + 0.2 * (7.0 * t).sin());
+//! }
+//! let channel = Channel { name: "h".into(), unit: Some("m".into()), values };
+//! let recording = Recording::from_columns("tank.csv", time, vec![channel])?;
+//! let data = Arc::new(Data::new(&model, &[recording])?);
+//! let setup = Setup::new(&model, data, free_parameters(&model))?;
+//!
+//! let filter = Filter::new(&setup);
+//! let (parameters, errors) = (setup.values(), filter.first_errors());
+//! let start = Stochastic { setup, parameters, errors, starts: Vec::new() };
+//! let weight = 1.0 / filter.strides().len() as f64;
+//! let fitted = filter.fit(start, weight, 40).expect("the simulation stays bounded");
+//! assert!((fitted.at.parameters[0] - 0.5).abs() < 0.05, "{}", fitted.at.parameters[0]);
+//! # Ok::<(), Box<dyn std::error::Error>>(())
+//! ```
 
 use std::sync::Arc;
 
@@ -53,7 +103,7 @@ const LEAST_NOISE: f64 = 0.25;
 const FIRST_ERROR: f64 = 0.1;
 const FIRST_MEMORY: f64 = 10.0;
 /// How far the logarithm of an intensity may go from the first one, downwards and upwards.
-const RANGE: (f64, f64) = (25.0, 12.0);
+pub const RANGE: (f64, f64) = (25.0, 12.0);
 /// Longest step of the logarithm of a variance.
 const LONGEST: f64 = 2.0;
 /// Blocks of samples whose scores tell their variance.
@@ -66,6 +116,13 @@ pub struct Errors {
     pub force: Vec<f64>,
     /// ln r per channel, r in SI².
     pub sensor: Vec<f64>,
+}
+
+impl Errors {
+    /// Standard deviation of each channel's noise, SI.
+    pub fn noise(&self) -> Vec<f64> {
+        self.sensor.iter().map(|r| (0.5 * r).exp()).collect()
+    }
 }
 
 /// A model at these parameters, which errs so much.
@@ -151,19 +208,15 @@ pub struct Pass {
     pub information: Vec<f64>,
     /// Gradients of [`BLOCKS`] blocks of samples.
     pub blocks: Vec<Vec<f64>>,
-    /// RMS of the innovations over the spread of their channels, horizon by horizon, without the first tenth of each
-    /// piece.
-    pub errors: Vec<f64>,
 }
 
 impl Pass {
-    fn new(n: usize, horizons: usize) -> Pass {
+    fn new(n: usize) -> Pass {
         Pass {
             log: 0.0,
             gradient: vec![0.0; n],
             information: vec![0.0; n * n],
             blocks: vec![vec![0.0; n]; BLOCKS],
-            errors: vec![0.0; 2 * horizons],
         }
     }
 
@@ -172,14 +225,10 @@ impl Pass {
         let n = np + nn;
         let ratio = i.e * i.e / i.s;
         self.log -= 0.5 * (ratio + (2.0 * std::f64::consts::PI * i.s).ln());
-        let (piece, sample) = i.at;
-        if sample >= filter.length(piece) / 10 {
-            self.errors[2 * i.horizon] += (i.e / filter.spread[i.channel]).powi(2);
-            self.errors[2 * i.horizon + 1] += 1.0;
-        }
         if n == 0 {
             return;
         }
+        let (piece, sample) = i.at;
         let block = &mut self.blocks[BLOCKS * (filter.offsets[piece] + sample) / filter.total.max(1)];
         let de = |a: usize| if a < np { i.by_parameters[a] } else { i.by_errors.0[a - np] };
         let ds = |a: usize| if a < np { 0.0 } else { i.by_errors.1[a - np] };
@@ -195,28 +244,22 @@ impl Pass {
         }
     }
 
-    fn finish(mut self) -> Pass {
-        let n = self.gradient.len();
-        for a in 0..n {
-            for b in 0..a {
-                self.information[b * n + a] = self.information[a * n + b];
-            }
-        }
-        self.errors = self.errors.chunks(2).map(|e| (e[0] / e[1].max(1.0)).sqrt()).collect();
-        self
-    }
-
-    fn sum(parts: Vec<Pass>, n: usize, horizons: usize) -> Pass {
-        let mut total = Pass::new(n, horizons);
+    /// Of all parts together, the other half of the information filled in.
+    fn sum(parts: Vec<Pass>, n: usize) -> Pass {
+        let mut total = Pass::new(n);
         let add = |a: &mut [f64], b: &[f64]| a.iter_mut().zip(b).for_each(|(a, b)| *a += b);
         for part in parts {
             total.log += part.log;
             add(&mut total.gradient, &part.gradient);
             add(&mut total.information, &part.information);
-            add(&mut total.errors, &part.errors);
             total.blocks.iter_mut().zip(&part.blocks).for_each(|(a, b)| add(a, b));
         }
-        total.finish()
+        for a in 0..n {
+            for b in 0..a {
+                total.information[b * n + a] = total.information[a * n + b];
+            }
+        }
+        total
     }
 
     /// How much the information overstates what the samples tell of the first `n` of what is free: the mean eigenvalue of
@@ -287,7 +330,7 @@ impl Filter {
             })
             .collect();
         let dt = data.pieces.iter().map(|p| p.dt).fold(f64::INFINITY, f64::min);
-        let slowest = periods(nominal).into_iter().fold(0.0, f64::max);
+        let slowest = data.periods().into_iter().fold(0.0, f64::max);
         let strides = strides(total, (0.5 * slowest) as usize);
         let runs: Vec<Option<Vec<f64>>> = (0..data.pieces.len())
             .map(|p| {
@@ -381,12 +424,8 @@ impl Filter {
     }
 
     /// Number of variances.
-    pub fn variances(&self) -> usize {
+    fn variances(&self) -> usize {
         self.rows.len() + self.sensor.len()
-    }
-
-    fn length(&self, piece: usize) -> usize {
-        self.offsets.get(piece + 1).copied().unwrap_or(self.total) - self.offsets[piece]
     }
 
     /// Runs the filter over every horizon of every piece. `add` receives the innovations of one of them, in their order,
@@ -399,9 +438,23 @@ impl Filter {
         new: impl Fn() -> T + Sync,
         add: impl Fn(&mut T, &Innovation<'_>) + Sync,
     ) -> Option<Vec<T>> {
+        self.run_from(0, at, derivatives, signals, new, add)
+    }
+
+    /// The same over the horizons from one on.
+    fn run_from<T: Send>(
+        &self,
+        shortest: usize,
+        at: &Stochastic,
+        derivatives: bool,
+        signals: Option<&[Arc<SignalLanes>]>,
+        new: impl Fn() -> T + Sync,
+        add: impl Fn(&mut T, &Innovation<'_>) + Sync,
+    ) -> Option<Vec<T>> {
         let mut chains = Vec::new();
-        for (horizon, (stride, phases)) in self.strides.iter().zip(&self.phases).enumerate() {
-            for phase in 0..*phases {
+        for horizon in shortest..self.strides.len() {
+            let (stride, phases) = (self.strides[horizon], self.phases[horizon]);
+            for phase in 0..phases {
                 let first = phase * stride / phases / self.coarse * self.coarse;
                 chains.extend((0..at.setup.data.pieces.len()).map(|piece| Chain { horizon, piece, first }));
             }
@@ -418,23 +471,20 @@ impl Filter {
 
     /// The likelihood of a model with its derivatives, or alone.
     pub fn pass(&self, at: &Stochastic, derivatives: bool) -> Option<Pass> {
+        self.pass_from(0, at, derivatives)
+    }
+
+    fn pass_from(&self, shortest: usize, at: &Stochastic, derivatives: bool) -> Option<Pass> {
         let n = if derivatives { at.setup.free.len() + self.variances() } else { 0 };
-        let horizons = self.strides.len();
-        let parts =
-            self.run(at, derivatives, None, || Pass::new(n, horizons), |pass, i| pass.add(self, i))?;
-        let pass = Pass::sum(parts, n, horizons);
+        let add = |pass: &mut Pass, i: &Innovation<'_>| pass.add(self, i);
+        let parts = self.run_from(shortest, at, derivatives, None, || Pass::new(n), add)?;
+        let pass = Pass::sum(parts, n);
         pass.log.is_finite().then_some(pass)
     }
 
     /// ln L of the longer half of the horizons alone: enough to tell which of several points is the best to begin with.
     pub fn glance(&self, at: &Stochastic) -> Option<f64> {
-        let half = self.strides.len() / 2;
-        let longer = Filter {
-            strides: self.strides[half..].to_vec(),
-            phases: self.phases[half..].to_vec(),
-            ..self.clone()
-        };
-        longer.pass(at, false).map(|pass| pass.log)
+        self.pass_from(self.strides.len() / 2, at, false).map(|pass| pass.log)
     }
 
     /// First state of a piece with its variances.
@@ -479,13 +529,15 @@ impl Filter {
         let coarse = self.coarse;
         let Chain { horizon, piece, first } = *chain;
         let fine = &setup.environments[piece];
-        let environment = &Environment {
+        // (A machine of which samples are skipped has no inputs.)
+        let thin = (coarse > 1).then(|| Environment {
             dt: fine.dt * coarse as f64,
             len: fine.len.div_ceil(coarse),
             start: fine.start,
-            inputs: fine.inputs.clone(),
+            inputs: Vec::new(),
             forces: Vec::new(),
-        };
+        });
+        let environment = thin.as_ref().unwrap_or(fine);
         let system = &*setup.system;
         let (nx, ny) = (system.nx, system.ny);
         let (stride, first) = (self.strides[horizon] / coarse, first / coarse);
@@ -515,6 +567,7 @@ impl Filter {
         };
         let mut stepper = simulation.stepper(&x0);
         let mut x = x0;
+        let mut before = vec![0.0; nx];
         let mut dp = vec![0.0; nn * nx * nx];
         let mut dx = vec![0.0; nn * nx];
         let mut f = vec![0.0; nx * nx];
@@ -551,7 +604,7 @@ impl Filter {
                 stepper.observe();
                 x.copy_from_slice(stepper.state());
                 change.fill(0.0);
-                let before = x.clone();
+                before.copy_from_slice(&x);
                 for c in 0..ny {
                     let y = measured[c][k * coarse];
                     if y.is_nan() {
@@ -636,9 +689,9 @@ impl Filter {
                 f[i * nx..(i + 1) * nx].copy_from_slice(&stepper.tangents(i)[np..np + nx]);
             }
             stepper.restart_lanes();
-            sandwich(&f, &mut p, &mut scratch, nx);
+            qr::sandwich(&f, &mut p, &mut scratch, nx);
             for l in 0..nn {
-                sandwich(&f, &mut dp[l * nx * nx..(l + 1) * nx * nx], &mut scratch, nx);
+                qr::sandwich(&f, &mut dp[l * nx * nx..(l + 1) * nx * nx], &mut scratch, nx);
                 let dx = &mut dx[l * nx..(l + 1) * nx];
                 for i in 0..nx {
                     scratch[i] = qr::dot(&f[i * nx..(i + 1) * nx], dx);
@@ -774,7 +827,7 @@ fn coarse(setup: &Setup, first: usize) -> usize {
     if setup.system.nu > 0 || !setup.environments.iter().all(|e| e.forces.is_empty()) {
         return 1;
     }
-    let period = periods(setup).into_iter().fold(f64::INFINITY, f64::min);
+    let period = setup.data.periods().into_iter().fold(f64::INFINITY, f64::min);
     // (A divisor of the first stride, so that every correction falls on a step.)
     (1..=first).rev().find(|n| first.is_multiple_of(*n) && *n as f64 * STEPS <= period).unwrap_or(1)
 }
@@ -807,37 +860,6 @@ fn thinned(signals: &Arc<SignalLanes>, n: usize) -> Arc<SignalLanes> {
         inputs: all(&signals.inputs),
         outputs: all(&signals.outputs),
     })
-}
-
-/// p ← f p fᵀ.
-fn sandwich(f: &[f64], p: &mut [f64], scratch: &mut [f64], n: usize) {
-    for i in 0..n {
-        for j in 0..n {
-            scratch[i * n + j] = (0..n).map(|k| f[i * n + k] * p[k * n + j]).sum();
-        }
-    }
-    for i in 0..n {
-        for j in 0..=i {
-            let v = qr::dot(&scratch[i * n..(i + 1) * n], &f[j * n..(j + 1) * n]);
-            p[i * n + j] = v;
-            p[j * n + i] = v;
-        }
-    }
-}
-
-/// The period of each channel of each piece, samples: that of a sine with its spread and its rate.
-fn periods(setup: &Setup) -> Vec<f64> {
-    let mut periods = Vec::new();
-    for piece in &setup.data.pieces {
-        for smooth in &piece.smooth {
-            let swing = crate::data::spread(&smooth.value);
-            let rate = rms(smooth.d1.iter());
-            if swing > 0.0 && rate > 0.0 {
-                periods.push(2.0 * std::f64::consts::PI * swing / rate / piece.dt);
-            }
-        }
-    }
-    periods
 }
 
 /// The horizons of so many samples in all.
@@ -968,8 +990,8 @@ decay = "x' + a*x = 0"
         assert!((gradient[2] - by_r).abs() < 1e-4 * by_r.abs().max(1.0), "{} {by_r}", gradient[2]);
     }
 
-    /// The rate, the intensity and the sensor's noise of a random walk that decays, over seeds: means within two standard
-    /// errors of the truth.
+    /// The rate, the intensity and the sensor's noise of a random walk that decays, over seeds: means within 2.5 standard
+    /// errors of the truth and the hundredth that a finite record is biased by.
     #[test]
     fn a_walk_tells_its_rate_its_intensity_and_its_noise() {
         let (a, q, r) = (0.8f64, 0.4f64, 0.01f64);

@@ -496,14 +496,14 @@ fn conclude(
         let polished = polish(&found.improved, &found.scale, &judge);
         defend(search, &mut found, polished, &baseline, &judge, true)
     };
-    // Where more than noise is left, every model of the machine errs, and output errors do not compare them.
-    let of = |found: &Found, polished: &Polished, named: bool| {
+    let judged_of = |found: &Found, polished: &Polished, named: bool| {
         let scale = residual_scale(&polished.fitted, &found.scale);
         Judged::of(search, found, &polished.fitted, &scale, (&baseline.polished.fitted, named), library)
     };
     let scale = residual_scale(&polished.fitted, &found.scale);
     let scores = judge.scores(&polished.fitted.setup, &polished.fitted.fit.point.parameters, &scale);
-    let mut judged = of(&found, &polished, named);
+    let mut judged = judged_of(&found, &polished, named);
+    // Where more than noise is left, every model of the machine errs, and output errors do not compare them.
     let mut agreed = Vec::new();
     if !leaves_noise(&scores, &polished.origin, &scale) {
         let names = judged.verdict == Verdict::MissingPhysics;
@@ -512,9 +512,9 @@ fn conclude(
         }
         let in_both = |part: &Part| agreed.contains(&named_as(part, library, &nominal.model));
         let standing = (&found, &polished);
-        if let Some((other, simulates, named)) = believed(search, standing, in_both, names, &baseline, &judge)
-        {
-            judged = of(&other, &simulates, named);
+        let explored = explored(search, standing, in_both, names, &baseline, &judge);
+        if let Some((other, simulates, named)) = explored {
+            judged = judged_of(&other, &simulates, named);
             (found, polished) = (other, simulates);
         }
         limited |= found.limited;
@@ -758,7 +758,7 @@ impl Judged {
 /// What the exploration finds beside an error of the model, if it can be defended and says more than what stands. Where
 /// nothing is named yet, it names laws or simulates better. Where laws are named, it has one of them (`agreed`) and simulates
 /// better. Whether its mechanisms are named, which those of an exploration that did not come to its end are not.
-fn believed(
+fn explored(
     search: &Search<'_>,
     (found, polished): (&Found, &Polished),
     agreed: impl Fn(&Part) -> bool,
@@ -987,7 +987,7 @@ fn defend(
         let fails = !bound.is_empty()
             || search.undetermined(&polished.origin, &widths).is_some()
             || worse
-            || search.has_negative_inertia(fitted, &found.scale)
+            || search.has_negative_inertia(&fitted.setup, &fitted.level, &fitted.fit.point, &found.scale)
             || !(likely || predicts());
         if !fails {
             return polished;

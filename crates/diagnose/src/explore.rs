@@ -19,7 +19,7 @@
 
 use std::sync::Arc;
 
-use greybox_calibrate::stochastic::{Filter, Fitted as Filtered, Pass, Stochastic};
+use greybox_calibrate::stochastic::{Filter, Fitted as Filtered, Pass, RANGE, Stochastic};
 use greybox_calibrate::{Level, Point, Prior, Setup, Work};
 use greybox_simulate::SignalLanes;
 use rayon::prelude::*;
@@ -28,13 +28,13 @@ use crate::along::Along;
 use crate::candidate::Candidate;
 use crate::library::First;
 use crate::screen::{Gram, Lanes, Scored, first_states, lanes, scored};
-use crate::search::{Fitted, Part, Search};
+use crate::search::{Fitted, Law, Part, Search, carried, laws};
 use crate::spectra::Spectra;
 use crate::{Observer, Stage};
 
 /// Probability from which a family of laws is named.
-pub(crate) const NAMED: f64 = 0.95;
-/// Probabilities whose ratio is less than e to this stay undecided.
+const NAMED: f64 = 0.95;
+/// Difference of two logarithms of evidence up to which the data do not decide.
 const UNDECIDED: f64 = 1.5;
 /// Hypotheses of each number of laws that are followed.
 const BEAM: usize = 2;
@@ -59,9 +59,7 @@ const PROMISING: f64 = 1.0;
 /// Departure of a parameter from what is stated, in units of its prior, from which candidates are also tried where it is
 /// stated: a calibrated parameter may stand in for what is missing.
 const FAR: f64 = 1.0;
-/// Range of a logarithm, ln q or ln r, and the least share of the highest value of an inner parameter that its logarithm
-/// reaches.
-const RANGE: f64 = 37.0;
+/// The least value of an inner parameter that its prior reaches, over its highest.
 const LEAST: f64 = 1e-3;
 /// Segments along which candidates are evaluated.
 const SEGMENTS: usize = 20;
@@ -77,33 +75,41 @@ enum Known {
     Angle,
 }
 
-/// A law of a hypothesis with its parameters.
-#[derive(Debug, Clone)]
-struct Member {
-    candidate: Candidate,
-    values: Vec<f64>,
-    scales: Vec<f64>,
-    known: Vec<Known>,
-}
-
 /// The machine's equations with some laws, fitted.
 #[derive(Debug, Clone)]
 pub(crate) struct Hypothesis {
-    members: Vec<Member>,
     /// The laws as they stand in the model.
     pub(crate) parts: Vec<Part>,
+    /// What is known of the parameters of each before the data.
+    known: Vec<Vec<Known>>,
     /// The fit.
     pub(crate) fitted: Filtered,
 }
 
+/// A hypothesis to be fitted.
+struct Draft {
+    parts: Vec<Part>,
+    known: Vec<Vec<Known>>,
+    start: Stochastic,
+}
+
 impl Hypothesis {
-    fn holds(&self, candidate: &Candidate) -> bool {
-        self.members.iter().any(|m| m.candidate == *candidate)
+    fn candidates(&self) -> impl Iterator<Item = &Candidate> {
+        self.parts.iter().map(|part| &part.candidate)
     }
 
-    /// Whether it has the same laws.
-    fn is(&self, others: &[&Candidate]) -> bool {
-        self.members.len() == others.len() && others.iter().all(|c| self.holds(c))
+    fn holds(&self, candidate: &Candidate) -> bool {
+        self.candidates().any(|c| c == candidate)
+    }
+
+    /// Whether it has these laws and no others.
+    fn is(&self, candidates: &[&Candidate]) -> bool {
+        self.parts.len() == candidates.len() && candidates.iter().all(|c| self.holds(c))
+    }
+
+    /// Its laws with their present values.
+    fn laws(&self) -> Vec<Law> {
+        laws(&self.parts, &self.at().setup.model, &self.at().parameters)
     }
 
     fn at(&self) -> &Stochastic {
@@ -113,7 +119,7 @@ impl Hypothesis {
     /// What is known before the data of everything that is free: logarithm of the density, precision.
     fn priors(&self) -> (f64, Vec<f64>) {
         let at = self.at();
-        let machine = at.setup.free.len() - self.members.iter().map(|m| m.values.len()).sum::<usize>();
+        let machine = at.setup.free.len() - self.known.iter().map(Vec::len).sum::<usize>();
         let mut log = 0.0;
         let mut precision = Vec::new();
         for f in &at.setup.free[..machine] {
@@ -121,8 +127,7 @@ impl Hypothesis {
             log -= 0.5 * f.prior.at(value).0.powi(2);
             precision.push(f.prior.precision(value));
         }
-        let laws = self.members.iter().flat_map(|m| &m.known);
-        for (f, known) in at.setup.free[machine..].iter().zip(laws) {
+        for (f, known) in at.setup.free[machine..].iter().zip(self.known.iter().flatten()) {
             let value = at.parameters[f.index];
             match known {
                 Known::Strength(width) => {
@@ -142,7 +147,7 @@ impl Hypothesis {
                 }
             }
         }
-        precision.resize(self.fitted.pass.gradient.len(), 12.0 / (RANGE * RANGE));
+        precision.resize(self.fitted.pass.gradient.len(), 12.0 / (RANGE.0 + RANGE.1).powi(2));
         (log, precision)
     }
 
@@ -155,7 +160,7 @@ impl Hypothesis {
         for (a, p) in precision.iter().enumerate() {
             h[a * n + a] += p;
         }
-        let laws = self.members.len() as f64 * (candidates.max(1) as f64).ln();
+        let laws = self.parts.len() as f64 * (candidates.max(1) as f64).ln();
         let normal = 0.5 * n as f64 * (2.0 * std::f64::consts::PI).ln();
         log / c + prior + normal - 0.5 * log_determinant(&h, n) - laws
     }
@@ -228,8 +233,10 @@ pub(crate) struct Explorer<'a, 'b> {
     search: &'a Search<'b>,
     machine: Setup,
     filter: Filter,
+    /// Work after which it looks for nothing more.
+    most_work: u64,
     /// What is known of the parameters of each candidate before the data.
-    known: Vec<Vec<Known>>,
+    priors: Vec<Vec<Known>>,
     /// All hypotheses that were fitted.
     rows: Vec<Hypothesis>,
     /// Which of them have their extensions among the others.
@@ -242,7 +249,8 @@ impl<'a, 'b> Explorer<'a, 'b> {
     /// Of a machine with its inputs held as a search decided.
     pub(crate) fn new(search: &'a Search<'b>, machine: &Setup) -> Explorer<'a, 'b> {
         // With a limit of work of its own.
-        let work = Arc::new(Work::of_fits_within(search.most_work / SHARE_OF_WORK));
+        let most_work = search.most_work / SHARE_OF_WORK;
+        let work = Arc::new(Work::of_fits_within(most_work));
         search.observer.begins(&work);
         let machine = Setup { noise: None, work, ..machine.clone() };
         let filter = Filter::new(&machine);
@@ -250,7 +258,8 @@ impl<'a, 'b> Explorer<'a, 'b> {
             search,
             machine,
             filter,
-            known: Vec::new(),
+            most_work,
+            priors: Vec::new(),
             rows: Vec::new(),
             extended: Vec::new(),
             inflation: 1.0,
@@ -279,7 +288,7 @@ impl<'a, 'b> Explorer<'a, 'b> {
             .map(|parameters| self.filter.fit(start(parameters), self.weight(), CALIBRATION))
             .collect();
         let fitted = fits.into_iter().flatten().max_by(|a, b| a.objective.total_cmp(&b.objective))?;
-        Some(Hypothesis { members: Vec::new(), parts: Vec::new(), fitted })
+        Some(Hypothesis { parts: Vec::new(), known: Vec::new(), fitted })
     }
 
     /// Weight of the likelihood in a fit.
@@ -291,14 +300,14 @@ impl<'a, 'b> Explorer<'a, 'b> {
     fn as_stated(&self, h: &Hypothesis) -> Option<Hypothesis> {
         let at = h.at();
         let far = self.machine.free.iter().any(|f| f.prior.at(at.parameters[f.index]).0.abs() > FAR);
-        if !far || !h.members.is_empty() {
+        if !far || !h.parts.is_empty() {
             return None;
         }
         let held = Setup { free: Vec::new(), ..self.machine.clone() };
         let start = Stochastic { setup: held, parameters: self.machine.values(), ..at.clone() };
         let mut fitted = self.filter.fit(start, self.weight(), LAST_STEPS)?;
         fitted.at.setup.free.clone_from(&self.machine.free);
-        Some(Hypothesis { members: Vec::new(), parts: Vec::new(), fitted })
+        Some(Hypothesis { parts: Vec::new(), known: Vec::new(), fitted })
     }
 
     /// Segments over all data, with the starts that a hypothesis gives them.
@@ -315,7 +324,7 @@ impl<'a, 'b> Explorer<'a, 'b> {
         let at = h.at();
         let setup = &at.setup;
         let (level, point) = self.level(h);
-        let scale: Vec<f64> = at.errors.sensor.iter().map(|r| (0.5 * r).exp()).collect();
+        let scale = at.errors.noise();
         let (along, forces) = Along::observed(setup, &level, &scale, &point);
         let spectra = Spectra::new(setup, &level, &scale, &point, &along, &forces);
         let lanes = lanes(setup, library, open, &along, &spectra);
@@ -339,7 +348,7 @@ impl<'a, 'b> Explorer<'a, 'b> {
     }
 
     /// What is known of the parameters of all candidates before the data.
-    fn all_known(&self, machine: &Hypothesis) -> Vec<Vec<Known>> {
+    fn all_priors(&self, machine: &Hypothesis) -> Vec<Vec<Known>> {
         let candidates = self.search.candidates();
         let setup = &machine.at().setup;
         let (level, point) = self.level(machine);
@@ -348,10 +357,10 @@ impl<'a, 'b> Explorer<'a, 'b> {
         let spectra = Spectra::new(setup, &level, scale, &point, &along, &forces);
         let lanes = lanes(setup, self.search.library, candidates, &along, &spectra);
         let total = totals(setup, &along);
-        (0..candidates.len()).map(|c| self.known_of(c, &lanes, &total)).collect()
+        (0..candidates.len()).map(|c| self.prior_of(c, &lanes, &total)).collect()
     }
 
-    fn known_of(&self, index: usize, lanes: &Lanes, total: &Totals) -> Vec<Known> {
+    fn prior_of(&self, index: usize, lanes: &Lanes, total: &Totals) -> Vec<Known> {
         let mechanism = &self.search.library[self.search.candidates()[index].mechanism];
         let variants = || lanes.variants.iter().filter(|v| v.candidate == index);
         // Of a strength: the widest of what any choice of the inner parameters says.
@@ -382,23 +391,11 @@ impl<'a, 'b> Explorer<'a, 'b> {
             .collect()
     }
 
-    fn member(&self, candidate: &Candidate, values: Vec<f64>, scales: Vec<f64>) -> Option<Member> {
-        let index = self.search.candidates().iter().position(|c| c == candidate)?;
-        Some(Member { candidate: candidate.clone(), values, scales, known: self.known.get(index)?.clone() })
-    }
-
     /// What another search found, as a hypothesis.
     fn adopted(&self, machine: &Hypothesis, other: &Fitted) -> Option<Hypothesis> {
         if other.parts.is_empty() {
             return None;
         }
-        let members: Option<Vec<Member>> = self
-            .search
-            .parts(other)
-            .into_iter()
-            .map(|(candidate, values, scales)| self.member(&candidate, values, scales))
-            .collect();
-        let members = members?;
         let n0 = self.machine.model.parameters.len();
         let point = &other.fit.point;
         let mut fresh = vec![Vec::new(); self.machine.data.pieces.len()];
@@ -412,174 +409,149 @@ impl<'a, 'b> Explorer<'a, 'b> {
                 }
             }
         }
-        let (mut start, parts) = self.assembled(machine, &members, &point.parameters[..n0], &fresh)?;
-        start.setup.method = other.setup.method;
-        let fitted = self.filter.fit(start, self.weight(), LAST_STEPS)?;
-        Some(Hypothesis { members, parts, fitted })
+        let laws = self.search.laws(other);
+        let mut draft = self.assembled(machine, &laws, &point.parameters[..n0], &fresh)?;
+        draft.start.setup.method = other.setup.method;
+        self.fit(draft, LAST_STEPS)
     }
 
-    /// A hypothesis with these laws and the parameters of the machine, to be fitted; new states start as `fresh` says.
+    fn fit(&self, draft: Draft, steps: usize) -> Option<Hypothesis> {
+        let Draft { parts, known, start } = draft;
+        let fitted = self.filter.fit(start, self.weight(), steps)?;
+        Some(Hypothesis { parts, known, fitted })
+    }
+
+    /// A hypothesis with these laws and the parameters of the machine; new states start as `fresh` says, per piece.
     fn assembled(
         &self,
         base: &Hypothesis,
-        members: &[Member],
+        laws: &[Law],
         machine: &[f64],
         fresh: &[Vec<f64>],
-    ) -> Option<(Stochastic, Vec<Part>)> {
+    ) -> Option<Draft> {
         let at = base.at();
-        let parts: Vec<_> =
-            members.iter().map(|m| (m.candidate.clone(), m.values.clone(), m.scales.clone())).collect();
-        let (mut setup, parts) =
-            self.search.assemble(&self.machine.holds, machine, &parts, &at.setup).ok()?;
+        let prior = |law: &Law| {
+            let index = self.search.candidates().iter().position(|c| *c == law.0)?;
+            self.priors.get(index).cloned()
+        };
+        let known = laws.iter().map(prior).collect::<Option<Vec<_>>>()?;
+        let (mut setup, parts) = self.search.assemble(&self.machine.holds, machine, laws, &at.setup).ok()?;
         setup.noise = None;
         let first = self.machine.free.len();
-        for (f, known) in setup.free[first..].iter_mut().zip(members.iter().flat_map(|m| &m.known)) {
+        for (f, known) in setup.free[first..].iter_mut().zip(known.iter().flatten()) {
             if let Known::Strength(width) = known {
                 f.prior = Prior::Normal { mean: 0.0, std: *width };
             }
         }
-        let starts = (0..setup.data.pieces.len())
-            .map(|p| {
-                let mut x = vec![f64::NAN; setup.system.nx];
-                let mut new = fresh.get(p).into_iter().flatten();
-                for (j, state) in setup.model.states.iter().enumerate() {
-                    let known = at.setup.model.state(&state.name).map(|i| at.setup.system.offsets[i]);
-                    for k in 0..state.order {
-                        let of = |from: usize| at.starts.get(p).and_then(|s| s.get(from + k)).copied();
-                        x[setup.system.offsets[j] + k] = match known {
-                            Some(from) => of(from).unwrap_or(f64::NAN),
-                            None => new.next().copied().unwrap_or(0.0),
-                        };
-                    }
-                }
-                x
-            })
-            .collect();
-        let parameters = setup.values();
-        Some((Stochastic { setup, parameters, errors: at.errors.clone(), starts }, parts))
-    }
-
-    /// Values of a hypothesis's laws now.
-    fn members(&self, h: &Hypothesis) -> Vec<Member> {
-        let mut members = h.members.clone();
-        for (member, part) in members.iter_mut().zip(&h.parts) {
-            let names = part.instance.names.iter();
-            for (v, name) in member.values.iter_mut().zip(names) {
-                if let Some(i) = h.at().setup.model.parameter(name) {
-                    *v = h.at().parameters[i];
-                }
-            }
+        fn of(starts: &[Vec<f64>], piece: usize) -> &[f64] {
+            starts.get(piece).map_or(&[], Vec::as_slice)
         }
-        members
+        let start = |p| carried(&at.setup, of(&at.starts, p), &setup, of(fresh, p), f64::NAN);
+        let starts = (0..setup.data.pieces.len()).map(start).collect();
+        let (parameters, errors) = (setup.values(), at.errors.clone());
+        Some(Draft { parts, known, start: Stochastic { setup, parameters, errors, starts } })
     }
 
-    /// Starts of a fit of a hypothesis with one law more, the likeliest first.
-    fn first_points(&self, h: &Hypothesis, member: &Member, s: &Scored) -> Option<(Stochastic, Vec<Part>)> {
+    /// A hypothesis with one law more, where the likeliest of several starts is.
+    fn extended_by(&self, h: &Hypothesis, candidate: &Candidate, s: &Scored) -> Option<Draft> {
         let n0 = self.machine.model.parameters.len();
         let at = h.at();
-        let mechanism = &self.search.library[member.candidate.mechanism];
+        let mechanism = &self.search.library[candidate.mechanism];
         let fresh = if mechanism.states.is_empty() {
             Vec::new()
         } else {
             let (level, point) = self.level(h);
-            let scale: Vec<f64> = at.errors.sensor.iter().map(|r| (0.5 * r).exp()).collect();
-            let along = Along::smoothed(&at.setup, &level, &scale, &point);
-            first_states(&at.setup, mechanism, &member.candidate, &along)?
+            let along = Along::smoothed(&at.setup, &level, &at.errors.noise(), &point);
+            first_states(&at.setup, mechanism, candidate, &along)?
         };
-        let mut members = self.members(h);
-        members.push(member.clone());
-        let (mut start, parts) = self.assembled(h, &members, &at.parameters[..n0], &fresh)?;
+        let mut laws = h.laws();
+        laws.push((candidate.clone(), s.values.clone(), s.scales.clone()));
+        let mut draft = self.assembled(h, &laws, &at.parameters[..n0], &fresh)?;
+        let start = &mut draft.start;
         if !mechanism.states.is_empty() {
             // What it brings along may be faster than the machine.
             let tolerance: Vec<f64> = start.setup.data.spread.iter().map(|s| 1e-3 * s).collect();
             start.setup.choose_method(&tolerance, usize::MAX);
         }
-        let own = start.parameters.len() - member.values.len();
+        let own = start.parameters.len() - s.values.len();
         let point = |values: &[f64], shift: Option<&[f64]>| {
-            let mut point = start.clone();
-            point.parameters[own..].copy_from_slice(values);
-            if let Some(shift) = shift {
-                for (f, d) in at.setup.free.iter().zip(shift) {
-                    point.parameters[f.index] = (point.parameters[f.index] + d).max(f.lower).min(f.upper);
-                }
+            let mut parameters = start.parameters.clone();
+            parameters[own..].copy_from_slice(values);
+            for (f, d) in at.setup.free.iter().zip(shift.into_iter().flatten()) {
+                parameters[f.index] = (parameters[f.index] + d).max(f.lower).min(f.upper);
             }
-            point
+            parameters
         };
         let mut points = vec![point(&s.values, None), point(&s.values, Some(&s.shift))];
         points.extend(s.faint.iter().map(|faint| point(faint, None)));
         points.extend(s.others.iter().map(|(_, values, shift)| point(values, Some(shift))));
-        let worth = |p: &Stochastic| self.filter.glance(p).unwrap_or(f64::NEG_INFINITY);
-        let priced: Vec<f64> = points.iter().map(worth).collect();
-        let best = (0..points.len()).max_by(|a, b| priced[*a].total_cmp(&priced[*b]))?;
-        priced[best].is_finite().then(|| (points.swap_remove(best), parts))
+        let mut best = f64::NEG_INFINITY;
+        let mut likeliest = None;
+        for parameters in points {
+            let trial = Stochastic { parameters, ..start.clone() };
+            let log = self.filter.glance(&trial).filter(|log| *log >= best);
+            if let Some(log) = log {
+                (best, likeliest) = (log, Some(trial));
+            }
+        }
+        *start = likeliest?;
+        Some(draft)
     }
 
-    /// The hypothesis with one law more, for each that promises something, fitted.
+    /// The hypothesis with one law more, for the first `most` of those that promise something, fitted by so many steps.
+    fn trials(&self, h: &Hypothesis, open: &[Candidate], most: usize, steps: usize) -> Vec<Hypothesis> {
+        let scored = self.proposals(h, open);
+        let mut short = self.search.short_list(open, &scored, 0.0, SHORT_LIST, 0);
+        short.truncate(most);
+        self.observer().stage(Stage::Fitting { candidates: short.len() });
+        let trial = |s: &&Scored| self.fit(self.extended_by(h, &open[s.candidate], s)?, steps);
+        short.par_iter().filter_map(trial).collect()
+    }
+
+    /// Some hypotheses after further steps, as far as they are admissible.
+    fn refined(&self, trials: Vec<Hypothesis>, steps: usize) -> Vec<Hypothesis> {
+        let go_on = |h: Hypothesis| {
+            let fitted = self.filter.fit(h.fitted.at, self.weight(), steps)?;
+            Some(Hypothesis { fitted, ..h })
+        };
+        trials.into_par_iter().filter_map(go_on).filter(|h| self.is_admissible(h)).collect()
+    }
+
+    /// The likeliest of some hypotheses, and the others, likeliest first.
+    fn likeliest(&self, trials: Vec<Hypothesis>, most: usize) -> (Vec<Hypothesis>, Vec<Hypothesis>) {
+        let mut ranked: Vec<(f64, Hypothesis)> = trials.into_iter().map(|h| (self.evidence(&h), h)).collect();
+        ranked.sort_by(|a, b| b.0.total_cmp(&a.0));
+        let mut first: Vec<Hypothesis> = ranked.into_iter().map(|r| r.1).collect();
+        let others = first.split_off(first.len().min(most));
+        (first, others)
+    }
+
+    /// The hypothesis with one law more, for each that promises something, fitted; some of them twice.
     fn extensions(&self, base: &Hypothesis) -> Vec<Hypothesis> {
         let library = self.search.library;
         let taken = |c: &Candidate| {
-            base.members.iter().any(|m| {
-                let (own, kind) = (&library[m.candidate.mechanism], &library[c.mechanism].kind);
-                m.candidate == *c
-                    || m.candidate.place == c.place
-                        && (own.refines.contains(kind) || library[c.mechanism].refines.contains(&own.kind))
+            base.candidates().any(|own| {
+                let (refines, kind) = (&library[own.mechanism].refines, &library[c.mechanism].kind);
+                own == c
+                    || own.place == c.place
+                        && (refines.contains(kind)
+                            || library[c.mechanism].refines.contains(&library[own.mechanism].kind))
             })
         };
         // (What a single recording shows at certain times may not come back: it is never handed back beside an error.)
         let all = self.search.candidates().iter();
         let open: Vec<Candidate> =
             all.filter(|c| !taken(c) && !self.search.is_bound_to_a_clock(c)).cloned().collect();
-        self.observer().stage(Stage::Screening { candidates: open.len(), found: base.members.len() });
-        let stated = self.as_stated(base);
-        let mut out: Vec<Hypothesis> = Vec::new();
-        for (anchor, h) in [Some(base), stated.as_ref()].into_iter().flatten().enumerate() {
-            let scored = self.proposals(h, &open);
-            let short = self.search.short_list(&open, &scored, 0.0, SHORT_LIST, 0);
-            self.observer().stage(Stage::Fitting { candidates: short.len() });
+        self.observer().stage(Stage::Screening { candidates: open.len(), found: base.parts.len() });
+        let trials = self.trials(base, &open, SHORT_LIST, FIRST_STEPS);
+        let (trials, _) = self.likeliest(trials, FINALISTS);
+        let (best, others) = self.likeliest(self.refined(trials, MORE_STEPS), BEST);
+        let mut out = self.refined(best, LAST_STEPS);
+        out.extend(others);
+        if let Some(stated) = self.as_stated(base) {
             // (What starts at stated parameters has far to go: a few steps tell nothing.)
-            let (steps, most) = if anchor == 0 { (FIRST_STEPS, short.len()) } else { (0, FINALISTS) };
-            let mut trials: Vec<Hypothesis> = short[..most.min(short.len())]
-                .par_iter()
-                .filter_map(|s| {
-                    let member = self.member(&open[s.candidate], s.values.clone(), s.scales.clone())?;
-                    let (start, parts) = self.first_points(h, &member, s)?;
-                    let fitted = self.filter.fit(start, self.weight(), steps)?;
-                    let mut members = self.members(h);
-                    members.push(member);
-                    Some(Hypothesis { members, parts, fitted })
-                })
-                .collect();
-            if anchor == 0 {
-                trials.sort_by(|a, b| self.evidence(b).total_cmp(&self.evidence(a)));
-                trials.truncate(FINALISTS);
-            }
-            let go_on = |trials: Vec<Hypothesis>, steps: usize| -> Vec<Hypothesis> {
-                trials
-                    .into_par_iter()
-                    .filter_map(|h| {
-                        let fitted = self.filter.fit(h.fitted.at, self.weight(), steps)?;
-                        Some(Hypothesis { fitted, ..h })
-                    })
-                    .filter(|h| self.is_admissible(h))
-                    .collect()
-            };
-            if anchor == 0 {
-                trials = go_on(trials, MORE_STEPS);
-                trials.sort_by(|a, b| self.evidence(b).total_cmp(&self.evidence(a)));
-            }
-            let rest = if anchor == 0 { trials.split_off(trials.len().min(BEST)) } else { Vec::new() };
-            let mut finished = go_on(trials, LAST_STEPS);
-            finished.extend(rest);
-            for h in finished {
-                let same = |o: &Hypothesis| {
-                    o.members[o.members.len() - 1].candidate == h.members[h.members.len() - 1].candidate
-                };
-                match out.iter_mut().find(|o| same(o)) {
-                    Some(known) if self.evidence(&h) > self.evidence(known) => *known = h,
-                    Some(_) => {}
-                    None => out.push(h),
-                }
-            }
+            let trials = self.trials(&stated, &open, FINALISTS, 0);
+            out.extend(self.refined(trials, LAST_STEPS));
         }
         out
     }
@@ -594,21 +566,19 @@ impl<'a, 'b> Explorer<'a, 'b> {
 
     /// The hypothesis without one of its laws, fitted.
     fn without(&self, h: &Hypothesis, index: usize) -> Option<Hypothesis> {
-        let mut members = self.members(h);
-        members.remove(index);
-        let others: Vec<&Candidate> = members.iter().map(|m| &m.candidate).collect();
+        let mut laws = h.laws();
+        laws.remove(index);
+        let others: Vec<&Candidate> = laws.iter().map(|law| &law.0).collect();
         if let Some(known) = self.rows.iter().find(|row| row.is(&others)) {
             return Some(known.clone());
         }
         let n0 = self.machine.model.parameters.len();
-        let (start, parts) = self.assembled(h, &members, &h.at().parameters[..n0], &[])?;
-        let fitted = self.filter.fit(start, self.weight(), LAST_STEPS)?;
-        Some(Hypothesis { members, parts, fitted })
+        self.fit(self.assembled(h, &laws, &h.at().parameters[..n0], &[])?, LAST_STEPS)
     }
 
     /// Keeps a hypothesis, or the better of two fits of it; its index.
     fn keep(&mut self, h: Hypothesis) -> usize {
-        let candidates: Vec<&Candidate> = h.members.iter().map(|m| &m.candidate).collect();
+        let candidates: Vec<&Candidate> = h.candidates().collect();
         match self.rows.iter().position(|row| row.is(&candidates)) {
             Some(i) => {
                 if self.evidence(&h) > self.evidence(&self.rows[i]) {
@@ -649,7 +619,7 @@ impl<'a, 'b> Explorer<'a, 'b> {
     /// Whether the work is used up, or nobody waits for the answer any more.
     fn is_spent(&self) -> bool {
         let work = &self.machine.work;
-        work.is_given_up() || work.done() > self.search.most_work / SHARE_OF_WORK
+        work.is_given_up() || work.done() > self.most_work
     }
 
     /// Explores from parameters of the machine that another search found, and what it found beside them; `None` where the
@@ -658,7 +628,7 @@ impl<'a, 'b> Explorer<'a, 'b> {
         self.observer().stage(Stage::Calibrating);
         self.inflation = self.filter.strides().len() as f64;
         let machine = self.machine_alone(found)?;
-        self.known = self.all_known(&machine);
+        self.priors = self.all_priors(&machine);
         self.keep(machine);
         self.temper(0);
         for other in others {
@@ -673,10 +643,10 @@ impl<'a, 'b> Explorer<'a, 'b> {
             if self.is_spent() {
                 break;
             }
-            let before = self.best(|h| h.members.len() < laws).map(|i| self.evidence(&self.rows[i]))?;
+            let before = self.best(|h| h.parts.len() < laws).map(|i| self.evidence(&self.rows[i]))?;
             beam.iter().for_each(|row| self.extend(*row));
             let mut next: Vec<usize> =
-                (0..self.rows.len()).filter(|i| self.rows[*i].members.len() == laws).collect();
+                (0..self.rows.len()).filter(|i| self.rows[*i].parts.len() == laws).collect();
             next.sort_by(|a, b| self.evidence(&self.rows[*b]).total_cmp(&self.evidence(&self.rows[*a])));
             next.truncate(BEAM);
             let Some(&first) = next.first() else { break };
@@ -692,10 +662,10 @@ impl<'a, 'b> Explorer<'a, 'b> {
         }
         let mut best = self.best(|_| true)?;
         for _ in 0..ROUNDS {
-            if self.is_spent() || self.rows[best].members.is_empty() {
+            if self.is_spent() || self.rows[best].parts.is_empty() {
                 break;
             }
-            let laws = self.rows[best].members.len();
+            let laws = self.rows[best].parts.len();
             for index in 0..laws {
                 if let Some(base) = self.without(&self.rows[best], index) {
                     let row = self.keep(base);
@@ -724,7 +694,7 @@ impl<'a, 'b> Explorer<'a, 'b> {
                     chosen = self.keep(smaller);
                 }
                 _ => {
-                    let some = self.best(|h| !h.members.is_empty());
+                    let some = self.best(|h| !h.parts.is_empty());
                     let tried = if beliefs.is_empty() { some.map(|i| self.rows[i].clone()) } else { None };
                     let limited = self.is_spent();
                     return Some(Posterior { chosen: self.rows[chosen].clone(), beliefs, tried, limited });
@@ -739,34 +709,26 @@ impl<'a, 'b> Explorer<'a, 'b> {
         let own = self.evidence(h);
         let library = self.search.library;
         let family = |c: &Candidate| &library[c.mechanism].family;
-        (0..h.members.len())
+        (0..h.parts.len())
             .map(|index| {
-                let rest: Vec<&Candidate> = h
-                    .members
-                    .iter()
-                    .enumerate()
-                    .filter(|(i, _)| *i != index)
-                    .map(|(_, m)| &m.candidate)
-                    .collect();
+                let mut rest: Vec<&Candidate> = h.candidates().collect();
+                let candidate = rest.remove(index);
                 let (mut total, mut kin) = (1.0, 1.0);
                 let mut gain = f64::INFINITY;
                 let mut others = Vec::new();
                 for other in self.rows.iter().filter(|o| rest.iter().all(|c| o.holds(c))) {
                     let odds = (self.evidence(other) - own).clamp(-700.0, 700.0).exp();
-                    if other.members.len() == rest.len() {
+                    if other.parts.len() == rest.len() {
                         gain = own - self.evidence(other);
                         total += odds;
-                    } else if other.members.len() == h.members.len() {
-                        let Some(at) = other.members.iter().position(|m| !rest.contains(&&m.candidate))
-                        else {
-                            continue;
-                        };
-                        let candidate = &other.members[at].candidate;
-                        if *candidate == h.members[index].candidate {
+                    } else if other.parts.len() == h.parts.len() {
+                        let Some(at) = other.candidates().position(|c| !rest.contains(&c)) else { continue };
+                        let its = &other.parts[at].candidate;
+                        if its == candidate {
                             continue;
                         }
                         total += odds;
-                        if family(candidate) == family(&h.members[index].candidate) || is_equal(odds) {
+                        if family(its) == family(candidate) || is_equal(odds) {
                             kin += odds;
                         }
                         others.push((other.parts[at].clone(), odds));
@@ -800,43 +762,36 @@ struct Totals {
 impl Totals {
     /// The strength at which a column is as large as all that acts where it does.
     fn width(&self, lanes: &Lanes, column: usize) -> f64 {
-        let mut width = f64::INFINITY;
-        let rms = |of: &dyn Fn(&SignalLanes, usize) -> Option<f64>, lane: usize| -> f64 {
+        let Some(first) = lanes.signals.first() else { return f64::INFINITY };
+        // Of one lane in a table of each piece.
+        let rms = |of: &dyn Fn(&SignalLanes) -> Option<&Vec<f64>>, lane: usize| -> f64 {
             let (mut sum, mut n) = (0.0, 0usize);
-            for signals in &lanes.signals {
-                let samples = signals.force.len() / signals.lanes.max(1);
-                for v in (0..samples).filter_map(|k| of(signals, k * signals.lanes + lane)) {
-                    sum += v * v;
-                    n += 1;
-                }
+            let tables = lanes.signals.iter().filter_map(|s| of(s));
+            for v in tables.flat_map(|table| table.iter().skip(lane).step_by(first.lanes.max(1))) {
+                sum += v * v;
+                n += 1;
             }
             (sum / n.max(1) as f64).sqrt()
         };
+        fn table(tables: &[(usize, Vec<f64>)], index: usize) -> Option<&Vec<f64>> {
+            tables.iter().find(|t| t.0 == index).map(|t| &t.1)
+        }
+        let mut width = f64::INFINITY;
+        let mut narrow = |total: f64, size: f64| {
+            if size > 0.0 {
+                width = width.min(total / size);
+            }
+        };
         for lane in lanes.columns[column].clone() {
-            let force = rms(&|s, at| s.force.get(at).copied(), lane);
-            let weights = lanes.signals.first().map_or(&[][..], |s| &s.weights[..]);
+            let force = rms(&|s| Some(&s.force), lane);
             for (e, total) in self.forces.iter().enumerate() {
-                let count = lanes.signals.first().map_or(1, |s| s.lanes);
-                let size = force * weights.get(e * count + lane).map_or(0.0, |w| w.abs());
-                if size > 0.0 {
-                    width = width.min(total / size);
-                }
+                narrow(*total, force * first.weights.get(e * first.lanes + lane).map_or(0.0, |w| w.abs()));
             }
             for (i, total) in self.inputs.iter().enumerate() {
-                let size =
-                    rms(&|s, at| s.inputs.iter().find(|t| t.0 == i).and_then(|t| t.1.get(at)).copied(), lane);
-                if size > 0.0 {
-                    width = width.min(total / size);
-                }
+                narrow(*total, rms(&|s| table(&s.inputs, i), lane));
             }
             for (c, total) in self.outputs.iter().enumerate() {
-                let size = rms(
-                    &|s, at| s.outputs.iter().find(|t| t.0 == c).and_then(|t| t.1.get(at)).copied(),
-                    lane,
-                );
-                if size > 0.0 {
-                    width = width.min(total / size);
-                }
+                narrow(*total, rms(&|s| table(&s.outputs, c), lane));
             }
         }
         width
@@ -957,10 +912,10 @@ mass = "m*x'' + k*x = f"
         let search = Search::new(setup.clone(), &library, &crate::Quiet);
         let mut explorer = Explorer::new(&search, &setup);
         let machine = explorer.machine_alone(&setup.values()).unwrap();
-        explorer.known = explorer.all_known(&machine);
+        explorer.priors = explorer.all_priors(&machine);
         let width = |kind: &str| {
             let index = search.candidates().iter().position(|c| library[c.mechanism].kind == kind).unwrap();
-            match explorer.known[index][0] {
+            match explorer.priors[index][0] {
                 Known::Strength(width) => width,
                 _ => panic!("{kind} has a strength"),
             }

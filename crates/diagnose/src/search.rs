@@ -115,6 +115,19 @@ pub struct Part {
     pub scales: Vec<f64>,
 }
 
+/// A law at a place, the values of its parameters, and the sizes of the inner ones.
+pub(crate) type Law = (Candidate, Vec<f64>, Vec<f64>);
+
+/// The laws of a model with the values that its parameters give them.
+pub(crate) fn laws(parts: &[Part], model: &Model, parameters: &[f64]) -> Vec<Law> {
+    let value = |name: &String| model.parameter(name).map(|i| parameters[i]);
+    let law = |part: &Part| {
+        let values = part.instance.names.iter().filter_map(value).collect();
+        (part.candidate.clone(), values, part.scales.clone())
+    };
+    parts.iter().map(law).collect()
+}
+
 /// A model fitted at a level.
 #[derive(Debug, Clone)]
 pub struct Fitted {
@@ -223,16 +236,7 @@ fn whole(setup: &Setup) -> usize {
 /// Lengths of the segments: from a few periods of the fastest channel, by factors of four, to a quarter of the data.
 fn lengths(setup: &Setup) -> Vec<usize> {
     let total: usize = setup.data.lengths().iter().sum();
-    let mut period = f64::INFINITY;
-    for piece in &setup.data.pieces {
-        for smooth in &piece.smooth {
-            let swing = greybox_calibrate::spread(&smooth.value);
-            let rate = (smooth.d1.iter().map(|v| v * v).sum::<f64>() / smooth.d1.len().max(1) as f64).sqrt();
-            if swing > 0.0 && rate > 0.0 {
-                period = period.min(2.0 * std::f64::consts::PI * swing / rate / piece.dt);
-            }
-        }
-    }
+    let period = setup.data.periods().into_iter().fold(f64::INFINITY, f64::min);
     let longest = (total.min(MOST_SAMPLES) / SEGMENTS.1).max(SHORTEST);
     let first = ((PERIODS * period) as usize).min(total / SEGMENTS.0).max(SHORTEST).min(longest);
     let mut out = vec![first];
@@ -255,8 +259,24 @@ fn limits(iterations: usize) -> Limits {
     Limits { iterations, tolerance: 1e-5 }
 }
 
-/// Start values for another model of the same data: states of the same name keep theirs, new ones get
-/// `fresh` (their chains in order, per piece; zero where there is none).
+/// A state of another model: entries of the same name keep what they are (`unknown` where that is not given), new ones are
+/// `fresh` (their chains in order; zero where there is none).
+pub(crate) fn carried(from: &Setup, old: &[f64], to: &Setup, fresh: &[f64], unknown: f64) -> Vec<f64> {
+    let mut x = vec![0.0; to.system.nx];
+    let mut new = fresh.iter();
+    for (j, state) in to.model.states.iter().enumerate() {
+        let known = from.model.state(&state.name).map(|i| from.system.offsets[i]);
+        for k in 0..state.order {
+            x[to.system.offsets[j] + k] = match known {
+                Some(at) => old.get(at + k).copied().unwrap_or(unknown),
+                None => new.next().copied().unwrap_or(0.0),
+            };
+        }
+    }
+    x
+}
+
+/// Start values for another model of the same data; new states get those of `fresh`, per piece.
 fn transfer(
     from: &Setup,
     level: &Level,
@@ -264,25 +284,9 @@ fn transfer(
     to: &Setup,
     fresh: &[Vec<f64>],
 ) -> Vec<Vec<f64>> {
-    level
-        .segments
-        .iter()
-        .zip(starts)
-        .map(|(segment, old)| {
-            let mut x = vec![0.0; to.system.nx];
-            let mut new = fresh.get(segment.piece).into_iter().flatten();
-            for (j, state) in to.model.states.iter().enumerate() {
-                let known = from.model.state(&state.name).map(|i| from.system.offsets[i]);
-                for k in 0..state.order {
-                    x[to.system.offsets[j] + k] = match known {
-                        Some(at) => old.get(at + k).copied().unwrap_or(0.0),
-                        None => new.next().copied().unwrap_or(0.0),
-                    };
-                }
-            }
-            x
-        })
-        .collect()
+    let fresh = |piece: usize| fresh.get(piece).map_or(&[][..], Vec::as_slice);
+    let segments = level.segments.iter().zip(starts);
+    segments.map(|(segment, old)| carried(from, old, to, fresh(segment.piece), 0.0)).collect()
 }
 
 /// The same segments with the priors of another model's states.
@@ -345,7 +349,7 @@ impl<'a> Search<'a> {
         &self,
         holds: &[Hold],
         parameters: &[f64],
-        parts: &[(Candidate, Vec<f64>, Vec<f64>)],
+        parts: &[Law],
         from: &Setup,
     ) -> Result<(Setup, Vec<Part>), CompileError> {
         let mut model: Model = self.nominal.model.clone();
@@ -371,22 +375,9 @@ impl<'a> Search<'a> {
         Ok((setup, out))
     }
 
-    /// Parts of a fitted model with their present values.
-    pub(crate) fn parts(&self, fitted: &Fitted) -> Vec<(Candidate, Vec<f64>, Vec<f64>)> {
-        fitted
-            .parts
-            .iter()
-            .map(|part| {
-                let values = part
-                    .instance
-                    .names
-                    .iter()
-                    .filter_map(|n| fitted.setup.model.parameter(n))
-                    .map(|i| fitted.fit.point.parameters[i])
-                    .collect();
-                (part.candidate.clone(), values, part.scales.clone())
-            })
-            .collect()
+    /// The laws of a fitted model with their present values.
+    pub(crate) fn laws(&self, fitted: &Fitted) -> Vec<Law> {
+        laws(&fitted.parts, &fitted.setup.model, &fitted.fit.point.parameters)
     }
 
     /// An integration method whose error is a fiftieth of the residual.
@@ -421,7 +412,7 @@ impl<'a> Search<'a> {
     ) -> Option<Fitted> {
         let n0 = self.nominal.model.parameters.len();
         let old = &base.fit.point;
-        let mut parts = self.parts(base);
+        let mut parts = self.laws(base);
         let mut fresh: Vec<Vec<f64>> = vec![Vec::new(); base.setup.data.pieces.len()];
         let along = Along::smoothed(&base.setup, &base.level, scale, old);
         for member in &pair.members {
@@ -466,7 +457,7 @@ impl<'a> Search<'a> {
         scale: &[f64],
     ) -> bool {
         parts.iter().all(|part| self.allows(part, setup, &point.parameters))
-            && !self.turns_an_inertia(setup, level, point, scale)
+            && !self.has_negative_inertia(setup, level, point, scale)
     }
 
     /// Whether a mechanism's requirements on its parameters hold at these values of the model's.
@@ -559,7 +550,7 @@ impl<'a> Search<'a> {
         iterations: usize,
     ) -> Option<Fitted> {
         let n0 = self.nominal.model.parameters.len();
-        let mut parts = self.parts(base);
+        let mut parts = self.laws(base);
         parts.push((candidate.clone(), scored.values.clone(), scored.scales.clone()));
         let old = &base.fit.point;
         let (mut setup, parts) =
@@ -629,7 +620,7 @@ impl<'a> Search<'a> {
 
     /// `fitted` without part `index`, refitted.
     fn without(&self, fitted: &Fitted, index: usize, scale: &[f64], iterations: usize) -> Option<Fitted> {
-        let mut parts = self.parts(fitted);
+        let mut parts = self.laws(fitted);
         parts.remove(index);
         self.reassembled(fitted, &parts, scale, iterations)
     }
@@ -638,7 +629,7 @@ impl<'a> Search<'a> {
     fn reassembled(
         &self,
         fitted: &Fitted,
-        parts: &[(Candidate, Vec<f64>, Vec<f64>)],
+        parts: &[Law],
         scale: &[f64],
         iterations: usize,
     ) -> Option<Fitted> {
@@ -649,7 +640,7 @@ impl<'a> Search<'a> {
     fn reassembled_from(
         &self,
         fitted: &Fitted,
-        parts: &[(Candidate, Vec<f64>, Vec<f64>)],
+        parts: &[Law],
         others: Vec<Vec<f64>>,
         scale: &[f64],
         iterations: usize,
@@ -824,7 +815,7 @@ impl<'a> Search<'a> {
         calibrated: &Fitted,
         scale: &[f64],
     ) -> Option<f64> {
-        let mut rest = self.parts(fitted);
+        let mut rest = self.laws(fitted);
         parts.iter().for_each(|index| drop(rest.remove(*index)));
         let n0 = self.nominal.model.parameters.len();
         let mut faint = calibrated.fit.point.parameters[..n0].to_vec();
@@ -971,13 +962,8 @@ impl<'a> Search<'a> {
     pub(crate) fn adopt(&self, found: &Found, h: &Hypothesis, beliefs: &[Belief]) -> Option<Found> {
         let at = &h.fitted.at;
         let n0 = self.nominal.model.parameters.len();
-        let value = |name: &String| at.setup.model.parameter(name).map(|i| at.parameters[i]);
-        let of = |p: &Part| {
-            let values: Option<Vec<f64>> = p.instance.names.iter().map(value).collect();
-            Some((p.candidate.clone(), values?, p.scales.clone()))
-        };
-        let parts: Option<Vec<_>> = h.parts.iter().map(of).collect();
-        let (setup, parts) = self.assemble(&at.setup.holds, &at.parameters[..n0], &parts?, &at.setup).ok()?;
+        let laws = laws(&h.parts, &at.setup.model, &at.parameters);
+        let (setup, parts) = self.assemble(&at.setup.holds, &at.parameters[..n0], &laws, &at.setup).ok()?;
         let setup = Setup { noise: None, work: self.nominal.work.clone(), ..setup };
         let level = same_level(&setup, &found.calibrated.level);
         let starts = setup.starts(&level, &at.parameters);
@@ -1060,11 +1046,7 @@ impl<'a> Search<'a> {
 
     /// Whether the mechanisms turn the sign of the mass matrix's determinant somewhere along the recordings: a negative
     /// inertia, or a coupling of accelerations stronger than the inertias that it couples.
-    pub fn has_negative_inertia(&self, fitted: &Fitted, scale: &[f64]) -> bool {
-        self.turns_an_inertia(&fitted.setup, &fitted.level, &fitted.fit.point, scale)
-    }
-
-    fn turns_an_inertia(&self, setup: &Setup, level: &Level, point: &Point, scale: &[f64]) -> bool {
+    pub fn has_negative_inertia(&self, setup: &Setup, level: &Level, point: &Point, scale: &[f64]) -> bool {
         let along = Along::smoothed(setup, level, scale, point);
         let n0 = self.nominal.system.nz;
         let model = &setup.model;
@@ -1808,7 +1790,7 @@ impl<'a> Search<'a> {
 
     /// The last part written as the sum of simpler mechanisms that it equals exactly.
     fn split(&self, fitted: &Fitted, scale: &[f64]) -> Option<Fitted> {
-        let mut parts = self.parts(fitted);
+        let mut parts = self.laws(fitted);
         let (whole, values, _) = parts.pop()?;
         let mechanism = &self.library[whole.mechanism];
         if mechanism.equals.is_empty() {
@@ -1965,7 +1947,7 @@ impl<'a> Search<'a> {
 
     /// The model with a law in place of its refinement, from the refinement's parameters.
     fn simpler(&self, fitted: &Fitted, index: usize, scale: &[f64]) -> Option<Fitted> {
-        let mut parts = self.parts(fitted);
+        let mut parts = self.laws(fitted);
         let (refinement, values, _) = &parts[index];
         let law = self.all.iter().find(|c| self.is_refined_by(c, refinement))?;
         if parts.iter().any(|p| p.0 == *law) {
@@ -2120,7 +2102,7 @@ impl<'a> Search<'a> {
         refinement: &Candidate,
         scale: &[f64],
     ) -> Option<Instance> {
-        let parts = self.parts(fitted);
+        let parts = self.laws(fitted);
         let (law, mechanism) = (&self.library[parts[index].0.mechanism], &self.library[refinement.mechanism]);
         let ([_], [strength]) = (&law.linear[..], &parts[index].1[..]) else { return None };
         if !mechanism.is_at_equal_strengths(law) {
@@ -2143,13 +2125,7 @@ impl<'a> Search<'a> {
     }
 
     /// The model with these parts, of which one has its inner parameters held where they are.
-    fn held(
-        &self,
-        fitted: &Fitted,
-        parts: &[(Candidate, Vec<f64>, Vec<f64>)],
-        index: usize,
-        scale: &[f64],
-    ) -> Option<Fitted> {
+    fn held(&self, fitted: &Fitted, parts: &[Law], index: usize, scale: &[f64]) -> Option<Fitted> {
         let mut held = self.reassembled(fitted, parts, scale, 0)?;
         let mechanism = &self.library[held.parts[index].candidate.mechanism];
         let names = mechanism.parameters().zip(&held.parts[index].instance.names);
@@ -2405,7 +2381,8 @@ second = "m2*x2'' + k2*x2 = 0"
             let inertia =
                 |m: &Mechanism| m.kind == "coupling" && m.linear == ["mc"] && m.reaction.is_some() == both;
             let fitted = with(&search, inertia, mc);
-            let negative = search.has_negative_inertia(&fitted, &scale);
+            let negative =
+                search.has_negative_inertia(&fitted.setup, &fitted.level, &fitted.fit.point, &scale);
             assert_eq!(search.admissible(&fitted, &scale), !negative);
             negative
         };

@@ -15,7 +15,7 @@
 //! survive coarse sampling and noise, states without a sensor exist, and d(t) is the force that the
 //! equations lack (Rauch, Tung & Striebel, AIAA J. 3(8), 1965).
 
-use greybox_calibrate::{Setup, spread};
+use greybox_calibrate::{Setup, qr, spread};
 use greybox_simulate::{Seeds, SignalLanes, Simulation};
 use rayon::prelude::*;
 
@@ -169,6 +169,7 @@ impl<'a> Filter<'a> {
         let mut x: Vec<f64> =
             (0..nx).map(|i| first[i][range.start]).chain(std::iter::repeat_n(0.0, nz)).collect();
         let mut p = vec![0.0; n * n];
+        let mut scratch = vec![0.0; n * n];
         for i in 0..n {
             let std = if i < nx {
                 let t = self.given.tolerance[i];
@@ -230,7 +231,8 @@ impl<'a> Filter<'a> {
                 ahead[i] = next.state()[i] + from_states + from_forces;
             }
             ahead[nx..].copy_from_slice(&x[nx..]);
-            let mut p_next = sandwich(&phi, &p, n);
+            let mut p_next = p.clone();
+            qr::sandwich(&phi, &mut p_next, &mut scratch, n);
             for e in 0..nz {
                 p_next[(nx + e) * n + nx + e] += self.q[e];
             }
@@ -287,29 +289,6 @@ impl<'a> Filter<'a> {
         }
         out
     }
-}
-
-/// Φ P Φᵀ, symmetric.
-fn sandwich(phi: &[f64], p: &[f64], n: usize) -> Vec<f64> {
-    let mut left = vec![0.0; n * n];
-    for i in 0..n {
-        for (l, f) in phi[i * n..(i + 1) * n].iter().enumerate() {
-            if *f != 0.0 {
-                for j in 0..n {
-                    left[i * n + j] += f * p[l * n + j];
-                }
-            }
-        }
-    }
-    let mut out = vec![0.0; n * n];
-    for i in 0..n {
-        for j in 0..=i {
-            let v: f64 = (0..n).map(|l| left[i * n + l] * phi[j * n + l]).sum();
-            out[i * n + j] = v;
-            out[j * n + i] = v;
-        }
-    }
-    out
 }
 
 /// Solves P v = b with P scaled to unit diagonal; `None` when it is not positive definite.

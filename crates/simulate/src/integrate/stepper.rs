@@ -36,9 +36,9 @@ use super::{Core, Simulation};
 /// let decay = (-0.02f64).exp();
 /// assert!((stepper.state()[0] - decay).abs() < 1e-9);
 /// stepper.set_state(&[5.0]);
-/// stepper.set_tangent(0, 0, 1.0);
+/// stepper.tangents_mut(0)[0] = 1.0;
 /// assert!(stepper.step());
-/// assert!((stepper.state()[0] - 5.0 * decay).abs() < 1e-8 && (stepper.tangent(0, 0) - decay).abs() < 1e-9);
+/// assert!((stepper.state()[0] - 5.0 * decay).abs() < 1e-8 && (stepper.tangents(0)[0] - decay).abs() < 1e-9);
 /// ```
 pub struct Stepper<'a> {
     core: Core<'a>,
@@ -85,11 +85,6 @@ impl Stepper<'_> {
         self.moved = true;
     }
 
-    /// The tangent of an entry of the state along a lane.
-    pub fn tangent(&self, entry: usize, lane: usize) -> f64 {
-        self.core.dx[entry * self.core.width + lane]
-    }
-
     /// The tangents of an entry of the state along all lanes.
     pub fn tangents(&self, entry: usize) -> &[f64] {
         &self.core.dx[entry * self.core.width..][..self.core.lanes]
@@ -99,12 +94,6 @@ impl Stepper<'_> {
     pub fn tangents_mut(&mut self, entry: usize) -> &mut [f64] {
         self.moved = true;
         &mut self.core.dx[entry * self.core.width..][..self.core.lanes]
-    }
-
-    /// Sets the tangent of an entry of the state along a lane.
-    pub fn set_tangent(&mut self, entry: usize, lane: usize, value: f64) {
-        self.moved = true;
-        self.core.dx[entry * self.core.width + lane] = value;
     }
 
     /// The lanes of the initial states begin anew: each is the derivative by its entry of the state as it is now. What was
@@ -229,7 +218,7 @@ late = "x' + a*delay(x, tau) = u"
         for _ in 0..n {
             assert!(stepper.step());
         }
-        (stepper.state()[0], stepper.tangent(0, 0))
+        (stepper.state()[0], stepper.tangents(0)[0])
     }
 
     /// With nothing set, a stepper is the simulation; a set state is felt after the delay, and the tangent says how much.
