@@ -904,6 +904,37 @@ mass = "m*x'' + k*x = f"
         assert_eq!(wrong, 0);
     }
 
+    /// A law costs the logarithm of how many there are to choose from, and of how widely its strength could have been another.
+    #[test]
+    fn what_could_have_been_otherwise_counts_against_a_law() {
+        let setup = mass(1.9, 0.1, 3);
+        let library = some_laws();
+        let search = Search::new(setup.clone(), &library, &crate::Quiet);
+        let mut explorer = Explorer::new(&search, &setup);
+        let machine = explorer.machine_alone(&setup.values()).unwrap();
+        explorer.priors = explorer.all_priors(&machine);
+        let damped = explorer
+            .extensions(&machine)
+            .into_iter()
+            .find(|h| library[h.parts[0].candidate.mechanism].kind == "viscous_friction");
+        let damped = damped.unwrap();
+        let fewer = damped.evidence(4.0, 10) - damped.evidence(4.0, 100);
+        assert!((fewer - 10f64.ln()).abs() < 1e-9);
+        let Known::Strength(width) = damped.known[0][0] else { panic!("a damper has a strength") };
+        let with = |width: f64| {
+            let known = vec![vec![Known::Strength(width)]];
+            Hypothesis { known, ..damped.clone() }.evidence(4.0, 10)
+        };
+        let wider = with(10.0 * width) - with(100.0 * width);
+        assert!((wider - 10f64.ln()).abs() < 0.01, "{wider}");
+        // Half as wide a peak of the likelihood in each direction holds so much less of what was possible.
+        let mut sharp = damped.clone();
+        sharp.fitted.pass.information.iter_mut().for_each(|i| *i *= 4.0);
+        let sharper = damped.evidence(4.0, 10) - sharp.evidence(4.0, 10);
+        let all = damped.fitted.pass.gradient.len() as f64 * 2f64.ln();
+        assert!(sharper > 0.9 * all && sharper < all, "{sharper} {all}");
+    }
+
     /// The prior of a strength is as wide as the strength whose force is all that the equation balances.
     #[test]
     fn a_strength_is_expected_to_be_as_large_as_the_forces() {
