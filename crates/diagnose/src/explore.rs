@@ -881,6 +881,14 @@ mass = "m*x'' + k*x = f"
         posterior.chosen.parts.iter().map(kind).collect()
     }
 
+    /// An exploration that knows its priors, and the machine alone.
+    fn begun<'a, 'b>(search: &'a Search<'b>, setup: &Setup) -> (Explorer<'a, 'b>, Hypothesis) {
+        let mut explorer = Explorer::new(search, setup);
+        let machine = explorer.machine_alone(&setup.values()).unwrap();
+        explorer.priors = explorer.all_priors(&machine);
+        (explorer, machine)
+    }
+
     #[test]
     fn a_determinant_is_the_product_of_its_factors() {
         let a = [4.0, 2.0, 0.0, 2.0, 9.0, 3.0, 0.0, 3.0, 16.0];
@@ -904,15 +912,13 @@ mass = "m*x'' + k*x = f"
         assert_eq!(wrong, 0);
     }
 
-    /// A law costs the logarithm of how many there are to choose from, and of how widely its strength could have been another.
+    /// A law costs the logarithm of how many candidates there are, and that of how wide the prior of its strength is.
     #[test]
     fn what_could_have_been_otherwise_counts_against_a_law() {
         let setup = mass(1.9, 0.1, 3);
         let library = some_laws();
         let search = Search::new(setup.clone(), &library, &crate::Quiet);
-        let mut explorer = Explorer::new(&search, &setup);
-        let machine = explorer.machine_alone(&setup.values()).unwrap();
-        explorer.priors = explorer.all_priors(&machine);
+        let (explorer, machine) = begun(&search, &setup);
         let damped = explorer
             .extensions(&machine)
             .into_iter()
@@ -941,9 +947,7 @@ mass = "m*x'' + k*x = f"
         let setup = mass(1.9, 0.1, 3);
         let library = some_laws();
         let search = Search::new(setup.clone(), &library, &crate::Quiet);
-        let mut explorer = Explorer::new(&search, &setup);
-        let machine = explorer.machine_alone(&setup.values()).unwrap();
-        explorer.priors = explorer.all_priors(&machine);
+        let (explorer, machine) = begun(&search, &setup);
         let width = |kind: &str| {
             let index = search.candidates().iter().position(|c| library[c.mechanism].kind == kind).unwrap();
             match explorer.priors[index][0] {
