@@ -142,6 +142,31 @@ pub fn sandwich(f: &[f64], p: &mut [f64], scratch: &mut [f64], n: usize) {
     }
 }
 
+/// ln of the determinant of a positive definite matrix, from Cholesky's factor of the matrix with a unit diagonal.
+pub fn log_determinant(a: &[f64], n: usize) -> f64 {
+    let d: Vec<f64> = (0..n).map(|i| a[i * n + i].max(1e-300).sqrt()).collect();
+    let mut l: Vec<f64> = (0..n * n).map(|i| a[i] / (d[i / n] * d[i % n])).collect();
+    let mut log = 0.0;
+    for j in 0..n {
+        let mut pivot = l[j * n + j] + 1e-12;
+        for k in 0..j {
+            pivot -= l[j * n + k] * l[j * n + k];
+        }
+        let pivot = pivot.max(1e-12);
+        log += pivot.ln() + 2.0 * d[j].ln();
+        let root = pivot.sqrt();
+        l[j * n + j] = root;
+        for i in j + 1..n {
+            let mut v = l[i * n + j];
+            for k in 0..j {
+                v -= l[i * n + k] * l[j * n + k];
+            }
+            l[i * n + j] = v / root;
+        }
+    }
+    log
+}
+
 /// Solves the symmetric positive (semi)definite `n × n` system by Cholesky with a relative floor on
 /// the pivots; small systems only (fold tests, Gram blocks).
 pub fn solve_spd(a: &[f64], n: usize, b: &[f64]) -> Vec<f64> {
@@ -190,6 +215,23 @@ mod tests {
         let b: Vec<f64> = (0..m).map(|i| (0..3).map(|p| x[p] * a[p * m + i]).sum()).collect();
         a.extend(&b);
         (a, b, x)
+    }
+
+    #[test]
+    fn a_determinant_is_the_product_of_its_factors() {
+        let a = [4.0, 2.0, 0.0, 2.0, 9.0, 3.0, 0.0, 3.0, 16.0];
+        // 4·(9·16 − 9) − 2·(2·16)
+        assert!((log_determinant(&a, 3) - 476f64.ln()).abs() < 1e-9);
+        let scaled: Vec<f64> = a.iter().map(|v| v * 1e-20).collect();
+        assert!((log_determinant(&scaled, 3) - 476f64.ln() + 60.0 * 10f64.ln()).abs() < 1e-9);
+    }
+
+    #[test]
+    fn a_sandwich_is_the_product_of_three() {
+        let (f, mut p, mut scratch) = ([1.0, 2.0, 0.0, -1.0], [4.0, 1.0, 1.0, 3.0], [0.0; 4]);
+        sandwich(&f, &mut p, &mut scratch, 2);
+        // F P = (6 7; −1 −3), and that by Fᵀ.
+        assert_eq!(p, [20.0, -7.0, -7.0, 3.0]);
     }
 
     #[test]

@@ -722,8 +722,12 @@ impl Filter {
                 break;
             }
             let mut accepted = false;
-            for _ in 0..8 {
-                let trial = self.step(&at, &pass, weight, damping);
+            for attempt in 0..8 {
+                let (trial, promised) = self.step(&at, &pass, weight, damping);
+                // (The first is tried in any case: the gradient is not exact.)
+                if attempt > 0 && (promised.is_nan() || promised < GAIN) {
+                    break;
+                }
                 let found = self.pass(&trial, true);
                 let value = found.as_ref().map_or(f64::NEG_INFINITY, |p| weight * p.log + prior(&trial));
                 if value > objective {
@@ -749,7 +753,8 @@ impl Filter {
         Some(Fitted { at, pass, objective, converged })
     }
 
-    fn step(&self, at: &Stochastic, pass: &Pass, weight: f64, damping: f64) -> Stochastic {
+    /// A step of the scoring, and the gain that the curvature promises.
+    fn step(&self, at: &Stochastic, pass: &Pass, weight: f64, damping: f64) -> (Stochastic, f64) {
         let free = &at.setup.free;
         let (np, n) = (free.len(), pass.gradient.len());
         let value = |a: usize| match a.checked_sub(np) {
@@ -792,6 +797,7 @@ impl Filter {
         let rhs: Vec<f64> = (0..n).map(|a| if held[a] { 0.0 } else { g[a] / d[a] }).collect();
         let step = qr::solve_spd(&scaled, n, &rhs);
         let mut next = at.clone();
+        let mut moved = vec![0.0; n];
         for a in 0..n {
             let ((low, high), v) = (bounds(a), value(a));
             let mut step = step[a] / d[a];
@@ -806,13 +812,15 @@ impl Filter {
             } else {
                 to
             };
+            moved[a] = to - v;
             match a.checked_sub(np) {
                 None => next.parameters[free[a].index] = to,
                 Some(l) if l < self.rows.len() => next.errors.force[l] = to,
                 Some(l) => next.errors.sensor[l - self.rows.len()] = to,
             }
         }
-        next
+        let curved: f64 = (0..n).map(|a| moved[a] * qr::dot(&h[a * n..(a + 1) * n], &moved)).sum();
+        (next, qr::dot(&g, &moved) - 0.5 * curved)
     }
 }
 

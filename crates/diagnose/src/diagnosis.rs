@@ -13,6 +13,7 @@ use greybox_recording::Recording;
 use rayon::prelude::*;
 
 use crate::along::Along;
+use crate::candidate::Candidate;
 use crate::evidence::{Evidence, fall, kappa};
 use crate::library::{Mechanism, MechanismError, built_in};
 use crate::locate::{Location, force, locate};
@@ -20,7 +21,8 @@ use crate::place::{Motion, Place};
 use crate::search::{
     Fitted, Found, MOST_WORK, Part, Rival, Search, UNDECIDED, log_likelihood_gain, raw_rms, raw_rss, rms,
 };
-use crate::surface::{Surface, Variable, held_out};
+use crate::shapes::Variable;
+use crate::surface::{Surface, held_out};
 use crate::twins::{Twin, twins};
 use crate::uncertainty::Uncertainty;
 use crate::validate::Gain;
@@ -496,15 +498,15 @@ fn conclude(
         let polished = polish(&found.improved, &found.scale, &judge);
         defend(search, &mut found, polished, &baseline, &judge, true)
     };
-    let judged_of = |found: &Found, polished: &Polished, named: bool| {
+    let judged_of = |found: &Found, polished: &Polished, named: &dyn Fn(&Part) -> bool| {
         let scale = residual_scale(&polished.fitted, &found.scale);
         Judged::of(search, found, &polished.fitted, &scale, (&baseline.polished.fitted, named), library)
     };
     let scale = residual_scale(&polished.fitted, &found.scale);
     let scores = judge.scores(&polished.fitted.setup, &polished.fitted.fit.point.parameters, &scale);
-    let mut judged = judged_of(&found, &polished, named);
+    let mut judged = judged_of(&found, &polished, &|_| named);
     // Where more than noise is left, every model of the machine errs, and output errors do not compare them.
-    let mut agreed = Vec::new();
+    let (mut agreed, mut by_evidence) = (Vec::new(), Vec::new());
     if !leaves_noise(&scores, &polished.origin, &scale) {
         let names = judged.verdict == Verdict::MissingPhysics;
         if names {
@@ -513,9 +515,9 @@ fn conclude(
         let in_both = |part: &Part| agreed.contains(&named_as(part, library, &nominal.model));
         let standing = (&found, &polished);
         let explored = explored(search, standing, in_both, names, &baseline, &judge);
-        if let Some((other, simulates, named)) = explored {
-            judged = judged_of(&other, &simulates, named);
-            (found, polished) = (other, simulates);
+        if let Some(Explored { found: other, polished: simulates, named }) = explored {
+            judged = judged_of(&other, &simulates, &|part| named.contains(&part.candidate));
+            (found, polished, by_evidence) = (other, simulates, named);
         }
         limited |= found.limited;
     }
@@ -588,7 +590,8 @@ fn conclude(
     // Of laws that are not believed together those stand that another comparison has named.
     let stands = |part: &Part| found.errs && agreed.contains(&named_as(part, library, &nominal.model));
     let all = judged.verdict == Verdict::MissingPhysics;
-    let believed: Vec<bool> = improved.parts.iter().map(|part| all || stands(part)).collect();
+    let holds_name = |part: &Part| all && (!found.errs || by_evidence.contains(&part.candidate));
+    let believed: Vec<bool> = improved.parts.iter().map(|part| holds_name(part) || stands(part)).collect();
     let verdict = if believed.contains(&true) { Verdict::MissingPhysics } else { judged.verdict };
     let Judged { shares, left, surface, alone, without, full, base, doubts, .. } = judged;
     let share = |rss: f64| (rss / base.max(1e-300)).clamp(0.0, 1.0);
@@ -699,7 +702,7 @@ impl Judged {
         found: &Found,
         improved: &Fitted,
         scale: &[f64],
-        (calibrated, named): (&Fitted, bool),
+        (calibrated, named): (&Fitted, &dyn Fn(&Part) -> bool),
         library: &[Mechanism],
     ) -> Judged {
         // Where nothing was found, what the search's own noise model leaves white.
@@ -737,18 +740,21 @@ impl Judged {
         let is_imitation = (0..doubts.len()).any(|i| {
             beaten(i) && (lost[i] > CORRECTION || (0..doubts.len()).any(|j| i != j && redundant(i, j)))
         });
+        let by_name = improved.parts.iter().zip(&shares).filter(|(part, _)| named(part));
+        let by_name: Vec<f64> = by_name.map(|(_, share)| *share).collect();
+        let is_patchwork = || is_patchwork(improved, &shares, library, left.steady, redundant);
         let verdict = match left.verdict(improved.parts.len()) {
-            _ if !named && !improved.parts.is_empty() => Verdict::Unexplained,
-            _ if found.errs && share(base - full) < EXPLAINED => Verdict::Unexplained,
-            Verdict::MissingPhysics if is_imitation => Verdict::Unexplained,
-            verdict
-                if (verdict == Verdict::MissingPhysics || found.errs)
-                    && (is_patchwork(improved, &shares, library, left.steady, redundant)
-                        || is_rivalled(&comparable, &found.scale, library)) =>
-            {
+            _ if by_name.is_empty() && !improved.parts.is_empty() => Verdict::Unexplained,
+            // (The exploration has held free shapes against its laws.)
+            _ if found.errs && (by_name.iter().sum::<f64>() < EXPLAINED || is_patchwork()) => {
                 Verdict::Unexplained
             }
             _ if found.errs => Verdict::MissingPhysics,
+            Verdict::MissingPhysics
+                if is_imitation || is_patchwork() || is_rivalled(&comparable, &found.scale, library) =>
+            {
+                Verdict::Unexplained
+            }
             verdict => verdict,
         };
         Judged { verdict, shares, left, surface, alone, without, full, base, doubts }
@@ -757,7 +763,7 @@ impl Judged {
 
 /// What the exploration finds beside an error of the model, if it can be defended and says more than what stands. Where
 /// nothing is named yet, it names laws or simulates better. Where laws are named, it has one of them (`agreed`) and simulates
-/// better. Whether its mechanisms are named, which those of an exploration that did not come to its end are not.
+/// better.
 fn explored(
     search: &Search<'_>,
     (found, polished): (&Found, &Polished),
@@ -765,9 +771,11 @@ fn explored(
     names: bool,
     baseline: &Baseline,
     judge: &Judge,
-) -> Option<(Found, Polished, bool)> {
+) -> Option<Explored> {
     let posterior = search.explore(found)?;
-    let believes = !posterior.beliefs.is_empty() && !posterior.limited;
+    let beliefs = posterior.chosen.parts.iter().zip(&posterior.beliefs);
+    let mut named: Vec<Candidate> =
+        beliefs.filter(|(_, b)| b.named).map(|(part, _)| part.candidate.clone()).collect();
     let likeliest = posterior.tried.as_ref().unwrap_or(&posterior.chosen);
     if likeliest.parts.is_empty() {
         return None;
@@ -786,9 +794,19 @@ fn explored(
         judge.misfit(&p.fitted.setup, &p.fitted.fit.point.parameters, &scale)
     };
     let is_better = || misfit(&own, &adopted.scale).total_cmp(&misfit(polished, &found.scale)).is_lt();
-    let takes_over = if names { parts.iter().any(agreed) && is_better() } else { believes || is_better() };
+    named.retain(|candidate| parts.iter().any(|part| part.candidate == *candidate));
+    let takes_over =
+        if names { parts.iter().any(agreed) && is_better() } else { !named.is_empty() || is_better() };
     adopted.limited |= posterior.limited;
-    if takes_over { Some((adopted, own, believes)) } else { None }
+    takes_over.then_some(Explored { found: adopted, polished: own, named })
+}
+
+/// What an exploration hands back.
+struct Explored {
+    found: Found,
+    polished: Polished,
+    /// The candidates whose names the data hold.
+    named: Vec<Candidate>,
 }
 
 fn residual_scale(fitted: &Fitted, scale: &[f64]) -> Vec<f64> {

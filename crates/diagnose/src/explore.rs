@@ -17,18 +17,24 @@
 //! | a parameter of the machine | as stated, or Cauchy about its value ([`greybox_calibrate::free_parameters`]) |
 //! | ln q, ln r | even over the range that a fit may use |
 
+mod beside;
+
+use std::f64::consts::PI;
+use std::ops::Range;
 use std::sync::Arc;
 
 use greybox_calibrate::stochastic::{Filter, Fitted as Filtered, Pass, RANGE, Stochastic};
-use greybox_calibrate::{Level, Point, Prior, Setup, Work};
+use greybox_calibrate::{Level, Point, Prior, Setup, Work, qr};
 use greybox_simulate::SignalLanes;
 use rayon::prelude::*;
 
+use self::beside::Beside;
 use crate::along::Along;
 use crate::candidate::Candidate;
 use crate::library::First;
 use crate::screen::{Gram, Lanes, Scored, first_states, lanes, scored};
 use crate::search::{Fitted, Law, Part, Search, carried, laws};
+use crate::shapes::log_sum;
 use crate::spectra::Spectra;
 use crate::{Observer, Stage};
 
@@ -116,79 +122,60 @@ impl Hypothesis {
         &self.fitted.at
     }
 
-    /// What is known before the data of everything that is free: logarithm of the density, precision.
-    fn priors(&self) -> (f64, Vec<f64>) {
+    /// What is known before the data of each that is free: logarithm of the density, precision.
+    fn priors(&self) -> Vec<(f64, f64)> {
         let at = self.at();
         let machine = at.setup.free.len() - self.known.iter().map(Vec::len).sum::<usize>();
-        let mut log = 0.0;
-        let mut precision = Vec::new();
-        for f in &at.setup.free[..machine] {
+        let (own, laws) = at.setup.free.split_at(machine);
+        let own = own.iter().map(|f| {
             let value = at.parameters[f.index];
-            log -= 0.5 * f.prior.at(value).0.powi(2);
-            precision.push(f.prior.precision(value));
-        }
-        for (f, known) in at.setup.free[machine..].iter().zip(self.known.iter().flatten()) {
+            (-0.5 * f.prior.at(value).0.powi(2), f.prior.precision(value))
+        });
+        let laws = laws.iter().zip(self.known.iter().flatten()).map(|(f, known)| {
             let value = at.parameters[f.index];
+            let even = |size: f64| (-size.ln(), 12.0 / (size * size));
             match known {
                 Known::Strength(width) => {
-                    log -=
-                        0.5 * ((value / width).powi(2) + (2.0 * std::f64::consts::PI * width * width).ln());
-                    precision.push(1.0 / (width * width));
+                    let square = (value / width).powi(2) + (2.0 * PI * width * width).ln();
+                    (-0.5 * square, 1.0 / (width * width))
                 }
-                Known::Inner(range) => {
-                    let size = (value.abs() * range).max(1e-300);
-                    log -= size.ln();
-                    precision.push(12.0 / (size * size));
-                }
-                Known::Angle => {
-                    let turn = 2.0 * std::f64::consts::PI;
-                    log -= turn.ln();
-                    precision.push(12.0 / (turn * turn));
-                }
+                Known::Inner(range) => even((value.abs() * range).max(1e-300)),
+                Known::Angle => even(2.0 * PI),
             }
+        });
+        let mut priors: Vec<(f64, f64)> = own.chain(laws).collect();
+        priors.resize(self.fitted.pass.gradient.len(), (0.0, 12.0 / (RANGE.0 + RANGE.1).powi(2)));
+        priors
+    }
+
+    /// ln ∫ exp(ln L/c + ln π) of the parameters that are `kept`, the others where they are and without their priors.
+    fn integral(&self, c: f64, kept: impl Fn(usize) -> bool) -> f64 {
+        let priors = self.priors();
+        let Pass { log, information, .. } = &self.fitted.pass;
+        let kept: Vec<usize> = (0..priors.len()).filter(|a| kept(*a)).collect();
+        let (all, n) = (priors.len(), kept.len());
+        let mut h = vec![0.0; n * n];
+        for (i, a) in kept.iter().enumerate() {
+            for (j, b) in kept.iter().enumerate() {
+                h[i * n + j] = information[a * all + b] / c;
+            }
+            h[i * n + i] += priors[*a].1;
         }
-        precision.resize(self.fitted.pass.gradient.len(), 12.0 / (RANGE.0 + RANGE.1).powi(2));
-        (log, precision)
+        let prior: f64 = kept.iter().map(|a| priors[*a].0).sum();
+        log / c + prior + 0.5 * n as f64 * (2.0 * PI).ln() - 0.5 * qr::log_determinant(&h, n)
     }
 
     /// ln Z with the likelihood tempered by `c`, among `candidates` laws.
     fn evidence(&self, c: f64, candidates: usize) -> f64 {
-        let (prior, precision) = self.priors();
-        let Pass { log, information, .. } = &self.fitted.pass;
-        let n = precision.len();
-        let mut h: Vec<f64> = information.iter().map(|i| i / c).collect();
-        for (a, p) in precision.iter().enumerate() {
-            h[a * n + a] += p;
-        }
-        let laws = self.parts.len() as f64 * (candidates.max(1) as f64).ln();
-        let normal = 0.5 * n as f64 * (2.0 * std::f64::consts::PI).ln();
-        log / c + prior + normal - 0.5 * log_determinant(&h, n) - laws
+        self.integral(c, |_| true) - self.parts.len() as f64 * (candidates.max(1) as f64).ln()
     }
-}
 
-/// ln of the determinant of a positive definite matrix, from Cholesky's factor of the matrix with a unit diagonal.
-fn log_determinant(a: &[f64], n: usize) -> f64 {
-    let d: Vec<f64> = (0..n).map(|i| a[i * n + i].max(1e-300).sqrt()).collect();
-    let mut l: Vec<f64> = (0..n * n).map(|i| a[i] / (d[i / n] * d[i % n])).collect();
-    let mut log = 0.0;
-    for j in 0..n {
-        let mut pivot = l[j * n + j] + 1e-12;
-        for k in 0..j {
-            pivot -= l[j * n + k] * l[j * n + k];
-        }
-        let pivot = pivot.max(1e-12);
-        log += pivot.ln() + 2.0 * d[j].ln();
-        let root = pivot.sqrt();
-        l[j * n + j] = root;
-        for i in j + 1..n {
-            let mut v = l[i * n + j];
-            for k in 0..j {
-                v -= l[i * n + k] * l[j * n + k];
-            }
-            l[i * n + j] = v / root;
-        }
+    /// The free parameters of a law.
+    fn own(&self, law: usize) -> Range<usize> {
+        let machine = self.at().setup.free.len() - self.known.iter().map(Vec::len).sum::<usize>();
+        let first = machine + self.known[..law].iter().map(Vec::len).sum::<usize>();
+        first..first + self.known[law].len()
     }
-    log
 }
 
 /// Another law in the place of one of the chosen.
@@ -213,6 +200,9 @@ pub(crate) struct Belief {
     pub(crate) gain: f64,
     /// What could stand in its place.
     pub(crate) others: Vec<Other>,
+    /// The data hold its name: its place was offered to all candidates, and neither they nor forces of free shape are as
+    /// likely there.
+    pub(crate) named: bool,
 }
 
 /// What the exploration believes.
@@ -686,7 +676,7 @@ impl<'a, 'b> Explorer<'a, 'b> {
         self.temper(best);
         let mut chosen = best;
         loop {
-            let beliefs = self.beliefs(chosen);
+            let mut beliefs = self.beliefs(chosen);
             let weakest = (0..beliefs.len()).min_by(|a, b| beliefs[*a].family.total_cmp(&beliefs[*b].family));
             match weakest {
                 Some(index) if beliefs[index].family < NAMED => {
@@ -694,12 +684,46 @@ impl<'a, 'b> Explorer<'a, 'b> {
                     chosen = self.keep(smaller);
                 }
                 _ => {
+                    self.name(chosen, &mut beliefs);
                     let some = self.best(|h| !h.parts.is_empty());
                     let tried = if beliefs.is_empty() { some.map(|i| self.rows[i].clone()) } else { None };
                     let limited = self.is_spent();
                     return Some(Posterior { chosen: self.rows[chosen].clone(), beliefs, tried, limited });
                 }
             }
+        }
+    }
+
+    /// Tells of which laws of a row the data hold the name, were something else allowed: a force of free shape beside them, or
+    /// in the place of some.
+    fn name(&self, row: usize, beliefs: &mut [Belief]) {
+        let h = &self.rows[row];
+        let candidates = self.search.candidates().len();
+        let (library, level) = (self.search.library, self.level(h));
+        let beside = Beside::of(h, &self.filter, library, &level, self.inflation, candidates);
+        let Some(beside) = beside.filter(|_| !beliefs.is_empty()) else { return };
+        // Laws that a shape replaces, by bits; and the odds of that against all laws, a shape beside them or none.
+        let evidence = |replaced: usize| {
+            let laws: Vec<usize> = (0..h.parts.len()).filter(|i| replaced >> i & 1 == 1).collect();
+            beside.evidence(&laws).unwrap_or(f64::NEG_INFINITY)
+        };
+        let with_all = log_sum(&[0.0, evidence(0)]);
+        let odds: Vec<f64> = (1..1 << h.parts.len())
+            .map(|set| (evidence(set) - with_all).clamp(-700.0, 700.0).exp())
+            .collect();
+        for (i, belief) in beliefs.iter_mut().enumerate() {
+            let something_else: f64 = odds
+                .iter()
+                .enumerate()
+                .filter(|(set, _)| (set + 1) >> i & 1 == 1)
+                .map(|(_, odds)| odds)
+                .sum();
+            // Of its kin, and of all that was tried in its place.
+            let (kin, total) = (belief.family / belief.probability, 1.0 / belief.probability);
+            let mut rest: Vec<&Candidate> = h.candidates().collect();
+            rest.remove(i);
+            let mut extended = self.rows.iter().zip(&self.extended).filter(|row| *row.1);
+            belief.named = kin / (total + something_else) >= NAMED && extended.any(|row| row.0.is(&rest));
         }
     }
 
@@ -739,7 +763,7 @@ impl<'a, 'b> Explorer<'a, 'b> {
                     .map(|(part, odds)| Other { part, probability: odds / total, equivalent: is_equal(odds) })
                     .collect();
                 others.sort_by(|a, b| b.probability.total_cmp(&a.probability));
-                Belief { probability: 1.0 / total, family: kin / total, gain, others }
+                Belief { probability: 1.0 / total, family: kin / total, gain, others, named: false }
             })
             .collect()
     }
@@ -838,6 +862,11 @@ mass = "m*x'' + k*x = f"
     /// A mass on a spring of 22 N/m with a damper, driven by two sines, pushed by a slow random force (0.3 s) of this size, and
     /// measured to a tenth of a millimetre.
     fn mass(damping: f64, push: f64, seed: u64) -> Setup {
+        mass_with(&|v| damping * v, push, seed)
+    }
+
+    /// The same with any friction of its speed.
+    fn mass_with(friction: &dyn Fn(f64) -> f64, push: f64, seed: u64) -> Setup {
         let mut rng = rand_pcg::Pcg64::seed_from_u64(seed);
         let mut normal = || -> f64 { StandardNormal.sample(&mut rng) };
         let (dt, n, fine) = (0.02, 1500usize, 10usize);
@@ -853,7 +882,7 @@ mass = "m*x'' + k*x = f"
             let decay = (-h / 0.3f64).exp();
             for i in 0..fine {
                 w = decay * w + push * (1.0 - decay * decay).sqrt() * normal();
-                let a = drive(t + (i as f64 + 0.5) * h) + w - 22.0 * x - damping * v;
+                let a = drive(t + (i as f64 + 0.5) * h) + w - 22.0 * x - friction(v);
                 v += h * a;
                 x += h * v;
             }
@@ -872,13 +901,13 @@ mass = "m*x'' + k*x = f"
         built_in().unwrap().into_iter().filter(|m| kinds.contains(&m.kind.as_str())).collect()
     }
 
-    /// What is named, the library's kinds in the order of the hypothesis.
-    fn named(setup: &Setup, library: &[Mechanism]) -> Vec<String> {
+    /// What is believed, the library's kinds in the order of the hypothesis, and whether the data hold the name.
+    fn believed(setup: &Setup, library: &[Mechanism]) -> Vec<(String, bool)> {
         let search = Search::new(setup.clone(), library, &crate::Quiet);
         let posterior = Explorer::new(&search, setup).explore(&setup.values(), &[]).unwrap();
         assert!(!posterior.limited);
         let kind = |p: &Part| library[p.candidate.mechanism].kind.clone();
-        posterior.chosen.parts.iter().map(kind).collect()
+        posterior.chosen.parts.iter().map(kind).zip(posterior.beliefs.iter().map(|b| b.named)).collect()
     }
 
     /// An exploration that knows its priors, and the machine alone.
@@ -889,27 +918,32 @@ mass = "m*x'' + k*x = f"
         (explorer, machine)
     }
 
-    #[test]
-    fn a_determinant_is_the_product_of_its_factors() {
-        let a = [4.0, 2.0, 0.0, 2.0, 9.0, 3.0, 0.0, 3.0, 16.0];
-        // 4·(9·16 − 9) − 2·(2·16)
-        assert!((log_determinant(&a, 3) - 476f64.ln()).abs() < 1e-9);
-        let scaled: Vec<f64> = a.iter().map(|v| v * 1e-20).collect();
-        assert!((log_determinant(&scaled, 3) - 476f64.ln() + 60.0 * 10f64.ln()).abs() < 1e-9);
-    }
-
     /// A damper of a fifth of the critical damping among pushes half as large as the drive is named, and alone; without
     /// it nothing is.
     #[test]
     fn a_damper_is_named_among_random_forces_and_nothing_is_where_there_is_none() {
         let library = some_laws();
         let seeds = 6u64;
-        let right =
-            (0..seeds).filter(|seed| named(&mass(1.9, 1.0, 40 + seed), &library) == ["viscous_friction"]);
+        let damper = [("viscous_friction".to_string(), true)];
+        let right = (0..seeds).filter(|seed| believed(&mass(1.9, 1.0, 40 + seed), &library) == damper);
         let right = right.count() as u64;
-        let wrong = (0..seeds).filter(|seed| !named(&mass(0.0, 1.0, 80 + seed), &library).is_empty()).count();
+        let wrong =
+            (0..seeds).filter(|seed| !believed(&mass(0.0, 1.0, 80 + seed), &library).is_empty()).count();
         assert!(right >= seeds - 1, "{right} of {seeds}");
         assert_eq!(wrong, 0);
+    }
+
+    /// A drag with the square of the speed, in a library without one: what stands in for it is believed to act, and is not
+    /// named.
+    #[test]
+    fn what_stands_in_for_another_law_is_not_named() {
+        let library = some_laws();
+        for seed in 0..4 {
+            let setup = mass_with(&|v| 1.2 * v * v.abs() * v.abs(), 0.2, 140 + seed);
+            let believed = believed(&setup, &library);
+            assert!(!believed.is_empty(), "seed {seed}");
+            assert!(believed.iter().all(|law| !law.1), "seed {seed}: {believed:?}");
+        }
     }
 
     /// A law costs the logarithm of how many candidates there are, and that of how wide the prior of its strength is.

@@ -15,6 +15,7 @@ pub mod locate;
 pub mod place;
 pub mod screen;
 pub mod search;
+pub mod shapes;
 pub mod smoother;
 pub mod spectra;
 pub mod surface;

@@ -65,8 +65,9 @@ pub struct Scored {
     pub others: Vec<(f64, Vec<f64>, Vec<f64>)>,
 }
 
-/// What one column of the regression does to the machine.
-enum Component {
+/// What one column of the regression does to the machine, or a part of it.
+#[derive(Debug, Clone)]
+pub enum Component {
     /// A force with weights on the equations.
     Force(Vec<f64>, Vec<Vec<f64>>),
     /// A change of an input.
@@ -153,7 +154,6 @@ pub fn lanes(
             variants(setup, mechanism, candidate, index, along, spectra)
         })
         .collect();
-    let nz = setup.system.nz;
     let mut components: Vec<Component> = Vec::new();
     let mut columns = Vec::new();
     let mut variants = Vec::new();
@@ -167,8 +167,13 @@ pub fn lanes(
         variant.columns = from..columns.len();
         variants.push(variant);
     }
-    let count = components.len();
-    let signals = setup
+    Lanes { signals: signals(setup, &components), columns, variants }
+}
+
+/// What a simulation adds, one lane for each component; per piece.
+pub fn signals(setup: &Setup, components: &[Component]) -> Vec<Arc<SignalLanes>> {
+    let (count, nz) = (components.len(), setup.system.nz);
+    setup
         .data
         .pieces
         .iter()
@@ -205,8 +210,18 @@ pub fn lanes(
             }
             Arc::new(lanes)
         })
-        .collect();
-    Lanes { signals, columns, variants }
+        .collect()
+}
+
+/// What a law does along given states at these values of its own parameters.
+pub fn effect(
+    setup: &Setup,
+    mechanism: &Mechanism,
+    candidate: &Candidate,
+    along: &Along<'_>,
+    values: &[f64],
+) -> Option<Vec<Component>> {
+    Law::new(setup, mechanism, candidate, along)?.components(values)
 }
 
 /// The columns of a candidate for every choice of its inner parameters.
@@ -581,6 +596,7 @@ fn choices(mechanism: &Mechanism, scales: &[f64], more: Vec<Vec<f64>>) -> Vec<Ve
 
 /// Inner products of residual, sensitivities and candidate responses, all projected off the initial
 /// states.
+#[derive(Clone)]
 pub struct Gram {
     np: usize,
     /// JᵀJ + Λ.
@@ -638,6 +654,15 @@ fn project_columns(rows: SegmentRows, nx: usize, columns: Option<&[Range<usize>]
         qr::project_off(&q, m, column);
     }
     Projected { rows: m, r, jp, g: signals }
+}
+
+/// A block with the parameters projected off.
+struct Off {
+    gg: Vec<f64>,
+    gr: Vec<f64>,
+    /// What the parameters do for each column, and for the residual.
+    columns: Vec<Vec<f64>>,
+    base: Vec<f64>,
 }
 
 impl Gram {
@@ -810,9 +835,44 @@ impl Gram {
         solve_scaled(&self.jj, self.np, b)
     }
 
-    /// Regresses block `index`; `positive[i]` drops column i when its coefficient comes out negative.
-    /// `None` when the block adds nothing that the parameters cannot do already.
-    pub fn regress(&self, index: usize, positive: &[bool], ridge: f64) -> Option<Regressed> {
+    /// The same without some of the parameters, each where it would be if its value were lower by so much: what it did is in
+    /// the residual.
+    #[must_use]
+    pub fn without(&self, gone: &[(usize, f64)]) -> Gram {
+        let (np, lanes) = (self.np, self.lanes);
+        let kept: Vec<usize> = (0..np).filter(|a| gone.iter().all(|g| g.0 != *a)).collect();
+        let mut all = self.clone();
+        for (i, by) in gone {
+            // r + J by, column by column.
+            all.rr += 2.0 * by * all.jr[*i] + by * by * self.jj[i * np + i];
+            for a in 0..np {
+                all.jr[a] += by * self.jj[a * np + i];
+            }
+            for l in 0..lanes {
+                all.gr[l] += by * self.jg[i * lanes + l];
+            }
+        }
+        let n = kept.len();
+        let mut out =
+            Gram { np: n, jj: vec![0.0; n * n], prior: vec![0.0; n], jr: Vec::new(), jg: Vec::new(), ..all };
+        for (i, a) in kept.iter().enumerate() {
+            for (j, b) in kept.iter().enumerate() {
+                out.jj[i * n + j] = self.jj[a * np + b];
+            }
+            out.prior[i] = self.prior[*a];
+            out.jr.push(all.jr[*a]);
+            out.jg.extend_from_slice(&self.jg[a * lanes..(a + 1) * lanes]);
+        }
+        out
+    }
+
+    /// GᵀG and Gᵀr of block `index` with the parameters projected off.
+    pub fn projected(&self, index: usize) -> (Vec<f64>, Vec<f64>) {
+        let Off { gg, gr, .. } = self.off(index);
+        (gg, gr)
+    }
+
+    fn off(&self, index: usize) -> Off {
         let block = self.blocks[index].clone();
         let n = block.len();
         let np = self.np;
@@ -831,6 +891,15 @@ impl Gram {
             }
             gr[a] = self.gr[block.start + a] - (0..np).map(|i| jg(i, a) * base[i]).sum::<f64>();
         }
+        Off { gg, gr, columns, base }
+    }
+
+    /// Regresses block `index`; `positive[i]` drops column i when its coefficient comes out negative.
+    /// `None` when the block adds nothing that the parameters cannot do already.
+    pub fn regress(&self, index: usize, positive: &[bool], ridge: f64) -> Option<Regressed> {
+        let block = self.blocks[index].clone();
+        let (n, np) = (block.len(), self.np);
+        let Off { gg, gr, columns, base } = self.off(index);
         let mut kept: Vec<usize> = (0..n)
             .filter(|&a| {
                 let size = self.gg[index][a * n + a];
@@ -1093,4 +1162,38 @@ pub fn scored(library: &[Mechanism], candidates: &[Candidate], lanes: &Lanes, gr
         .collect();
     scored.sort_by(|a, b| b.gain.total_cmp(&a.gain).then(a.candidate.cmp(&b.candidate)));
     scored
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    /// Leaving a parameter out of the inner products is leaving it out of every row, with what it did in the residual.
+    #[test]
+    fn a_parameter_is_left_out_with_its_effect_in_the_residual() {
+        let blocks = [0..2, 2..3];
+        let (mut all, mut left) = (Gram::new(3, 3, &blocks), Gram::new(1, 3, &blocks));
+        for k in 0..12 {
+            let x = |i: i32| (f64::from(k) * 0.7 + f64::from(i * i) * 1.3).sin();
+            let (r, j, g) = (x(0), [x(1), x(2), x(3)], [x(4), x(5) * 2.0, x(6)]);
+            all.add_row(r, &j, &g);
+            left.add_row(r + 0.6 * j[0] - 1.5 * j[2], &[j[1]], &g);
+        }
+        let without = all.without(&[(0, 0.6), (2, -1.5)]);
+        let close = |a: &[f64], b: &[f64]| {
+            assert_eq!(a.len(), b.len());
+            a.iter().zip(b).for_each(|(a, b)| assert!((a - b).abs() < 1e-9, "{a} {b}"));
+        };
+        close(&[without.rr], &[left.rr]);
+        close(&without.jj, &left.jj);
+        close(&without.jr, &left.jr);
+        close(&without.jg, &left.jg);
+        close(&without.gr, &left.gr);
+        for index in 0..2 {
+            let ((gg, gr), (its, own)) = (without.projected(index), left.projected(index));
+            close(&gg, &its);
+            close(&gr, &own);
+        }
+        assert!((without.remaining() - left.remaining()).abs() < 1e-9);
+    }
 }

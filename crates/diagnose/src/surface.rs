@@ -1,10 +1,7 @@
-//! The non-parametric rival: forces of free shape, to see whether anything systematic is left.
+//! The non-parametric rival: [free shapes](crate::shapes), to see whether anything systematic is left.
 //!
-//! Piecewise linear functions of the motion d (7 knots), of d' (7), of both (5 × 5), of their product (15),
-//! of its product with another motion (9), of each input (7) and its products with d and d' (7), and of slow
-//! time (14 knots, alone and as a gain of d, d', d² and each input) are injected like any candidate. What they
-//! explain on folds they were not fitted to is force that acts on the machine and has a shape; noise gains
-//! nothing.
+//! They are injected like any candidate. What they explain on folds they were not fitted to is force that acts on the machine
+//! and has a shape; noise gains nothing.
 
 use std::sync::Arc;
 
@@ -14,15 +11,15 @@ use rayon::prelude::*;
 
 use crate::along::Along;
 use crate::evidence::{fall, least_kappa};
-use crate::place::{Motion, Place, places};
-use crate::screen::project;
+use crate::screen::{project, signals};
+use crate::shapes::{Shapes, Variable};
 
 const FOLDS: usize = 10;
 /// Samples that tell enough, and fewest segments that are kept.
 const MOST_SAMPLES: usize = 20_000;
 const LEAST_SEGMENTS: usize = 4;
-/// Knots of slow time over a recording.
-const SLOW_KNOTS: usize = 14;
+/// Share of the samples at either end of a variable that get no knots of their own: least squares has no prior.
+const RARE: f64 = 0.01;
 /// Fewest independent samples (N κ) for a test of free shapes.
 const LEAST_INDEPENDENT: f64 = 20.0;
 
@@ -47,41 +44,6 @@ pub struct Surface {
     pub block: usize,
 }
 
-/// A variable of the free shapes.
-#[derive(Debug, Clone, PartialEq)]
-pub enum Variable {
-    /// Position of a motion.
-    Position(Motion),
-    /// Rate of a motion.
-    Rate(Motion),
-    /// Both.
-    Both(Motion),
-    /// The product of two motions, acting on the first.
-    Product(Motion, Motion),
-    /// An input (or its product with the motion), acting where the motion acts.
-    Input(usize, Motion),
-    /// Slow time.
-    Time(Motion),
-}
-
-fn knots(values: &[Vec<f64>], n: usize) -> Option<Vec<f64>> {
-    let mut all: Vec<f64> = values.iter().flatten().copied().filter(|v| v.is_finite()).collect();
-    if all.len() < 4 * n {
-        return None;
-    }
-    all.sort_by(f64::total_cmp);
-    // Between the 1 % and 99 % quantiles, evenly in value: rare extremes get no knot of their own.
-    let (lo, hi) = (all[all.len() / 100], all[all.len() - 1 - all.len() / 100]);
-    (hi > lo).then(|| (0..n).map(|i| lo + (hi - lo) * i as f64 / (n - 1) as f64).collect())
-}
-
-/// Hat function `i` over even knots.
-fn hat(knots: &[f64], i: usize, v: f64) -> f64 {
-    let h = knots[1] - knots[0];
-    let v = v.clamp(knots[0], knots[knots.len() - 1]);
-    (1.0 - ((v - knots[i]) / h).abs()).max(0.0)
-}
-
 /// Every so many-th segment, where there are more samples than the test needs (and no memory goes on from one
 /// segment to the next).
 fn thinned(setup: &Setup, level: &Level, point: &Point) -> (Level, Point) {
@@ -103,119 +65,8 @@ fn thinned(setup: &Setup, level: &Level, point: &Point) -> (Level, Point) {
 pub fn test(setup: &Setup, level: &Level, scale: &[f64], point: &Point) -> Option<Surface> {
     let (level, point) = &thinned(setup, level, point);
     let along = Along::undisturbed(setup, level, scale, point);
-    let motions: Vec<Motion> = places(&setup.model)
-        .into_iter()
-        .filter_map(|p| match p {
-            Place::Motion(m) if m.weights.iter().filter(|w| **w != 0.0).count() == 1 => Some(m),
-            _ => None,
-        })
-        .take(3)
-        .collect();
-    let mut columns: Vec<(Vec<f64>, Vec<Vec<f64>>)> = Vec::new();
-    let mut groups: Vec<(Variable, std::ops::Range<usize>)> = Vec::new();
-    let pieces = &setup.data.pieces;
-    // A constant has no shape, and its products repeat what they are made of.
-    let inputs: Vec<usize> = (0..setup.system.nu).filter(|u| setup.data.input_varies(*u)).collect();
-    for motion in &motions {
-        let eval = |e: &Option<greybox_model::Expr>| {
-            e.as_ref().and_then(|e| along.eval(std::slice::from_ref(e), &[])?.pop())
-        };
-        let (d, v) = (eval(&motion.position), eval(&motion.rate));
-        let mut push = |variable: Variable, made: Vec<Vec<Vec<f64>>>| {
-            if made.is_empty() {
-                return;
-            }
-            let first = columns.len();
-            columns.extend(made.into_iter().map(|series| (motion.weights.clone(), series)));
-            groups.push((variable, first..columns.len()));
-        };
-        let shapes = |series: &Vec<Vec<f64>>, n: usize| -> Vec<Vec<Vec<f64>>> {
-            let Some(k) = knots(series, n) else { return Vec::new() };
-            (0..n)
-                .map(|i| series.iter().map(|s| s.iter().map(|x| hat(&k, i, *x)).collect()).collect())
-                .collect()
-        };
-        if let Some(d) = &d {
-            push(Variable::Position(motion.clone()), shapes(d, 7));
-        }
-        if let Some(v) = &v {
-            push(Variable::Rate(motion.clone()), shapes(v, 7));
-        }
-        if let (Some(d), Some(v)) = (&d, &v)
-            && let (Some(kd), Some(kv)) = (knots(d, 5), knots(v, 5))
-        {
-            let mut both = Vec::new();
-            for i in 0..5 {
-                for j in 0..5 {
-                    both.push(
-                        d.iter()
-                            .zip(v)
-                            .map(|(d, v)| {
-                                d.iter().zip(v).map(|(d, v)| hat(&kd, i, *d) * hat(&kv, j, *v)).collect()
-                            })
-                            .collect(),
-                    );
-                }
-            }
-            push(Variable::Both(motion.clone()), both);
-        }
-        let times_series = |a: &[Vec<f64>], b: &[Vec<f64>]| -> Vec<Vec<f64>> {
-            a.iter().zip(b).map(|(a, b)| a.iter().zip(b).map(|(a, b)| a * b).collect()).collect()
-        };
-        if let (Some(d), Some(v)) = (&d, &v) {
-            push(Variable::Both(motion.clone()), shapes(&times_series(d, v), 15));
-        }
-        for other in &motions {
-            if other != motion
-                && let (Some(d), Some(o)) = (&d, eval(&other.position))
-            {
-                push(Variable::Product(motion.clone(), other.clone()), shapes(&times_series(d, &o), 9));
-            }
-        }
-        for &u in &inputs {
-            let series: Vec<Vec<f64>> = pieces.iter().map(|p| p.inputs[u].clone()).collect();
-            push(Variable::Input(u, motion.clone()), shapes(&series, 7));
-            for of in [&d, &v].into_iter().flatten() {
-                push(Variable::Input(u, motion.clone()), shapes(&times_series(&series, of), 7));
-            }
-        }
-        let times: Vec<Vec<f64>> =
-            pieces.iter().map(|p| (0..p.len).map(|k| p.start + k as f64 * p.dt).collect()).collect();
-        // What a force of slow time, and the gains of the motion and of the inputs, would be if they changed.
-        let slow = shapes(&times, SLOW_KNOTS);
-        let mut factors: Vec<Option<Vec<Vec<f64>>>> = vec![None];
-        factors.extend([&d, &v].into_iter().flatten().cloned().map(Some));
-        factors.extend(d.iter().map(|d| Some(times_series(d, d))));
-        factors.extend(inputs.iter().map(|&u| Some(pieces.iter().map(|p| p.inputs[u].clone()).collect())));
-        for factor in factors {
-            let gains = slow.iter().map(|shape| match &factor {
-                None => shape.clone(),
-                Some(f) => times_series(shape, f),
-            });
-            push(Variable::Time(motion.clone()), gains.collect());
-        }
-    }
-    if columns.is_empty() {
-        return None;
-    }
-    let (lanes, nz) = (columns.len(), setup.system.nz);
-    let signals: Vec<Arc<SignalLanes>> = pieces
-        .iter()
-        .enumerate()
-        .map(|(p, piece)| {
-            let mut weights = vec![0.0; nz * lanes];
-            let mut force = vec![0.0; piece.len * lanes];
-            for (l, (w, series)) in columns.iter().enumerate() {
-                for e in 0..nz {
-                    weights[e * lanes + l] = w[e];
-                }
-                for (k, v) in series[p].iter().enumerate() {
-                    force[k * lanes + l] = if v.is_finite() { *v } else { 0.0 };
-                }
-            }
-            Arc::new(SignalLanes { lanes, weights, force, ..SignalLanes::default() })
-        })
-        .collect();
+    let Shapes { groups, forces } = Shapes::along(setup, &along, RARE)?;
+    let (lanes, signals) = (forces.len(), signals(setup, &forces));
     let total: usize = level.segments.iter().map(|s| s.range.len()).sum();
     // Blocks no shorter than the residual's correlation: neighbours must not predict each other.
     let kappa = least_kappa(setup, level, scale, point);
@@ -238,10 +89,10 @@ pub fn test(setup: &Setup, level: &Level, scale: &[f64], point: &Point) -> Optio
     let mut all = with(0..lanes);
     let mut best: Option<(Variable, f64)> = None;
     let mut single = (0.0, 0.0, Vec::new());
-    for (variable, range) in &groups {
-        let one = with(range.clone());
+    for group in &groups {
+        let one = with(group.columns.clone());
         if best.as_ref().is_none_or(|b| one.0 > b.1) {
-            best = Some((variable.clone(), one.0));
+            best = Some((group.variable.clone(), one.0));
             single = one;
         }
     }
