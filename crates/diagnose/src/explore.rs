@@ -933,7 +933,7 @@ mass = "m*x'' + k*x = f"
         assert_eq!(wrong, 0);
     }
 
-    /// A drag with the square of the speed, in a library without one: what stands in for it is believed to act, and is not
+    /// A drag with the cube of the speed, in a library without one: what stands in for it is believed to act, and is not
     /// named.
     #[test]
     fn what_stands_in_for_another_law_is_not_named() {
