@@ -23,6 +23,7 @@ use crate::screen::Component;
 
 /// Knots of slow time over a recording.
 const SLOW_KNOTS: usize = 14;
+
 /// A variable of the free shapes.
 #[derive(Debug, Clone, PartialEq)]
 pub enum Variable {
