@@ -142,29 +142,34 @@ pub fn sandwich(f: &[f64], p: &mut [f64], scratch: &mut [f64], n: usize) {
     }
 }
 
-/// ln of the determinant of a positive definite matrix, from Cholesky's factor of the matrix with a unit diagonal.
-pub fn log_determinant(a: &[f64], n: usize) -> f64 {
-    let d: Vec<f64> = (0..n).map(|i| a[i * n + i].max(1e-300).sqrt()).collect();
-    let mut l: Vec<f64> = (0..n * n).map(|i| a[i] / (d[i / n] * d[i % n])).collect();
-    let mut log = 0.0;
+/// Cholesky's lower factor L of a positive definite `n × n` matrix A = L Lᵀ with a unit diagonal, a trace of which keeps it from
+/// being singular.
+pub fn cholesky(a: &[f64], n: usize) -> Vec<f64> {
+    let mut l = vec![0.0; n * n];
     for j in 0..n {
-        let mut pivot = l[j * n + j] + 1e-12;
+        let mut pivot = a[j * n + j] + 1e-12;
         for k in 0..j {
             pivot -= l[j * n + k] * l[j * n + k];
         }
-        let pivot = pivot.max(1e-12);
-        log += pivot.ln() + 2.0 * d[j].ln();
-        let root = pivot.sqrt();
+        let root = pivot.max(1e-12).sqrt();
         l[j * n + j] = root;
         for i in j + 1..n {
-            let mut v = l[i * n + j];
+            let mut v = a[i * n + j];
             for k in 0..j {
                 v -= l[i * n + k] * l[j * n + k];
             }
             l[i * n + j] = v / root;
         }
     }
-    log
+    l
+}
+
+/// ln of the determinant of a positive definite `n × n` matrix, from Cholesky's factor of the matrix with a unit diagonal.
+pub fn log_determinant(a: &[f64], n: usize) -> f64 {
+    let d: Vec<f64> = (0..n).map(|i| a[i * n + i].max(1e-300).sqrt()).collect();
+    let scaled: Vec<f64> = (0..n * n).map(|i| a[i] / (d[i / n] * d[i % n])).collect();
+    let l = cholesky(&scaled, n);
+    (0..n).map(|j| 2.0 * (l[j * n + j].ln() + d[j].ln())).sum()
 }
 
 /// Solves the symmetric positive (semi)definite `n × n` system by Cholesky with a relative floor on

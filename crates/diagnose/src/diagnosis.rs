@@ -506,7 +506,7 @@ fn conclude(
     let scores = judge.scores(&polished.fitted.setup, &polished.fitted.fit.point.parameters, &scale);
     let mut judged = judged_of(&found, &polished, &|_| named);
     // Where more than noise is left, every model of the machine errs, and output errors do not compare them.
-    let (mut agreed, mut by_evidence) = (Vec::new(), Vec::new());
+    let mut agreed = Vec::new();
     if !leaves_noise(&scores, &polished.origin, &scale) {
         let names = judged.verdict == Verdict::MissingPhysics;
         if names {
@@ -517,7 +517,7 @@ fn conclude(
         let explored = explored(search, standing, in_both, names, &baseline, &judge);
         if let Some(Explored { found: other, polished: simulates, named }) = explored {
             judged = judged_of(&other, &simulates, &|part| named.contains(&part.candidate));
-            (found, polished, by_evidence) = (other, simulates, named);
+            (found, polished) = (other, simulates);
         }
         limited |= found.limited;
     }
@@ -590,8 +590,8 @@ fn conclude(
     // Of laws that are not believed together those stand that another comparison has named.
     let stands = |part: &Part| found.errs && agreed.contains(&named_as(part, library, &nominal.model));
     let all = judged.verdict == Verdict::MissingPhysics;
-    let holds_name = |part: &Part| all && (!found.errs || by_evidence.contains(&part.candidate));
-    let believed: Vec<bool> = improved.parts.iter().map(|part| holds_name(part) || stands(part)).collect();
+    let parts = improved.parts.iter().zip(&judged.named);
+    let believed: Vec<bool> = parts.map(|(part, named)| (all && *named) || stands(part)).collect();
     let verdict = if believed.contains(&true) { Verdict::MissingPhysics } else { judged.verdict };
     let Judged { shares, left, surface, alone, without, full, base, doubts, .. } = judged;
     let share = |rss: f64| (rss / base.max(1e-300)).clamp(0.0, 1.0);
@@ -682,6 +682,8 @@ fn named_as(part: &Part, library: &[Mechanism], nominal: &Model) -> (String, Vec
 /// What an improved model explains, and what it leaves.
 struct Judged {
     verdict: Verdict,
+    /// Whether each part is named, if the verdict allows.
+    named: Vec<bool>,
     /// Share of the calibrated model's misfit that each part explains.
     shares: Vec<f64>,
     left: Left,
@@ -740,15 +742,13 @@ impl Judged {
         let is_imitation = (0..doubts.len()).any(|i| {
             beaten(i) && (lost[i] > CORRECTION || (0..doubts.len()).any(|j| i != j && redundant(i, j)))
         });
-        let by_name = improved.parts.iter().zip(&shares).filter(|(part, _)| named(part));
-        let by_name: Vec<f64> = by_name.map(|(_, share)| *share).collect();
+        let named: Vec<bool> = improved.parts.iter().map(named).collect();
+        let by_name: f64 = shares.iter().zip(&named).filter(|s| *s.1).map(|s| s.0).sum();
         let is_patchwork = || is_patchwork(improved, &shares, library, left.steady, redundant);
         let verdict = match left.verdict(improved.parts.len()) {
-            _ if by_name.is_empty() && !improved.parts.is_empty() => Verdict::Unexplained,
+            _ if !named.contains(&true) && !improved.parts.is_empty() => Verdict::Unexplained,
             // (The exploration has held free shapes against its laws.)
-            _ if found.errs && (by_name.iter().sum::<f64>() < EXPLAINED || is_patchwork()) => {
-                Verdict::Unexplained
-            }
+            _ if found.errs && (by_name < EXPLAINED || is_patchwork()) => Verdict::Unexplained,
             _ if found.errs => Verdict::MissingPhysics,
             Verdict::MissingPhysics
                 if is_imitation || is_patchwork() || is_rivalled(&comparable, &found.scale, library) =>
@@ -757,7 +757,7 @@ impl Judged {
             }
             verdict => verdict,
         };
-        Judged { verdict, shares, left, surface, alone, without, full, base, doubts }
+        Judged { verdict, named, shares, left, surface, alone, without, full, base, doubts }
     }
 }
 

@@ -125,8 +125,7 @@ impl Hypothesis {
     /// What is known before the data of each that is free: logarithm of the density, precision.
     fn priors(&self) -> Vec<(f64, f64)> {
         let at = self.at();
-        let machine = at.setup.free.len() - self.known.iter().map(Vec::len).sum::<usize>();
-        let (own, laws) = at.setup.free.split_at(machine);
+        let (own, laws) = at.setup.free.split_at(self.own(0).start);
         let own = own.iter().map(|f| {
             let value = at.parameters[f.index];
             (-0.5 * f.prior.at(value).0.powi(2), f.prior.precision(value))
@@ -170,11 +169,10 @@ impl Hypothesis {
         self.integral(c, |_| true) - self.parts.len() as f64 * (candidates.max(1) as f64).ln()
     }
 
-    /// The free parameters of a law.
+    /// The free parameters of a law; those of the machine are before them.
     fn own(&self, law: usize) -> Range<usize> {
-        let machine = self.at().setup.free.len() - self.known.iter().map(Vec::len).sum::<usize>();
-        let first = machine + self.known[..law].iter().map(Vec::len).sum::<usize>();
-        first..first + self.known[law].len()
+        let first = self.at().setup.free.len() - self.known[law..].iter().map(Vec::len).sum::<usize>();
+        first..first + self.known.get(law).map_or(0, Vec::len)
     }
 }
 
@@ -319,19 +317,8 @@ impl<'a, 'b> Explorer<'a, 'b> {
         let spectra = Spectra::new(setup, &level, &scale, &point, &along, &forces);
         let lanes = lanes(setup, library, open, &along, &spectra);
         let blocks: Vec<_> = lanes.variants.iter().map(|v| v.columns.clone()).collect();
-        let (np, columns) = (setup.free.len(), lanes.columns.len());
-        let new = || (Gram::new(np, columns, &blocks), vec![0.0; np], vec![0.0; columns]);
-        let run = self.filter.run(at, true, Some(&lanes.signals), new, |(gram, j, g), i| {
-            let root = i.s.sqrt();
-            j.iter_mut().zip(i.by_parameters).for_each(|(j, de)| *j = -de / root);
-            for (g, range) in g.iter_mut().zip(&lanes.columns) {
-                *g = -i.by_signals[range.clone()].iter().sum::<f64>() / root;
-            }
-            gram.add_row(i.e / root, j, g);
-        });
-        let Some(parts) = run else { return Vec::new() };
-        let mut gram = Gram::new(np, columns, &blocks);
-        parts.iter().for_each(|part| gram.add(&part.0));
+        let gram = innovations(&self.filter, at, &lanes.signals, &[], &lanes.columns, &blocks);
+        let Some(mut gram) = gram else { return Vec::new() };
         gram.add_priors(&setup.free, &at.parameters, self.weight());
         let promised = |s: &Scored| 0.5 * s.gain * gram.remaining() * self.weight();
         scored(library, open, &lanes, &gram).into_iter().filter(|s| promised(s) > PROMISING).collect()
@@ -697,11 +684,14 @@ impl<'a, 'b> Explorer<'a, 'b> {
     /// Tells of which laws of a row the data hold the name, were something else allowed: a force of free shape beside them, or
     /// in the place of some.
     fn name(&self, row: usize, beliefs: &mut [Belief]) {
+        if beliefs.is_empty() {
+            return;
+        }
         let h = &self.rows[row];
         let candidates = self.search.candidates().len();
         let (library, level) = (self.search.library, self.level(h));
         let beside = Beside::of(h, &self.filter, library, &level, self.inflation, candidates);
-        let Some(beside) = beside.filter(|_| !beliefs.is_empty()) else { return };
+        let Some(beside) = beside else { return };
         // Laws that a shape replaces, by bits; and the odds of that against all laws, a shape beside them or none.
         let evidence = |replaced: usize| {
             let laws: Vec<usize> = (0..h.parts.len()).filter(|i| replaced >> i & 1 == 1).collect();
@@ -767,6 +757,31 @@ impl<'a, 'b> Explorer<'a, 'b> {
             })
             .collect()
     }
+}
+
+/// The inner products of the innovations of a model, their sensitivities, and what signals do to them: some columns of lanes
+/// beside the parameters, and some of which these blocks are wanted.
+fn innovations(
+    filter: &Filter,
+    at: &Stochastic,
+    signals: &[Arc<SignalLanes>],
+    beside: &[Range<usize>],
+    columns: &[Range<usize>],
+    blocks: &[Range<usize>],
+) -> Option<Gram> {
+    let np = at.setup.free.len() + beside.len();
+    let new = || (Gram::new(np, columns.len(), blocks), Vec::new());
+    let parts = filter.run(at, true, Some(signals), new, |(gram, row), i| {
+        let root = i.s.sqrt();
+        row.clear();
+        row.extend(i.by_parameters.iter().map(|de| -de / root));
+        let lanes = beside.iter().chain(columns);
+        row.extend(lanes.map(|lanes| -i.by_signals[lanes.clone()].iter().sum::<f64>() / root));
+        gram.add_row(i.e / root, &row[..np], &row[np..]);
+    })?;
+    let mut gram = Gram::new(np, columns.len(), blocks);
+    parts.iter().for_each(|part| gram.add(&part.0));
+    Some(gram)
 }
 
 /// Whether no one would bet on one of two.

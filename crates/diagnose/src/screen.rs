@@ -657,7 +657,7 @@ fn project_columns(rows: SegmentRows, nx: usize, columns: Option<&[Range<usize>]
 }
 
 /// A block with the parameters projected off.
-struct Off {
+struct Projection {
     gg: Vec<f64>,
     gr: Vec<f64>,
     /// What the parameters do for each column, and for the residual.
@@ -868,11 +868,11 @@ impl Gram {
 
     /// GᵀG and Gᵀr of block `index` with the parameters projected off.
     pub fn projected(&self, index: usize) -> (Vec<f64>, Vec<f64>) {
-        let Off { gg, gr, .. } = self.off(index);
+        let Projection { gg, gr, .. } = self.projection(index);
         (gg, gr)
     }
 
-    fn off(&self, index: usize) -> Off {
+    fn projection(&self, index: usize) -> Projection {
         let block = self.blocks[index].clone();
         let n = block.len();
         let np = self.np;
@@ -891,7 +891,7 @@ impl Gram {
             }
             gr[a] = self.gr[block.start + a] - (0..np).map(|i| jg(i, a) * base[i]).sum::<f64>();
         }
-        Off { gg, gr, columns, base }
+        Projection { gg, gr, columns, base }
     }
 
     /// Regresses block `index`; `positive[i]` drops column i when its coefficient comes out negative.
@@ -899,7 +899,7 @@ impl Gram {
     pub fn regress(&self, index: usize, positive: &[bool], ridge: f64) -> Option<Regressed> {
         let block = self.blocks[index].clone();
         let (n, np) = (block.len(), self.np);
-        let Off { gg, gr, columns, base } = self.off(index);
+        let Projection { gg, gr, columns, base } = self.projection(index);
         let mut kept: Vec<usize> = (0..n)
             .filter(|&a| {
                 let size = self.gg[index][a * n + a];

@@ -223,7 +223,7 @@ impl Group {
     /// `gg` = GᵀG and `gr` = Gᵀr with the parameters projected off, each square worth `weight`.
     pub fn evidence(&self, gg: &[f64], gr: &[f64], weight: f64, width: f64) -> f64 {
         let n = gr.len();
-        let root = root(&self.covariance(), n);
+        let root = qr::cholesky(&self.covariance(), n);
         // (Lower triangular, L[a][b] at a·n + b.)
         let mut half = vec![0.0; n * n];
         for a in 0..n {
@@ -249,18 +249,6 @@ impl Group {
 pub fn log_sum(logs: &[f64]) -> f64 {
     let most = logs.iter().copied().fold(f64::NEG_INFINITY, f64::max);
     if most.is_finite() { most + logs.iter().map(|l| (l - most).exp()).sum::<f64>().ln() } else { most }
-}
-
-/// Cholesky's lower factor.
-fn root(a: &[f64], n: usize) -> Vec<f64> {
-    let mut l = vec![0.0; n * n];
-    for j in 0..n {
-        for i in j..n {
-            let sum = a[i * n + j] - (0..j).map(|k| l[i * n + k] * l[j * n + k]).sum::<f64>();
-            l[i * n + j] = if i == j { sum.max(1e-12).sqrt() } else { sum / l[j * n + j] };
-        }
-    }
-    l
 }
 
 #[cfg(test)]

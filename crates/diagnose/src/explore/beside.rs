@@ -15,7 +15,7 @@
 use greybox_calibrate::stochastic::Filter;
 use greybox_calibrate::{Level, Point};
 
-use super::{Hypothesis, Known};
+use super::{Hypothesis, Known, innovations};
 use crate::along::Along;
 use crate::library::Mechanism;
 use crate::screen::{Gram, effect, signals};
@@ -37,7 +37,7 @@ pub(super) struct Beside<'h> {
 }
 
 impl<'h> Beside<'h> {
-    /// `segments` are some over all data. `None` where nothing moves, or where the filter cannot follow.
+    /// Beside a hypothesis with segments over all data. `None` where nothing moves, or where the filter cannot follow.
     pub(super) fn of(
         h: &'h Hypothesis,
         filter: &Filter,
@@ -49,10 +49,8 @@ impl<'h> Beside<'h> {
         let at = h.at();
         let setup = &at.setup;
         let along = Along::smoothed(setup, level, &at.errors.noise(), point);
-        let Shapes { groups, forces } = Shapes::along(setup, &along, 0.0)?;
-        let shapes = forces.len();
-        let np = setup.free.len();
-        let mut added = forces;
+        let Shapes { groups, forces: mut added } = Shapes::along(setup, &along, 0.0)?;
+        let (np, shapes) = (setup.free.len(), added.len());
         let mut lanes = Vec::new();
         let mut effects = Vec::new();
         for (candidate, values, _) in h.laws() {
@@ -63,19 +61,9 @@ impl<'h> Beside<'h> {
                 added.extend(parts);
             }
         }
-        let columns = np + lanes.len();
         let blocks: Vec<_> = groups.iter().map(|g| g.columns.clone()).collect();
-        let new = || (Gram::new(columns, shapes, &blocks), Vec::new());
-        let parts = filter.run(at, true, Some(&signals(setup, &added)), new, |(gram, row), i| {
-            let root = i.s.sqrt();
-            row.clear();
-            row.extend(i.by_parameters.iter().map(|de| -de / root));
-            row.extend(lanes.iter().map(|lanes| -i.by_signals[lanes.clone()].iter().sum::<f64>() / root));
-            row.extend(i.by_signals[..shapes].iter().map(|de| -de / root));
-            gram.add_row(i.e / root, &row[..columns], &row[columns..]);
-        })?;
-        let mut gram = Gram::new(columns, shapes, &blocks);
-        parts.iter().for_each(|part| gram.add(&part.0));
+        let columns: Vec<_> = (0..shapes).map(|l| l..l + 1).collect();
+        let gram = innovations(filter, at, &signals(setup, &added), &lanes, &columns, &blocks)?;
         let total = along.total_forces();
         let width = |group: &Group| {
             let weights = group.variable.motion().weights.iter();
@@ -120,17 +108,19 @@ impl<'h> Beside<'h> {
         if without.iter().any(|law| self.effects[*law].is_none()) {
             return None;
         }
-        let weight = 1.0 / self.inflation;
         let gram = self.without(without);
-        let lost = 0.5 * weight * (gram.remaining() - self.without(&[]).remaining());
         let gains = self.shapes.iter().enumerate().map(|(index, (width, group))| {
             let (gg, gr) = gram.projected(index);
-            group.evidence(&gg, &gr, weight, *width)
+            group.evidence(&gg, &gr, 1.0 / self.inflation, *width)
         });
         let shapes = log_sum(&gains.collect::<Vec<_>>()) - self.price;
-        let is_others = |a: usize| without.iter().all(|law| !self.h.own(*law).contains(&a));
-        let (others, all) =
-            (self.h.integral(self.inflation, is_others), self.h.integral(self.inflation, |_| true));
-        Some(shapes + others - all + without.len() as f64 * self.price - lost)
+        Some(shapes + self.laws(&gram, without) - self.laws(&self.without(&[]), &[]))
+    }
+
+    /// ln of the evidence of the laws that stay, up to what is the same for all of them.
+    fn laws(&self, gram: &Gram, without: &[usize]) -> f64 {
+        let stays = |a: usize| without.iter().all(|law| !self.h.own(*law).contains(&a));
+        self.h.integral(self.inflation, stays) + without.len() as f64 * self.price
+            - 0.5 * gram.remaining() / self.inflation
     }
 }
