@@ -108,3 +108,36 @@ fn a_faster_motion_than_the_fits_saw_is_simulated_in_finer_steps() {
     let back = fast.for_simulations_of(slow.data.clone(), &values, &fine);
     assert_eq!(back.method, fast.method);
 }
+
+/// Lorenz's convection, by the second.
+const LORENZ: &str = r#"
+name = "Convection"
+[inputs]
+f = { unit = "1/s" }
+[states]
+x = { unit = "1" }
+y = { unit = "1" }
+z = { unit = "1" }
+[parameters]
+a = { value = 1.0, unit = "1/s" }
+s = { value = 10.0 }
+r = { value = 28.0 }
+b = { value = 2.6666667 }
+[equations]
+flow = "x' = a*s*(y - x) + f"
+first = "y' = a*(x*(r - z) - y)"
+second = "z' = a*(x*y - b*z)"
+"#;
+
+/// Small errors grow by e each second whatever the step: the finest steps follow no further than coarser ones do.
+#[test]
+fn chaos_takes_no_finer_steps_than_bring_something() {
+    let model = Model::from_toml(LORENZ, "model.toml").unwrap();
+    let (n, dt) = (1500, 0.05);
+    let f = vec![0.0; n];
+    let y = measure_in(&model, &f, dt, &[1.0, 1.0, 25.0], 64);
+    let mut setup = setup(&model, &f, dt, &y);
+    let tolerance: Vec<f64> = setup.data.spread.iter().map(|s| 0.01 * s).collect();
+    setup.choose_method(&tolerance, n);
+    assert!(matches!(setup.method, Method::Dop853 { substeps: 1..=2 }), "{:?}", setup.method);
+}

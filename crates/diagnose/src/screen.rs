@@ -42,6 +42,15 @@ pub struct Variant {
     pub secant: Option<bool>,
 }
 
+impl Variant {
+    /// The inner parameters times a factor, as far as their bounds let them go.
+    fn scaled(&self, mechanism: &Mechanism, factor: f64) -> Vec<f64> {
+        let bounds =
+            mechanism.inner.iter().zip(&self.scales).map(|(i, s)| (i.low * s.abs(), i.high * s.abs()));
+        self.inner.iter().zip(bounds).map(|(v, (low, high))| (v * factor).max(low).min(high)).collect()
+    }
+}
+
 /// Share of a column's sum of squares that the model's own parameters must leave over: less is a parameter
 /// under another name, and its coefficient would be rounding.
 const INDEPENDENT: f64 = 3e-4;
@@ -1057,10 +1066,7 @@ pub fn screen_pairs(
             let mechanism = &library[candidates[variant.candidate].mechanism];
             let values = match variant.secant {
                 None => mechanism.values(c, &variant.inner),
-                Some(true) if c[0] < 3.0 => {
-                    let inner: Vec<f64> = variant.inner.iter().map(|v| v * c[0]).collect();
-                    mechanism.values(&[], &inner)
-                }
+                Some(true) if c[0] < 3.0 => mechanism.values(&[], &variant.scaled(mechanism, c[0])),
                 Some(_) => mechanism.values(&[], &variant.inner),
             }?;
             Some(Scored {
@@ -1123,12 +1129,10 @@ pub fn scored(library: &[Mechanism], candidates: &[Candidate], lanes: &Lanes, gr
             Some(scalable) => {
                 let c = regressed.coefficients[0];
                 if scalable {
-                    let fifth: Vec<f64> = variant.inner.iter().map(|v| 0.2 * v * c.min(1.0)).collect();
-                    faint = mechanism.values(&[], &fifth);
+                    faint = mechanism.values(&[], &variant.scaled(mechanism, 0.2 * c.min(1.0)));
                 }
                 if scalable && c < 3.0 {
-                    let inner: Vec<f64> = variant.inner.iter().map(|v| v * c).collect();
-                    (regressed.gain, mechanism.values(&[], &inner))
+                    (regressed.gain, mechanism.values(&[], &variant.scaled(mechanism, c)))
                 } else {
                     // Gain with the coefficient held at one: c(2 − 1/c) of the best.
                     let gain = if c > 0.0 { regressed.gain * (2.0 / c - 1.0 / (c * c)) } else { 0.0 };

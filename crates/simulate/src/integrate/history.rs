@@ -64,7 +64,7 @@ impl History {
         if n == 0 || s <= self.s[0] {
             return (self.value.first().copied().unwrap_or(0.0), 0.0, 0, 0.0);
         }
-        let i = self.s.partition_point(|&t| t <= s).min(n - 1).max(1) - 1;
+        let i = last_before(&self.s, s).min(n.max(2) - 2);
         if i + 1 >= n {
             return (self.value[n - 1], 0.0, n - 1, 0.0);
         }
@@ -107,6 +107,31 @@ impl History {
         let rate = map.apply(&self.rate, usize::from(!self.rate.is_empty()));
         History { lanes: map.apply(&self.lanes, self.s.len()), rate, ..self.clone() }
     }
+}
+
+/// Index of the last of some increasing instants that is no later than `s`; the first is. It is looked for where even steps
+/// as long as the last one would have it.
+fn last_before(instants: &[f64], s: f64) -> usize {
+    let n = instants.len();
+    if n < 2 {
+        return 0;
+    }
+    let (last, step) = (instants[n - 1], instants[n - 1] - instants[n - 2]);
+    let back = ((last - s) / step).max(0.0).min(n as f64) as usize;
+    let (mut low, mut high) = (n.saturating_sub(back + 2), n - back);
+    let mut reach = 1;
+    while low > 0 && instants[low] > s {
+        high = low;
+        low = low.saturating_sub(reach);
+        reach *= 2;
+    }
+    let mut reach = 1;
+    while high < n && instants[high] <= s {
+        low = high;
+        high = (high + reach).min(n);
+        reach *= 2;
+    }
+    (low + instants[low..high].partition_point(|&t| t <= s)).max(1) - 1
 }
 
 /// Where each lane of a stretch comes from among the lanes of the stretch before it.
@@ -251,3 +276,35 @@ pub fn has_history(system: &System) -> bool {
 /// Steps (samples for a measurement) within which the past of a delayed expression bends to a new
 /// start.
 pub(super) const BEND: usize = 8;
+
+#[cfg(test)]
+mod tests {
+    use super::last_before;
+
+    #[test]
+    fn an_instant_is_found_wherever_it_is_among_uneven_steps() {
+        let mut state = 7u64;
+        let mut uniform = || {
+            state = state.wrapping_mul(6_364_136_223_846_793_005).wrapping_add(1_442_695_040_888_963_407);
+            (state >> 11) as f64 / (1u64 << 53) as f64
+        };
+        for n in 1..60 {
+            let mut instants = vec![uniform()];
+            while instants.len() < n {
+                let step = if uniform() < 0.2 { 50.0 } else { 1.0 } * (1e-3 + uniform());
+                instants.push(instants[instants.len() - 1] + step);
+            }
+            let (first, last) = (instants[0], instants[n - 1]);
+            for _ in 0..200 {
+                let s = first + (last - first) * 1.2 * uniform();
+                let expected = instants.iter().filter(|t| **t <= s).count() - 1;
+                assert_eq!(last_before(&instants, s), expected, "{s} among {instants:?}");
+            }
+            for (i, s) in instants.iter().enumerate() {
+                assert_eq!(last_before(&instants, *s), i);
+            }
+        }
+        assert_eq!(last_before(&[0.0, 1.0], f64::NAN), 0);
+        assert_eq!(last_before(&[0.0, 1.0], f64::INFINITY), 1);
+    }
+}
