@@ -961,6 +961,24 @@ mass = "m*x'' + k*x = f"
         }
     }
 
+    /// The work may run out before a law has had its rivals.
+    #[test]
+    fn a_law_is_named_only_where_its_place_was_offered_to_all() {
+        let setup = mass(1.9, 1.0, 41);
+        let library = some_laws();
+        let search = Search::new(setup.clone(), &library, &crate::Quiet);
+        let (mut explorer, machine) = begun(&search, &setup);
+        let is_damped = |h: &Hypothesis| library[h.parts[0].candidate.mechanism].kind == "viscous_friction";
+        let damped = explorer.extensions(&machine).into_iter().find(is_damped).unwrap();
+        let without = explorer.keep(machine);
+        let row = explorer.keep(damped);
+        for offered in [false, true] {
+            explorer.extended[without] = offered;
+            let beliefs = explorer.conclude(row).unwrap().beliefs;
+            assert_eq!(beliefs.iter().map(|b| b.named).collect::<Vec<_>>(), [offered]);
+        }
+    }
+
     /// A law costs the logarithm of how many candidates there are, and that of how wide the prior of its strength is.
     #[test]
     fn what_could_have_been_otherwise_counts_against_a_law() {
