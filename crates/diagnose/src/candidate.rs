@@ -369,10 +369,10 @@ impl Candidate {
             .map(|(at, name)| {
                 let (lower, upper) = match mechanism.inner(name) {
                     Some((i, inner)) => {
-                        let scale = scales[i].abs().max(1e-300);
+                        let (low, high) = inner.bounds(scales[i].abs().max(1e-300));
                         // A positive parameter may run down to zero unless the file says otherwise.
                         let free_to_zero = positive(name) && inner.low <= 1e-3;
-                        (if free_to_zero { 0.0 } else { inner.low * scale }, inner.high * scale)
+                        (if free_to_zero { 0.0 } else { low }, high)
                     }
                     None => (if positive(name) { 0.0 } else { f64::NEG_INFINITY }, f64::INFINITY),
                 };

@@ -140,6 +140,13 @@ pub struct Inner {
     pub carrier: Option<Expr>,
 }
 
+impl Inner {
+    /// Smallest and largest admissible value, in the unit of its `scale`.
+    pub(crate) fn bounds(&self, scale: f64) -> (f64, f64) {
+        (self.low * scale, self.high * scale)
+    }
+}
+
 /// A state of a mechanism's own.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Memory {

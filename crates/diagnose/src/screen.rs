@@ -45,8 +45,7 @@ pub struct Variant {
 impl Variant {
     /// The inner parameters times a factor, as far as their bounds let them go.
     fn scaled(&self, mechanism: &Mechanism, factor: f64) -> Vec<f64> {
-        let bounds =
-            mechanism.inner.iter().zip(&self.scales).map(|(i, s)| (i.low * s.abs(), i.high * s.abs()));
+        let bounds = mechanism.inner.iter().zip(&self.scales).map(|(inner, scale)| inner.bounds(scale.abs()));
         self.inner.iter().zip(bounds).map(|(v, (low, high))| (v * factor).max(low).min(high)).collect()
     }
 }
@@ -579,7 +578,8 @@ fn grid(
     let proposed = mechanism.inner.iter().zip(scales).map(|(inner, scale)| {
         let variable = inner.spectral.as_ref();
         let proposed = variable.map(|v| spectra.propose(candidate, v, inner.carrier.as_ref()));
-        let admissible = |v: &f64| *v >= inner.low * scale && *v <= inner.high * scale;
+        let (low, high) = inner.bounds(*scale);
+        let admissible = |v: &f64| *v >= low && *v <= high;
         proposed.into_iter().flatten().filter(admissible).collect()
     });
     choices(mechanism, scales, proposed.collect())

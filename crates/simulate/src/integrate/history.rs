@@ -279,31 +279,34 @@ pub(super) const BEND: usize = 8;
 
 #[cfg(test)]
 mod tests {
+    use proptest::collection::vec;
+    use proptest::prelude::*;
+
     use super::last_before;
 
-    #[test]
-    fn an_instant_is_found_wherever_it_is_among_uneven_steps() {
-        let mut state = 7u64;
-        let mut uniform = || {
-            state = state.wrapping_mul(6_364_136_223_846_793_005).wrapping_add(1_442_695_040_888_963_407);
-            (state >> 11) as f64 / (1u64 << 53) as f64
-        };
-        for n in 1..60 {
-            let mut instants = vec![uniform()];
-            while instants.len() < n {
-                let step = if uniform() < 0.2 { 50.0 } else { 1.0 } * (1e-3 + uniform());
-                instants.push(instants[instants.len() - 1] + step);
-            }
-            let (first, last) = (instants[0], instants[n - 1]);
-            for _ in 0..200 {
-                let s = first + (last - first) * 1.2 * uniform();
-                let expected = instants.iter().filter(|t| **t <= s).count() - 1;
-                assert_eq!(last_before(&instants, s), expected, "{s} among {instants:?}");
-            }
+    proptest! {
+        #[test]
+        fn an_instant_is_found_wherever_it_is_among_uneven_steps(
+            steps in vec(prop_oneof![4 => 1e-3..1.0, 1 => 1.0..50.0], 0..60),
+            share in 0.0..1.2,
+        ) {
+            let mut instants = vec![0.3];
+            instants.extend(steps.iter().scan(0.3, |t, step| {
+                *t += step;
+                Some(*t)
+            }));
+            let last = instants[instants.len() - 1];
+            let s = 0.3 + (last - 0.3) * share;
+            let counted = instants.iter().filter(|t| **t <= s).count() - 1;
+            prop_assert_eq!(last_before(&instants, s), counted);
             for (i, s) in instants.iter().enumerate() {
-                assert_eq!(last_before(&instants, *s), i);
+                prop_assert_eq!(last_before(&instants, *s), i);
             }
         }
+    }
+
+    #[test]
+    fn what_is_no_number_is_at_the_first_instant_and_what_is_infinite_at_the_last() {
         assert_eq!(last_before(&[0.0, 1.0], f64::NAN), 0);
         assert_eq!(last_before(&[0.0, 1.0], f64::INFINITY), 1);
     }
