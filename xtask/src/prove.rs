@@ -6,20 +6,20 @@
 mod cases;
 mod concealed;
 mod identify;
+mod runs;
 pub(crate) mod sets;
 pub(crate) mod statistics;
 mod table;
 
 use std::path::{Path, PathBuf};
-use std::process::Command;
 use std::time::Duration;
 
 use anyhow::{Context, Result, bail};
-use greybox_report::Report;
 use serde_json::json;
 
 use crate::{Ending, process};
 use cases::Case;
+use runs::{Question, Runs};
 
 /// What `prove` takes.
 #[derive(Debug, clap::Args)]
@@ -152,16 +152,16 @@ pub(crate) fn run(root: &Path, arguments: &Arguments) -> Result<Ending> {
         }
     }
     let binary = process::build(root)?;
+    let mut runs = Runs::new(&binary, Duration::from_secs(arguments.timeout));
     let mut outcomes = Vec::new();
     for case in &cases {
         eprintln!("{} …", case.name);
         let out = process::target(root).join("prove").join(&case.name);
-        outcomes.push(measure(&binary, &folder, case, &out, Duration::from_secs(arguments.timeout))?);
+        outcomes.push(measure(&mut runs, &folder, case, &out)?);
     }
     if let Some(sets) = sets {
         let out = process::target(root).join("prove").join("sets");
-        let limit = Duration::from_secs(arguments.timeout);
-        let answers = sets::run(&sets, &folder, &binary, &out, only, limit)?;
+        let answers = sets::run(&sets, &folder, &mut runs, &out, only)?;
         println!("{}", sets::text(&answers));
         let totals = sets::totals(&answers);
         let figures = match &arguments.floors {
@@ -229,26 +229,14 @@ fn select(cases: Vec<Case>, only: Option<&str>) -> Result<Vec<Case>> {
 }
 
 /// Runs one case; a run that fails is a figure like any other.
-fn measure(binary: &Path, folder: &Path, case: &Case, out: &Path, limit: Duration) -> Result<Outcome> {
-    // A report of an earlier run must not be taken for this one's.
-    if out.exists() {
-        std::fs::remove_dir_all(out).with_context(|| format!("{} cannot be emptied", out.display()))?;
-    }
-    std::fs::create_dir_all(out).with_context(|| format!("{} cannot be made", out.display()))?;
-    let folder = folder.join(&case.folder);
-    let mut command = Command::new(binary);
-    command.arg("diagnose").arg(folder.join(&case.model));
-    command.args(case.train.iter().map(|f| folder.join(f)));
-    for file in &case.holdout {
-        command.arg("--holdout").arg(folder.join(file));
-    }
-    command.arg("--out").arg(out);
-    let run = process::run(&mut command, out, limit)?;
-    let mut figures = Vec::new();
-    match report_of(&run, out) {
-        Ok(report) => figures.extend((case.judge)(&report)),
-        Err(why) => figures.push(Figure::judged("run", why, "a report", false)),
-    }
+fn measure(runs: &mut Runs<'_>, folder: &Path, case: &Case, out: &Path) -> Result<Outcome> {
+    let question = Question::of(&folder.join(&case.folder), &case.model, &case.train, &case.holdout);
+    let answered = runs.ask(&question, out)?;
+    let mut figures = match &answered.report {
+        Ok(report) => (case.judge)(report),
+        Err(why) => vec![Figure::judged("run", why, "a report", false)],
+    };
+    let run = &answered.run;
     let time = format!("{:.1} s", run.seconds);
     figures.push(match case.seconds {
         Some(most) => Figure::judged("time", time, format!("< {most} s"), run.seconds < most),
@@ -259,21 +247,6 @@ fn measure(binary: &Path, folder: &Path, case: &Case, out: &Path, limit: Duratio
         figures.push(Figure::plain("peak memory", format!("{:.0} MiB", bytes as f64 / (1024.0 * 1024.0))));
     }
     Ok(Outcome { case: case.name.clone(), figures })
-}
-
-/// The report that a run left in `out`, or why there is none.
-fn report_of(run: &process::Measured, out: &Path) -> Result<Report, String> {
-    match run.status {
-        None => Err(format!("stopped after {:.0} s", run.seconds)),
-        Some(status) if !status.success() => {
-            let said = std::fs::read_to_string(out.join("stderr.txt")).unwrap_or_default();
-            let first = said.lines().find(|l| !l.trim().is_empty()).unwrap_or("no message").trim();
-            Err(format!("{status}: {first}"))
-        }
-        Some(_) => std::fs::read_to_string(out.join("report.json"))
-            .map_err(|e| format!("report.json: {e}"))
-            .and_then(|text| Report::from_json(&text).map_err(|e| e.to_string())),
-    }
 }
 
 fn to_json(outcomes: &[Outcome]) -> serde_json::Value {
@@ -318,7 +291,8 @@ mod tests {
         let case = cases::all().into_iter().find(|c| c.name == "ball_bowling_ball").unwrap();
         let out = place.path().join("out");
         let go = |binary: PathBuf| {
-            measure(&binary, Path::new("here"), &case, &out, Duration::from_secs(20)).unwrap().figures
+            let mut runs = Runs::new(&binary, Duration::from_secs(20));
+            measure(&mut runs, Path::new("here"), &case, &out).unwrap().figures
         };
         let report = cases::tests::report("consistent", &[], "z");
         std::fs::write(place.path().join("r.json"), report.to_json().unwrap()).unwrap();

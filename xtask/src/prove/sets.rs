@@ -3,9 +3,7 @@
 //!
 //! `reachable.json` beside the recordings tells what is reachable and which names are right. Only this scorer reads it.
 
-use std::path::{Path, PathBuf};
-use std::process::Command;
-use std::time::Duration;
+use std::path::Path;
 
 use anyhow::{Context, Result, bail};
 use greybox_report::Report;
@@ -13,7 +11,7 @@ use greybox_report::contract::{Criterion, Mechanism, Ordered, Score, Verdict};
 use serde::{Deserialize, Serialize};
 
 use super::Figure;
-use crate::process;
+use super::runs::{Question, Runs};
 
 /// The file beside the recordings.
 pub(crate) const FILE: &str = "reachable.json";
@@ -157,31 +155,19 @@ pub(crate) fn floors(path: &Path) -> Result<Floors> {
 pub(crate) fn run(
     sets: &Sets,
     folder: &Path,
-    binary: &Path,
+    runs: &mut Runs<'_>,
     out: &Path,
     only: Option<&str>,
-    limit: Duration,
 ) -> Result<Vec<Answer>> {
     let wanted = sets.sets.iter().filter(|s| only.is_none_or(|w| s.name().contains(w)));
-    wanted.map(|set| one(set, folder, binary, &out.join(set.name().replace('/', "-")), limit)).collect()
+    wanted.map(|set| one(set, folder, runs, &out.join(set.name().replace('/', "-")))).collect()
 }
 
-fn one(set: &Set, folder: &Path, binary: &Path, out: &Path, limit: Duration) -> Result<Answer> {
+fn one(set: &Set, folder: &Path, runs: &mut Runs<'_>, out: &Path) -> Result<Answer> {
     eprintln!("{} …", set.name());
-    if out.exists() {
-        std::fs::remove_dir_all(out).with_context(|| format!("{} cannot be emptied", out.display()))?;
-    }
-    std::fs::create_dir_all(out).with_context(|| format!("{} cannot be made", out.display()))?;
-    let at = |file: &String| -> PathBuf { folder.join(&set.set).join(file) };
-    let mut command = Command::new(binary);
-    command.arg("diagnose").arg(at(&set.model)).args(set.train.iter().map(at));
-    for file in &set.holdout {
-        command.arg("--holdout").arg(at(file));
-    }
-    command.arg("--out").arg(out);
-    let run = process::run(&mut command, out, limit)?;
-    let report = super::report_of(&run, out);
-    Ok(judge(set, report, run.seconds))
+    let question = Question::of(&folder.join(&set.set), &set.model, &set.train, &set.holdout);
+    let answered = runs.ask(&question, out)?;
+    Ok(judge(set, answered.report.as_ref(), answered.run.seconds))
 }
 
 /// The error of the worst channel by the report's criterion: infinite where a simulation diverges.
@@ -197,7 +183,7 @@ fn error(score: &Score, criterion: Criterion) -> f64 {
     if value.is_nan() { f64::INFINITY } else { value }
 }
 
-fn judge(set: &Set, report: Result<Report, String>, seconds: f64) -> Answer {
+fn judge(set: &Set, report: Result<&Report, &String>, seconds: f64) -> Answer {
     let kinds = |list: &[Mechanism]| list.iter().map(|m| m.kind.clone()).collect::<Vec<_>>();
     let report = match report {
         Ok(report) => report,
@@ -216,7 +202,7 @@ fn judge(set: &Set, report: Result<Report, String>, seconds: f64) -> Answer {
                 right: false,
                 harm: vec![Harm::Fails],
                 seconds,
-                why: Some(why),
+                why: Some(why.clone()),
             };
         }
     };
@@ -446,6 +432,10 @@ mod tests {
 
     fn score(nrmse: f64) -> Score {
         Score { nrmse, rmse: None, nrmse_windowed: Some(nrmse), rmse_windowed: None }
+    }
+
+    fn judge(set: &Set, report: Result<Report, String>, seconds: f64) -> Answer {
+        super::judge(set, report.as_ref(), seconds)
     }
 
     #[test]

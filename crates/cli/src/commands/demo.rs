@@ -18,7 +18,7 @@ const HOLDOUT: &[u8] = include_bytes!("../../demo/rotary_link_test.csv");
 /// What the embedded files are.
 const ABOUT: &str = include_str!("../../demo/about.txt");
 
-/// Diagnose an embedded recording: the whole story in under a minute
+/// Diagnose an embedded recording: the whole story in about two minutes
 #[derive(Debug, Args)]
 #[command(after_help = "Examples:
   greybox demo
