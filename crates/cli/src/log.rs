@@ -56,6 +56,11 @@ impl Log {
         stages.end();
         stages.running = Some((sort(what), Instant::now(), ProcessTime::now()));
     }
+
+    /// Something came out while a stage is running.
+    pub(crate) fn fact(&self, what: &str) {
+        tell(&format!("{:9.2} s    {what}\n", self.start.elapsed().as_secs_f64()));
+    }
 }
 
 impl Drop for Log {

@@ -6,7 +6,7 @@ use std::thread::JoinHandle;
 use std::time::Duration;
 
 use greybox_commands::{diagnose, identify};
-use greybox_diagnose::{Observer, Stage};
+use greybox_diagnose::{Observer, Stage, Weighed};
 use indicatif::{ProgressBar, ProgressDrawTarget, ProgressStyle};
 
 use crate::log::{self, Log};
@@ -73,6 +73,12 @@ impl Progress {
 impl Observer for Progress {
     fn stage(&self, stage: Stage) {
         Progress::stage(self, diagnose::told(stage));
+    }
+
+    fn weighed(&self, weighed: &Weighed<'_>) {
+        if let Some(log) = &self.log {
+            log.fact(&diagnose::told_weighed(weighed));
+        }
     }
 }
 

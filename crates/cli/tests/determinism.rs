@@ -61,6 +61,25 @@ fn diagnose() {
     the_same_whatever_the_threads(&bench(), &request, &files);
 }
 
+/// The log says how every law was weighed; what it asks for costs the search nothing.
+#[test]
+fn what_is_told_changes_nothing() {
+    let bench = bench();
+    let told = |out: &str, log: &[&str]| {
+        let request = ["diagnose", "model.toml", "run1.csv", "run2.csv", "--out", out];
+        let outcome = bench.greybox(&[&request, log].concat());
+        assert_eq!(outcome.code, 0, "{}", outcome.stderr);
+        outcome.stderr
+    };
+    assert_eq!(told("silent", &[]), "");
+    let log = told("told", &["--log"]);
+    let weighed = log.lines().find(|line| line.contains("viscous_friction: score ")).unwrap();
+    assert!(weighed.contains(", robust ") && weighed.ends_with(": accepted"), "{log}");
+    for file in ["improved.toml", "report.json"] {
+        assert_eq!(bench.read(&format!("silent/{file}")), bench.read(&format!("told/{file}")), "{file}");
+    }
+}
+
 #[test]
 fn calibrate() {
     let request = ["calibrate", "model.toml", "run1.csv", "run2.csv", "--out"];

@@ -1,6 +1,6 @@
 //! A diagnosis as files and words.
 
-use greybox_diagnose::{Diagnosis, Stage};
+use greybox_diagnose::{Diagnosis, Stage, Weighed};
 use greybox_recording::Recording;
 use greybox_report::ReportError;
 use greybox_report::convert::{self, Sources};
@@ -79,4 +79,16 @@ pub fn told(stage: Stage) -> String {
         Stage::Whitening => "searching again with coloured noise modelled".to_owned(),
         Stage::Simulating => "simulating whole recordings".to_owned(),
     }
+}
+
+/// What was weighed in words: by what decides, and by what is to take its place.
+pub fn told_weighed(weighed: &Weighed<'_>) -> String {
+    format!(
+        "{}: score {:.1}, robust {:.1}, least {:.1}: {}",
+        weighed.kinds.join(" and "),
+        weighed.evidence.score,
+        (weighed.robust)(),
+        weighed.threshold,
+        if weighed.believed { "accepted" } else { "not believed" }
+    )
 }

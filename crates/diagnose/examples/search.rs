@@ -4,15 +4,21 @@
 use std::sync::Arc;
 
 use greybox_calibrate::{Data, Setup, free_parameters};
-use greybox_diagnose::{Observer, Stage, evidence::Evidence, library, search};
+use greybox_diagnose::{Observer, Stage, Weighed, evidence::Evidence, library, search};
 
 struct Talk(std::time::Instant, Arc<greybox_calibrate::Work>);
 impl Observer for Talk {
     fn stage(&self, stage: Stage) {
         println!("{:7.2} {:7.2} G {stage:?}", self.0.elapsed().as_secs_f64(), self.1.done() as f64 / 1e9);
     }
-    fn weighed(&self, kind: &str, e: &Evidence, share: f64) {
-        println!("{:7.2}   best {kind}: {e:?} share {share:.2e}", self.0.elapsed().as_secs_f64());
+    fn weighed(&self, w: &Weighed<'_>) {
+        let seconds = self.0.elapsed().as_secs_f64();
+        println!(
+            "{seconds:7.2}   best {}: {:?} robust {:.1}",
+            w.kinds.join(" and "),
+            w.evidence,
+            (w.robust)()
+        );
     }
     fn tried(&self, kind: &str, expression: &str, e: &Evidence) {
         println!(

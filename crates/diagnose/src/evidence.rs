@@ -10,10 +10,25 @@
 //!
 //! Consistency is judged on ten folds of contiguous blocks: leaving fold k out moves the parameters, to
 //! first order, by δ = −(H − H_k)⁻¹ s_k; what that does to fold k's own residual is its held-out error.
+//!
+//! Beside it, and deciding nothing yet, stands one quantity that could take the place of the score's κ and of all conditions on
+//! folds. It asks for the strength θ of the law itself: with its covariance S as its interval has it
+//! ([`Uncertainty`](crate::uncertainty)) and S₀ in white noise,
+//!
+//! ```text
+//! c = tr(S₀⁻¹ S) / dim θ,  at least 1          (Godambe, Ann. Math. Stat. 31, 1960)
+//! robust = (ν + 1) ln(1 + Σ n_c ln(RSS_old/RSS_new) / (c ν)) − price(k, n/c) − 2·surcharge
+//! ```
+//!
+//! the ratio of likelihoods adjusted by c (Chandler and Bate, Biometrika 94, 2007). S is that of stationary noise
+//! (ν = ∞: the first term is the sum over c), or of the scores of some forty blocks of samples where that is larger; then
+//! c is known with ν degrees of freedom, and the ratio is Student's. A law that is right only here and there, or whose gain
+//! a slow misfit makes, has a large c, however large the gain.
 
 use greybox_calibrate::{Level, Point, Setup, qr};
 
 use crate::screen::project;
+use crate::uncertainty::Inflation;
 
 /// Number of folds.
 pub const FOLDS: usize = 10;
@@ -180,11 +195,9 @@ pub fn folds(setup: &Setup, level: &Level, scale: &[f64], point: &Point) -> Fold
 }
 
 /// What a comparison knows of each of the two models.
-pub struct Side<'a> {
+pub struct Side {
     /// Residual sum of squares per channel (innovations, where the residual is whitened).
-    pub rss: &'a [f64],
-    /// Held-out errors.
-    pub folds: &'a Folds,
+    pub rss: Vec<f64>,
     /// Parameters beyond the nominal ones.
     pub parameters: f64,
     /// Surcharges of its mechanisms.
@@ -207,27 +220,53 @@ pub fn fall(from: &[f64], to: &[f64]) -> (f64, f64) {
     (sum, mean / (variance / k).sqrt().max(1e-300))
 }
 
-/// Weighs the richer model (`new`) against the simpler (`old`), both fitted with the same scale.
-pub fn weigh(old: &Side<'_>, new: &Side<'_>, count: &[usize], kappa: &[f64], whitened: bool) -> Evidence {
-    let effective: f64 = count.iter().zip(kappa).map(|(n, k)| *n as f64 * k).sum();
-    let mut gain = -2.0 * (new.surcharge - old.surcharge);
+/// Σ n_c w_c ln(RSS_old/RSS_new) over the channels, and Σ n_c w_c.
+fn gain(old: &Side, new: &Side, count: &[usize], weight: impl Fn(usize) -> f64) -> (f64, f64) {
+    let (mut gain, mut information) = (0.0, 0.0);
     for c in 0..count.len() {
+        let n = count[c] as f64 * weight(c);
+        information += n;
         if new.rss[c] > 0.0 && old.rss[c] > 0.0 {
-            gain += count[c] as f64 * kappa[c] * (old.rss[c] / new.rss[c]).ln();
+            gain += n * (old.rss[c] / new.rss[c]).ln();
         }
     }
+    (gain, information)
+}
+
+/// `robust` of the richer model (`new`) over the simpler (`old`), both fitted with the same scale; `inflation` is that of what
+/// `new` has beyond `old`.
+pub fn robust(old: &Side, new: &Side, count: &[usize], inflation: Inflation) -> f64 {
+    let (gain, information) = gain(old, new, count, |_| 1.0 / inflation.factor);
+    let freedom = inflation.freedom;
+    let told =
+        if freedom.is_finite() && gain > 0.0 { (freedom + 1.0) * (gain / freedom).ln_1p() } else { gain };
+    let dearer = price(new.parameters, information) - price(old.parameters, information);
+    told - dearer - 2.0 * (new.surcharge - old.surcharge)
+}
+
+/// Weighs the richer model (`new`) against the simpler (`old`), both fitted with the same scale, by what the samples tell and
+/// by the errors of either on folds.
+pub fn weigh(
+    (old, old_folds): (&Side, &Folds),
+    (new, new_folds): (&Side, &Folds),
+    count: &[usize],
+    kappa: &[f64],
+    whitened: bool,
+) -> Evidence {
+    let (gain, effective) = gain(old, new, count, |c| kappa[c]);
+    let gain = gain - 2.0 * (new.surcharge - old.surcharge);
     let (before, after): (f64, f64) = (old.rss.iter().sum(), new.rss.iter().sum());
-    let (fallen, t) = fall(&old.folds.sse, &new.folds.sse);
-    let better = old.folds.sse.iter().zip(&new.folds.sse).filter(|(a, b)| *a - *b > 0.0).count();
-    let changes = || old.folds.blocks.iter().zip(&new.folds.blocks).map(|(a, b)| a - b);
+    let (fallen, t) = fall(&old_folds.sse, &new_folds.sse);
+    let better = old_folds.sse.iter().zip(&new_folds.sse).filter(|(a, b)| *a - *b > 0.0).count();
+    let changes = || old_folds.blocks.iter().zip(&new_folds.blocks).map(|(a, b)| a - b);
     let all: f64 = changes().map(f64::abs).sum();
     Evidence {
         score: gain + price(old.parameters, effective) - price(new.parameters, effective),
         akaike: gain + 2.0 * (old.parameters - new.parameters),
         drop: 1.0 - after / before.max(1e-300),
-        held_out: fallen / old.folds.sse.iter().sum::<f64>().max(1e-300),
+        held_out: fallen / old_folds.sse.iter().sum::<f64>().max(1e-300),
         t,
-        improving: better as f64 / old.folds.sse.len().max(1) as f64,
+        improving: better as f64 / old_folds.sse.len().max(1) as f64,
         kappa: kappa.iter().copied().fold(1.0, f64::min),
         focus: changes().map(|d| d.max(0.0)).sum::<f64>() / all.max(1e-300),
         whitened,
@@ -236,20 +275,48 @@ pub fn weigh(old: &Side<'_>, new: &Side<'_>, count: &[usize], kappa: &[f64], whi
 
 #[cfg(test)]
 mod tests {
-    use super::{Folds, Side, price, weigh};
+    use super::{Folds, Inflation, Side, price, robust, weigh};
+
+    fn side(rss: f64, parameters: f64) -> Side {
+        Side { rss: vec![rss], parameters, surcharge: 0.0 }
+    }
 
     #[test]
     fn the_criteria_differ_by_their_price_alone() {
         let n = 1000;
         let folds = |rss: f64| Folds { sse: vec![rss / 10.0; 10], blocks: vec![rss / 20.0; 20] };
         let (simple, rich) = (folds(1010.0), folds(1000.0));
-        let side = |folds, rss, parameters| Side { rss, folds, parameters, surcharge: 0.0 };
-        let e = weigh(&side(&simple, &[1010.0], 1.0), &side(&rich, &[1000.0], 3.0), &[n], &[1.0], false);
+        let e = weigh((&side(1010.0, 1.0), &simple), (&side(1000.0, 3.0), &rich), &[n], &[1.0], false);
         let gain = 1000.0 * 1.01_f64.ln();
         assert!((e.akaike - (gain - 4.0)).abs() < 1e-9, "{}", e.akaike);
         assert!((e.score - (gain - price(3.0, 1000.0) + price(1.0, 1000.0))).abs() < 1e-9, "{}", e.score);
         // Two parameters for a gain of ten: BIC refuses what Akaike accepts.
         assert!(e.score < 0.0 && e.akaike > 0.0);
+    }
+
+    /// The same gain: from white noise, and where the strength is known twenty times less.
+    #[test]
+    fn what_a_slow_misfit_makes_is_worth_less() {
+        let of = |factor, freedom| {
+            robust(&side(1200.0, 0.0), &side(1000.0, 1.0), &[1000], Inflation { factor, freedom })
+        };
+        let gain = 1000.0 * 1.2_f64.ln();
+        let student = |gain: f64, n: f64| 40.0 * (1.0 + gain / 39.0).ln() - price(1.0, n);
+        assert!((of(1.0, 39.0) - student(gain, 1000.0)).abs() < 1e-9);
+        let slow = of(20.0, 39.0);
+        assert!((slow - student(gain / 20.0, 50.0)).abs() < 1e-9 && slow < 6.0, "{slow}");
+        // Of much freedom, Student's ratio is that of a normal.
+        let [many, all] = [1e7, f64::INFINITY].map(|freedom| of(1.0, freedom));
+        assert!(
+            (all - (gain - price(1.0, 1000.0))).abs() < 1e-9 && (many - all).abs() < 0.01,
+            "{many} {all}"
+        );
+        // What is worse is no better for it, and a surcharge is paid.
+        let plain = Inflation { factor: 1.0, freedom: 39.0 };
+        let worse = robust(&side(1000.0, 0.0), &side(1100.0, 1.0), &[1000], plain);
+        assert!(worse < -90.0, "{worse}");
+        let dear = Side { surcharge: 3.0, ..side(1000.0, 1.0) };
+        assert!((of(1.0, 39.0) - robust(&side(1200.0, 0.0), &dear, &[1000], plain) - 6.0).abs() < 1e-9);
     }
 
     #[test]

@@ -61,6 +61,20 @@ pub enum Stage {
     Simulating,
 }
 
+/// What was weighed, and how.
+pub struct Weighed<'a> {
+    /// The laws that were not there before.
+    pub kinds: &'a [&'a str],
+    /// What decides.
+    pub evidence: &'a evidence::Evidence,
+    /// What [`evidence::robust`] makes of it, computed when asked for.
+    pub robust: &'a dyn Fn() -> f64,
+    /// What either must exceed.
+    pub threshold: f64,
+    /// Whether it is believed.
+    pub believed: bool,
+}
+
 /// Watches a diagnosis. It never steers it, but may end it: by giving the work up, and by unwinding.
 pub trait Observer: Sync {
     /// The work begins; it may be [given up](Work::give_up), after which it ends soon.
@@ -69,8 +83,8 @@ pub trait Observer: Sync {
     fn stage(&self, _stage: Stage) {}
     /// A candidate of a round was fitted.
     fn tried(&self, _kind: &str, _expression: &str, _evidence: &evidence::Evidence) {}
-    /// The best candidate of a round was weighed.
-    fn weighed(&self, _kind: &str, _evidence: &evidence::Evidence, _share: f64) {}
+    /// The best of a round, one candidate or two, was weighed.
+    fn weighed(&self, _weighed: &Weighed<'_>) {}
     /// The score test's ranking: kind and share of the residual that it may explain.
     fn screened(&self, _ranking: &[(&str, f64)]) {}
     /// A mechanism no longer pays and was dropped.

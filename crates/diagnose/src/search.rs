@@ -4,14 +4,14 @@
 use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, Ordering};
 
-use greybox_calibrate::{Ending, Fit, Free, Level, Limits, Point, Setup, free_parameters};
+use greybox_calibrate::{Ending, Fit, Free, Level, Limits, Point, Setup, Work, free_parameters};
 use greybox_model::system::CompileError;
 use greybox_model::{Hold, Model};
 use rayon::prelude::*;
 
 use crate::along::Along;
 use crate::candidate::{Candidate, Instance, candidates};
-use crate::evidence::{Evidence, Side, folds, kappa, least_kappa, weigh};
+use crate::evidence::{Evidence, Side, folds, kappa, least_kappa, robust, weigh};
 use crate::explore::{Belief, Explorer, Hypothesis, Posterior};
 use crate::library::Mechanism;
 use crate::place::{Place, places};
@@ -19,7 +19,7 @@ use crate::screen::{Pair, Scored, first_states, first_values, inner_scales, scre
 use crate::temperature::AnyScale;
 use crate::uncertainty::Uncertainty;
 use crate::validate::{Gain, errors};
-use crate::{Observer, Stage};
+use crate::{Observer, Stage, Weighed};
 
 /// Number of segments of the first and last level, where nothing else decides.
 const SEGMENTS: (usize, usize) = (60, 4);
@@ -517,18 +517,18 @@ impl<'a> Search<'a> {
         let control = self.control(&current, &best, &scale);
         let evidence = self.weigh(&control, &best, &scale);
         let share = (control.rss() - best.rss()) / calibrated_rss(calibrated, &scale).max(1e-300);
-        let (n, first) = (self.all.len() as f64, current.parts.is_empty());
+        let first = current.parts.is_empty();
         let members = &best.parts[best.parts.len() - 2..];
-        for part in members {
-            self.observer.weighed(&self.library[part.candidate.mechanism].kind, &evidence, share);
-        }
+        let kinds: Vec<&str> =
+            members.iter().map(|part| &*self.library[part.candidate.mechanism].kind).collect();
         // There are n²/2 pairs to choose from; of few samples, one of them always fits.
         let samples: usize = state.current.fit.count.iter().sum();
         let believable = samples >= PAIR_SAMPLES
-            && evidence.score > 4.0 * n.max(2.0).ln() + 6.0
+            && evidence.score > self.threshold(2)
             && members.iter().all(|part| {
                 self.believable(&evidence, &self.library[part.candidate.mechanism], share, first, false)
             });
+        self.tell((&control, &best), &kinds, &evidence, &scale, believable);
         if !believable {
             return false;
         }
@@ -719,30 +719,69 @@ impl<'a> Search<'a> {
     /// The evidence for `new` over `old`; where residuals are whitened, by the profile likelihood: each
     /// model with the noise model that suits its own residual.
     fn weigh_with(&self, old: &Fitted, new: &Fitted, scale: &[f64], kappa: &[f64]) -> Evidence {
-        let price = |f: &Fitted| -> (f64, f64) {
-            f.parts.iter().fold((0.0, 0.0), |(p, s), part| {
-                let m = &self.library[part.candidate.mechanism];
-                (p + m.parameters().count() as f64, s + m.surcharge)
-            })
-        };
-        let whitened = new.setup.noise.is_some();
-        let rss = |f: &Fitted| if whitened { innovations(f, scale) } else { f.fit.rss.clone() };
+        let (before, after) = (self.side(old, new, scale), self.side(new, new, scale));
         let folds = |f: &Fitted| folds(&f.setup, &f.level, scale, &f.fit.point);
-        let ((p0, s0), (p1, s1)) = (price(old), price(new));
-        let (old_rss, new_rss) = (rss(old), rss(new));
-        let (old_folds, new_folds) = (folds(old), folds(new));
-        weigh(
-            &Side { rss: &old_rss, folds: &old_folds, parameters: p0, surcharge: s0 },
-            &Side { rss: &new_rss, folds: &new_folds, parameters: p1, surcharge: s1 },
-            &new.fit.count,
-            kappa,
-            whitened,
-        )
+        let whitened = new.setup.noise.is_some();
+        weigh((&before, &folds(old)), (&after, &folds(new)), &new.fit.count, kappa, whitened)
+    }
+
+    /// What a comparison that ends at `new` knows of a model.
+    fn side(&self, of: &Fitted, new: &Fitted, scale: &[f64]) -> Side {
+        let rss = if new.setup.noise.is_some() { innovations(of, scale) } else { of.fit.rss.clone() };
+        let mechanisms = || of.parts.iter().map(|part| &self.library[part.candidate.mechanism]);
+        let parameters = mechanisms().map(|m| m.parameters().count() as f64).sum();
+        Side { rss, parameters, surcharge: mechanisms().map(|m| m.surcharge).sum() }
+    }
+
+    /// What is known of the strengths that `new` has and `old` has not ([`robust`]).
+    fn robust(&self, old: &Fitted, new: &Fitted, scale: &[f64]) -> f64 {
+        // Whoever listens changes nothing: what it costs is not counted.
+        let work = Arc::new(Work::of_fits_within(u64::MAX));
+        let uncounted =
+            |f: &Fitted| Fitted { setup: Setup { work: work.clone(), ..f.setup.clone() }, ..f.clone() };
+        let (old, new) = (uncounted(old), uncounted(new));
+        let inflation = Uncertainty::of(&new, scale).inflation(&self.tested(&old, &new));
+        robust(&self.side(&old, &new, scale), &self.side(&new, &new, scale), &new.fit.count, inflation)
+    }
+
+    /// Positions, among what is free in `new`, of what stands for the laws that `old` lacks: their strengths, or all
+    /// parameters of a law that has none.
+    fn tested(&self, old: &Fitted, new: &Fitted) -> Vec<usize> {
+        let is_new = |part: &&Part| !old.parts.iter().any(|o| o.candidate == part.candidate);
+        let names = new.parts.iter().filter(is_new).flat_map(|part| {
+            let strengths = self.library[part.candidate.mechanism].linear.len();
+            let names = &part.instance.names;
+            if strengths > 0 { &names[..strengths.min(names.len())] } else { &names[..] }
+        });
+        let position = |name: &String| {
+            let index = new.setup.model.parameter(name)?;
+            new.setup.free.iter().position(|f| f.index == index)
+        };
+        names.filter_map(position).collect()
+    }
+
+    /// What evidence must exceed for so many laws, each one of all candidates.
+    fn threshold(&self, laws: usize) -> f64 {
+        2.0 * laws as f64 * (self.all.len().max(1) as f64).ln() + 6.0
+    }
+
+    /// Tells what was weighed against what.
+    fn tell(
+        &self,
+        (old, new): (&Fitted, &Fitted),
+        kinds: &[&str],
+        evidence: &Evidence,
+        scale: &[f64],
+        believed: bool,
+    ) {
+        let robust = || self.robust(old, new, scale);
+        let threshold = self.threshold(kinds.len());
+        self.observer.weighed(&Weighed { kinds, evidence, robust: &robust, threshold, believed });
     }
 
     /// Whether the improvement is to be believed.
     fn believable(&self, e: &Evidence, mechanism: &Mechanism, share: f64, first: bool, loose: bool) -> bool {
-        let threshold = 2.0 * (self.all.len().max(1) as f64).ln() + 6.0;
+        let threshold = self.threshold(1);
         // An effect that acts rarely is seen in few folds: it must pay much where it acts and cost nothing
         // elsewhere, and the baseline must have shown a misfit while its segments were short.
         // (Where the residual is white, the likelihood can be taken at its word.)
@@ -1353,8 +1392,10 @@ impl<'a> Search<'a> {
         let share =
             if evidence.whitened { 1.0 } else { (state.current.rss() - chosen.rss()) / total.max(1e-300) };
         let mechanism = &self.library[winner.mechanism];
-        self.observer.weighed(&mechanism.kind, &evidence, share);
-        if !self.believable(&evidence, mechanism, share, state.current.parts.is_empty(), state.loose) {
+        let believable =
+            self.believable(&evidence, mechanism, share, state.current.parts.is_empty(), state.loose);
+        self.tell((&state.current, &chosen), &[&mechanism.kind], &evidence, &scale, believable);
+        if !believable {
             state.rejected = vec![chosen];
             return false;
         }
@@ -1655,11 +1696,11 @@ impl<'a> Search<'a> {
                 continue;
             }
             let mechanism = &self.library[winner.mechanism];
-            self.observer.weighed(&mechanism.kind, &evidence, 1.0);
             // On few data, what was found on short segments is not traded for a whim of the long ones.
-            if state.current.fit.count.iter().sum::<usize>() < PAIR_SAMPLES
-                || !self.believable(&evidence, mechanism, 1.0, base.parts.is_empty(), state.loose)
-            {
+            let believable = state.current.fit.count.iter().sum::<usize>() >= PAIR_SAMPLES
+                && self.believable(&evidence, mechanism, 1.0, base.parts.is_empty(), state.loose);
+            self.tell((&base, &chosen), &[&mechanism.kind], &evidence, &state.scale, believable);
+            if !believable {
                 continue;
             }
             state.accepted.retain(|a| a.candidate != part.candidate);

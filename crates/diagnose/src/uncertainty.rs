@@ -10,6 +10,9 @@
 //!   48, 1980, over blocks), right for misfits that depend on the motion too, but with the scatter of 40 numbers.
 //!
 //! The first counts, unless the second says more than that scatter explains.
+//!
+//! By how much either exceeds the covariance in white noise is what a ratio of likelihoods is adjusted by
+//! ([`Uncertainty::inflation`]).
 
 use greybox_calibrate::noise_model::MOST;
 use greybox_calibrate::{Autoregression, qr, student_quantile};
@@ -28,10 +31,21 @@ const CHANCE: f64 = 0.1;
 pub(crate) struct Uncertainty {
     /// Number of free parameters.
     np: usize,
+    /// In white noise.
+    white: Vec<f64>,
     stationary: Estimated,
     blocks: Estimated,
     /// Ratio of the second variance to the first from which the second counts.
     surplus: f64,
+}
+
+/// By how much white noise overstates what the samples tell of some parameters.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct Inflation {
+    /// Mean eigenvalue of their covariance over that in white noise, at least 1.
+    pub factor: f64,
+    /// Degrees of freedom that it is known with: infinite in stationary noise, whose model has few parameters.
+    pub freedom: f64,
 }
 
 /// A covariance and the degrees of freedom that it was estimated with.
@@ -68,7 +82,8 @@ impl Uncertainty {
         let priors: Vec<f64> = setup.free.iter().map(|f| f.prior.precision(at[f.index])).collect();
         priors.iter().enumerate().for_each(|(i, prior)| h[i * np + i] += prior);
         let inverse = inverse(&h, np);
-        let (meat, freedom) = stationary(fitted, &segments, &priors);
+        let Stationary { coloured: meat, white, freedom } = stationary(fitted, &segments, &priors);
+        let white = between(&inverse, &white, np);
         let stationary = Estimated { covariance: between(&inverse, &meat, np), freedom };
         let scores = block_scores(fitted, &segments);
         let count = scores.len() as f64;
@@ -84,7 +99,33 @@ impl Uncertainty {
         let blocks = Estimated { covariance: between(&inverse, &meat, np), freedom };
         let surplus =
             ChiSquared::new(freedom).map_or(1.0, |chi| chi.inverse_cdf(1.0 - CHANCE) / freedom).max(1.0);
-        Uncertainty { np, stationary, blocks, surplus }
+        Uncertainty { np, white, stationary, blocks, surplus }
+    }
+
+    /// tr(S₀⁻¹ S)/dim θ of the parameters θ at these positions among those that are free, with their covariance S and the
+    /// one in white noise, S₀.
+    pub(crate) fn inflation(&self, tested: &[usize]) -> Inflation {
+        let ratio = |covariance: &[f64]| {
+            let t = tested.len();
+            let of = |all: &[f64], a: usize, b: usize| all[tested[a] * self.np + tested[b]];
+            let d: Vec<f64> = (0..t).map(|a| of(&self.white, a, a).max(1e-300).sqrt()).collect();
+            let scaled = |all: &[f64]| -> Vec<f64> {
+                (0..t * t).map(|i| of(all, i / t, i % t) / (d[i / t] * d[i % t])).collect()
+            };
+            let (white, own) = (scaled(&self.white), scaled(covariance));
+            let trace: f64 = (0..t).map(|a| qr::solve_spd(&white, t, &own[a * t..(a + 1) * t])[a]).sum();
+            trace / t as f64
+        };
+        if tested.is_empty() {
+            return Inflation { factor: 1.0, freedom: f64::INFINITY };
+        }
+        let (stationary, blocks) = (ratio(&self.stationary.covariance), ratio(&self.blocks.covariance));
+        let (factor, freedom) = if blocks > self.surplus * stationary {
+            (blocks, self.blocks.freedom)
+        } else {
+            (stationary, f64::INFINITY)
+        };
+        Inflation { factor: if factor.is_finite() { factor.max(1.0) } else { 1.0 }, freedom }
     }
 
     /// Half width of the 95 % interval of a figure with this gradient in the free parameters.
@@ -147,10 +188,18 @@ fn between(inverse: &[Vec<f64>], meat: &[f64], np: usize) -> Vec<f64> {
     (0..np * np).map(|i| qr::dot(&half[i / np], &inverse[i % np])).collect()
 }
 
-/// Covariance of the scores in stationary noise, and how many independent samples it was estimated with.
-fn stationary(fitted: &Fitted, segments: &[Projected], priors: &[f64]) -> (Vec<f64>, f64) {
+/// Covariances of the scores in stationary noise.
+struct Stationary {
+    coloured: Vec<f64>,
+    /// In white noise of the same variance.
+    white: Vec<f64>,
+    /// How many independent samples they were estimated with, less the parameters.
+    freedom: f64,
+}
+
+fn stationary(fitted: &Fitted, segments: &[Projected], priors: &[f64]) -> Stationary {
     let (ny, np) = (fitted.setup.system.ny, priors.len());
-    let mut meat = vec![0.0; np * np];
+    let (mut meat, mut white) = (vec![0.0; np * np], vec![0.0; np * np]);
     let ranges = |c: usize| {
         segments.iter().zip(&fitted.level.segments).map(move |(p, s)| {
             let n = s.range.len();
@@ -179,6 +228,9 @@ fn stationary(fitted: &Fitted, segments: &[Projected], priors: &[f64]) -> (Vec<f
             };
             let columns: Vec<Vec<f64>> = (0..np).map(coloured).collect();
             add_gram(&mut meat, &columns, inflate * noise.variance());
+            let plain: Vec<&[f64]> =
+                (0..np).map(|a| &p.jp[a * p.rows..(a + 1) * p.rows][range.clone()]).collect();
+            add_gram(&mut white, &plain, inflate * noise.total_variance());
         }
     }
     // What the priors of starts and parameters say is as uncertain as the samples are.
@@ -188,9 +240,13 @@ fn stationary(fitted: &Fitted, segments: &[Projected], priors: &[f64]) -> (Vec<f
         let columns: Vec<Vec<f64>> =
             (0..np).map(|a| p.jp[a * p.rows..(a + 1) * p.rows][ny * s.range.len()..].to_vec()).collect();
         add_gram(&mut meat, &columns, variance);
+        add_gram(&mut white, &columns, variance);
     }
-    priors.iter().enumerate().for_each(|(i, prior)| meat[i * np + i] += variance * prior);
-    (meat, (independent - np as f64).max(2.0))
+    for (i, prior) in priors.iter().enumerate() {
+        meat[i * np + i] += variance * prior;
+        white[i * np + i] += variance * prior;
+    }
+    Stationary { coloured: meat, white, freedom: (independent - np as f64).max(2.0) }
 }
 
 /// Jᵀ r over each block of samples.
@@ -241,37 +297,74 @@ rest = "rest' = 0"
 y = "b*f"
 "#;
 
-    /// Share of 400 intervals of b that hold it, in errors made of f(k) and a first-order autoregression.
-    fn coverage(colour: f64, error: fn(f64, f64) -> f64) -> f64 {
+    fn sine(k: i32) -> f64 {
+        (0.3 * f64::from(k)).sin()
+    }
+
+    /// b with its uncertainty from one recording of the input f(k), in errors made of it and a first-order autoregression.
+    fn estimate(
+        seed: u64,
+        colour: f64,
+        input: fn(i32) -> f64,
+        error: fn(f64, f64) -> f64,
+    ) -> (f64, Uncertainty) {
         let model = Model::from_toml(LINE, "model.toml").unwrap();
         let n = 1200;
-        let f: Vec<f64> = (0..n).map(|k| (0.3 * f64::from(k)).sin()).collect();
+        let f: Vec<f64> = (0..n).map(input).collect();
         let time: Vec<f64> = (0..n).map(f64::from).collect();
-        let (mut held, seeds) = (0, 400);
-        for seed in 0..seeds {
-            let mut random = Pcg64Mcg::seed_from_u64(seed);
-            let mut state = 0.0;
-            let mut noise = || {
-                let white: f64 = StandardNormal.sample(&mut random);
-                state = colour * state + (1.0 - colour * colour).sqrt() * white;
-                state
-            };
-            let y: Vec<f64> = f.iter().map(|f| 2.0 * f + 0.1 * error(*f, noise())).collect();
-            let channel =
-                |name: &str, values: &[f64]| Channel { name: name.into(), unit: None, values: values.into() };
-            let channels = vec![channel("f", &f), channel("y", &y)];
-            let recording = Recording::from_columns("line", time.clone(), channels).unwrap();
-            let data = Arc::new(Data::new(&model, &[recording]).unwrap());
-            let setup = Setup::new(&model, data, free_parameters(&model)).unwrap();
-            let level = setup.level(1);
-            let start = Point { parameters: vec![1.9], starts: setup.starts(&level, &[1.9]) };
-            let fit = setup.fit(&level, &[0.1], &[start], Limits::default());
-            let estimate = fit.point.parameters[0];
-            let fitted = Fitted { setup, parts: Vec::new(), level, fit };
-            let width = Uncertainty::of(&fitted, &[0.1]).widths()[0];
-            held += usize::from((estimate - 2.0).abs() <= width);
-        }
-        100.0 * f64::from(u32::try_from(held).unwrap()) / seeds as f64
+        let mut random = Pcg64Mcg::seed_from_u64(seed);
+        let mut state = 0.0;
+        let mut noise = || {
+            let white: f64 = StandardNormal.sample(&mut random);
+            state = colour * state + (1.0 - colour * colour).sqrt() * white;
+            state
+        };
+        let y: Vec<f64> = f.iter().map(|f| 2.0 * f + 0.1 * error(*f, noise())).collect();
+        let channel =
+            |name: &str, values: &[f64]| Channel { name: name.into(), unit: None, values: values.into() };
+        let channels = vec![channel("f", &f), channel("y", &y)];
+        let recording = Recording::from_columns("line", time.clone(), channels).unwrap();
+        let data = Arc::new(Data::new(&model, &[recording]).unwrap());
+        let setup = Setup::new(&model, data, free_parameters(&model)).unwrap();
+        let level = setup.level(1);
+        let start = Point { parameters: vec![1.9], starts: setup.starts(&level, &[1.9]) };
+        let fit = setup.fit(&level, &[0.1], &[start], Limits::default());
+        let estimate = fit.point.parameters[0];
+        let fitted = Fitted { setup, parts: Vec::new(), level, fit };
+        (estimate, Uncertainty::of(&fitted, &[0.1]))
+    }
+
+    /// Share of 400 intervals of b that hold it.
+    fn coverage(colour: f64, error: fn(f64, f64) -> f64) -> f64 {
+        let seeds = 400;
+        let holds = |seed: &u64| {
+            let (estimate, uncertainty) = estimate(*seed, colour, sine, error);
+            (estimate - 2.0).abs() <= uncertainty.widths()[0]
+        };
+        100.0 * (0..seeds).filter(holds).count() as f64 / seeds as f64
+    }
+
+    /// A first-order autoregression of ρ = 0.8 tells (1 + ρ)/(1 − ρ) = 9 times less of what stays, and more than white noise
+    /// of what changes its sign every sample.
+    #[test]
+    fn a_slow_residual_overstates_what_is_slow() {
+        let mean = |input: fn(i32) -> f64, error: fn(f64, f64) -> f64| {
+            (0..20).map(|seed| estimate(seed, 0.8, input, error).1.inflation(&[0]).factor).sum::<f64>() / 20.0
+        };
+        let slow = mean(|_| 1.0, |_, noise| noise);
+        assert!((slow - 9.0).abs() < 2.0, "{slow}");
+        let fast = mean(|k| if k % 2 == 0 { 1.0 } else { -1.0 }, |_, noise| noise);
+        assert!((1.0..1.1).contains(&fast), "{fast}");
+    }
+
+    /// Where the strength itself comes and goes, the samples agree less about it than their autocorrelation lets them.
+    #[test]
+    fn what_comes_and_goes_with_the_motion_is_known_less() {
+        let of = |error: fn(f64, f64) -> f64| {
+            (0..20).map(|seed| estimate(seed, 0.9, sine, error).1.inflation(&[0]).factor).sum::<f64>() / 20.0
+        };
+        let (plain, coming) = (of(|_, noise| noise), of(|f, noise| f * noise));
+        assert!(coming > 2.0 * plain, "{plain} {coming}");
     }
 
     // Three standard deviations of 400 draws at 95 % are 3.3 %.
