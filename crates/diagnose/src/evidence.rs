@@ -13,7 +13,7 @@
 //!
 //! Beside it, and deciding nothing yet, stands one quantity that could take the place of the score's κ and of all conditions on
 //! folds. It asks for the strength θ of the law itself: with its covariance S as its interval has it
-//! ([`Uncertainty`](crate::uncertainty)) and S₀ in white noise,
+//! (`uncertainty.rs`) and S₀ in white noise,
 //!
 //! ```text
 //! c = tr(S₀⁻¹ S) / dim θ,  at least 1          (Godambe, Ann. Math. Stat. 31, 1960)
@@ -28,7 +28,6 @@
 use greybox_calibrate::{Level, Point, Setup, qr};
 
 use crate::screen::project;
-use crate::uncertainty::Inflation;
 
 /// Number of folds.
 pub const FOLDS: usize = 10;
@@ -192,6 +191,15 @@ pub fn folds(setup: &Setup, level: &Level, scale: &[f64], point: &Point) -> Fold
         })
         .collect();
     Folds { sse, blocks: blocks.iter().map(|b| b.0).collect() }
+}
+
+/// By how much white noise overstates what the samples tell of some parameters.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct Inflation {
+    /// Mean eigenvalue of their covariance over that in white noise, at least 1.
+    pub factor: f64,
+    /// Degrees of freedom that it is known with: infinite in stationary noise, whose model has few parameters.
+    pub freedom: f64,
 }
 
 /// What a comparison knows of each of the two models.

@@ -18,6 +18,7 @@ use greybox_calibrate::noise_model::MOST;
 use greybox_calibrate::{Autoregression, qr, student_quantile};
 use statrs::distribution::{ChiSquared, ContinuousCDF};
 
+use crate::evidence::Inflation;
 use crate::screen::{Projected, project};
 use crate::search::Fitted;
 
@@ -37,15 +38,6 @@ pub(crate) struct Uncertainty {
     blocks: Estimated,
     /// Ratio of the second variance to the first from which the second counts.
     surplus: f64,
-}
-
-/// By how much white noise overstates what the samples tell of some parameters.
-#[derive(Debug, Clone, Copy, PartialEq)]
-pub struct Inflation {
-    /// Mean eigenvalue of their covariance over that in white noise, at least 1.
-    pub factor: f64,
-    /// Degrees of freedom that it is known with: infinite in stationary noise, whose model has few parameters.
-    pub freedom: f64,
 }
 
 /// A covariance and the degrees of freedom that it was estimated with.
