@@ -84,7 +84,7 @@ pub fn told(stage: Stage) -> String {
 /// What was weighed in words: by what decides, and by what is to take its place.
 pub fn told_weighed(weighed: &Weighed<'_>) -> String {
     format!(
-        "{}: score {:.1}, robust {:.1}, least {:.1}: {}",
+        "{}: score {:.1}, robust {:.1}, threshold {:.1}: {}",
         weighed.kinds.join(" and "),
         weighed.evidence.score,
         (weighed.robust)(),

@@ -241,8 +241,8 @@ fn gain(old: &Side, new: &Side, count: &[usize], weight: impl Fn(usize) -> f64) 
     (gain, information)
 }
 
-/// `robust` of the richer model (`new`) over the simpler (`old`), both fitted with the same scale; `inflation` is that of what
-/// `new` has beyond `old`.
+/// The adjusted score of the richer model (`new`) over the simpler (`old`), both fitted with the same scale: `robust` in the
+/// formula of [this module](self). `inflation` is that of what `new` has beyond `old`.
 pub fn robust(old: &Side, new: &Side, count: &[usize], inflation: Inflation) -> f64 {
     let (gain, information) = gain(old, new, count, |_| 1.0 / inflation.factor);
     let freedom = inflation.freedom;

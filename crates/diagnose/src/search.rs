@@ -740,7 +740,7 @@ impl<'a> Search<'a> {
         let uncounted =
             |f: &Fitted| Fitted { setup: Setup { work: work.clone(), ..f.setup.clone() }, ..f.clone() };
         let (old, new) = (uncounted(old), uncounted(new));
-        let inflation = Uncertainty::of(&new, scale).inflation(&self.tested(&old, &new));
+        let inflation = Uncertainty::inflation(&new, scale, &self.tested(&old, &new));
         robust(&self.side(&old, &new, scale), &self.side(&new, &new, scale), &new.fit.count, inflation)
     }
 

@@ -11,8 +11,10 @@
 //!
 //! The first counts, unless the second says more than that scatter explains.
 //!
-//! By how much either exceeds the covariance in white noise is what a ratio of likelihoods is adjusted by
+//! By how much the one that counts exceeds the covariance in white noise is what a ratio of likelihoods is adjusted by
 //! ([`Uncertainty::inflation`]).
+
+use std::ops::Range;
 
 use greybox_calibrate::noise_model::MOST;
 use greybox_calibrate::{Autoregression, qr, student_quantile};
@@ -32,8 +34,6 @@ const CHANCE: f64 = 0.1;
 pub(crate) struct Uncertainty {
     /// Number of free parameters.
     np: usize,
-    /// In white noise.
-    white: Vec<f64>,
     stationary: Estimated,
     blocks: Estimated,
     /// Ratio of the second variance to the first from which the second counts.
@@ -62,9 +62,18 @@ impl Estimated {
     }
 }
 
-impl Uncertainty {
-    /// At the optimum of a fit.
-    pub(crate) fn of(fitted: &Fitted, scale: &[f64]) -> Uncertainty {
+/// A fit's model linearised at its optimum, its starts eliminated.
+struct Linearised<'a> {
+    fitted: &'a Fitted,
+    segments: Vec<Projected>,
+    /// Precision of the priors.
+    priors: Vec<f64>,
+    /// Rows of H⁻¹.
+    inverse: Vec<Vec<f64>>,
+}
+
+impl Linearised<'_> {
+    fn of<'a>(fitted: &'a Fitted, scale: &[f64]) -> Linearised<'a> {
         let setup = &fitted.setup;
         let (nx, np) = (setup.system.nx, setup.free.len());
         let rows = setup.with_problem(&fitted.level, scale, |p| p.rows(&fitted.fit.point, true, None));
@@ -73,11 +82,105 @@ impl Uncertainty {
         let at = &fitted.fit.point.parameters;
         let priors: Vec<f64> = setup.free.iter().map(|f| f.prior.precision(at[f.index])).collect();
         priors.iter().enumerate().for_each(|(i, prior)| h[i * np + i] += prior);
-        let inverse = inverse(&h, np);
-        let Stationary { coloured: meat, white, freedom } = stationary(fitted, &segments, &priors);
-        let white = between(&inverse, &white, np);
-        let stationary = Estimated { covariance: between(&inverse, &meat, np), freedom };
-        let scores = block_scores(fitted, &segments);
+        Linearised { fitted, segments, priors, inverse: inverse(&h, np) }
+    }
+
+    /// Covariance of the parameters, given that of their scores.
+    fn covariance(&self, meat: &[f64]) -> Vec<f64> {
+        between(&self.inverse, meat, self.priors.len())
+    }
+
+    /// Segments with the rows of channel `c`.
+    fn channel(&self, c: usize) -> impl Iterator<Item = (&Projected, Range<usize>)> {
+        self.segments.iter().zip(&self.fitted.level.segments).map(move |(p, s)| {
+            let n = s.range.len();
+            (p, c * n..(c + 1) * n)
+        })
+    }
+
+    /// Samples over degrees of freedom, and the variance of all rows.
+    fn spent(&self) -> (f64, f64) {
+        let samples = self.fitted.level.segments.iter().map(|s| s.range.len()).sum::<usize>();
+        let measured = self.fitted.setup.system.ny * samples;
+        let freedom = measured.saturating_sub(self.priors.len()).max(1) as f64;
+        let rss: f64 = self.segments.iter().map(|p| qr::dot(&p.r, &p.r)).sum();
+        (measured as f64 / freedom, rss / freedom)
+    }
+
+    /// Adds what the priors of starts and parameters say, which is as uncertain as the samples are.
+    fn add_priors(&self, meat: &mut [f64]) {
+        let (ny, np) = (self.fitted.setup.system.ny, self.priors.len());
+        let (_, variance) = self.spent();
+        for (p, s) in self.segments.iter().zip(&self.fitted.level.segments) {
+            let columns: Vec<&[f64]> =
+                (0..np).map(|a| &p.jp[a * p.rows..(a + 1) * p.rows][ny * s.range.len()..]).collect();
+            add_gram(meat, &columns, variance);
+        }
+        self.priors.iter().enumerate().for_each(|(i, prior)| meat[i * np + i] += variance * prior);
+    }
+
+    /// Covariance of the scores in stationary noise, and how many independent samples it was estimated with.
+    fn stationary(&self) -> (Vec<f64>, f64) {
+        let (ny, np) = (self.fitted.setup.system.ny, self.priors.len());
+        let mut meat = vec![0.0; np * np];
+        let (inflate, _) = self.spent();
+        let mut independent = 0.0;
+        for c in 0..ny {
+            // A residual of zero is a sample that is missing, or that a whitening before has no row for.
+            let residuals: Vec<Vec<f64>> = self
+                .channel(c)
+                .map(|(p, range)| p.r[range].iter().map(|r| if *r == 0.0 { f64::NAN } else { *r }).collect())
+                .collect();
+            let stretches: Vec<&[f64]> = residuals.iter().map(Vec::as_slice).collect();
+            let noise = Autoregression::fit(&stretches, MOST);
+            let present = stretches.iter().flat_map(|s| s.iter()).filter(|r| r.is_finite()).count();
+            if noise.total_variance() > 0.0 {
+                independent += present as f64 * noise.variance() / noise.total_variance();
+            }
+            for (p, range) in self.channel(c) {
+                let coloured = |a: usize| {
+                    let mut column = p.jp[a * p.rows..(a + 1) * p.rows][range.clone()].to_vec();
+                    noise.colour_transposed(&mut column);
+                    column
+                };
+                let columns: Vec<Vec<f64>> = (0..np).map(coloured).collect();
+                add_gram(&mut meat, &columns, inflate * noise.variance());
+            }
+        }
+        self.add_priors(&mut meat);
+        (meat, (independent - np as f64).max(2.0))
+    }
+
+    /// Covariance of the scores in white noise of each channel's variance.
+    fn white(&self) -> Vec<f64> {
+        let (ny, np) = (self.fitted.setup.system.ny, self.priors.len());
+        let mut meat = vec![0.0; np * np];
+        let (inflate, _) = self.spent();
+        for c in 0..ny {
+            let present = self.channel(c).flat_map(|(p, range)| &p.r[range]).filter(|r| **r != 0.0);
+            let (count, power) = present.fold((0.0_f64, 0.0), |(n, sum), r| (n + 1.0, sum + r * r));
+            for (p, range) in self.channel(c) {
+                let columns: Vec<&[f64]> =
+                    (0..np).map(|a| &p.jp[a * p.rows..(a + 1) * p.rows][range.clone()]).collect();
+                add_gram(&mut meat, &columns, inflate * power / count.max(1.0));
+            }
+        }
+        self.add_priors(&mut meat);
+        meat
+    }
+}
+
+impl Uncertainty {
+    /// At the optimum of a fit.
+    pub(crate) fn of(fitted: &Fitted, scale: &[f64]) -> Uncertainty {
+        Uncertainty::at(&Linearised::of(fitted, scale))
+    }
+
+    fn at(model: &Linearised<'_>) -> Uncertainty {
+        let np = model.priors.len();
+        let (meat, freedom) = model.stationary();
+        let stationary = Estimated { covariance: model.covariance(&meat), freedom };
+        let scores = block_scores(model.fitted, &model.segments);
         let count = scores.len() as f64;
         let freedom = (count - np as f64).max(2.0);
         let mut meat = vec![0.0; np * np];
@@ -88,32 +191,32 @@ impl Uncertainty {
                 }
             }
         }
-        let blocks = Estimated { covariance: between(&inverse, &meat, np), freedom };
+        let blocks = Estimated { covariance: model.covariance(&meat), freedom };
         let surplus =
             ChiSquared::new(freedom).map_or(1.0, |chi| chi.inverse_cdf(1.0 - CHANCE) / freedom).max(1.0);
-        Uncertainty { np, white, stationary, blocks, surplus }
+        Uncertainty { np, stationary, blocks, surplus }
     }
 
     /// tr(S₀⁻¹ S)/dim θ of the parameters θ at these positions among those that are free, with their covariance S and the
     /// one in white noise, S₀.
-    pub(crate) fn inflation(&self, tested: &[usize]) -> Inflation {
-        let ratio = |covariance: &[f64]| {
-            let t = tested.len();
-            let of = |all: &[f64], a: usize, b: usize| all[tested[a] * self.np + tested[b]];
-            let d: Vec<f64> = (0..t).map(|a| of(&self.white, a, a).max(1e-300).sqrt()).collect();
-            let scaled = |all: &[f64]| -> Vec<f64> {
-                (0..t * t).map(|i| of(all, i / t, i % t) / (d[i / t] * d[i % t])).collect()
-            };
-            let (white, own) = (scaled(&self.white), scaled(covariance));
-            let trace: f64 = (0..t).map(|a| qr::solve_spd(&white, t, &own[a * t..(a + 1) * t])[a]).sum();
-            trace / t as f64
-        };
+    pub(crate) fn inflation(fitted: &Fitted, scale: &[f64], tested: &[usize]) -> Inflation {
         if tested.is_empty() {
             return Inflation { factor: 1.0, freedom: f64::INFINITY };
         }
-        let (stationary, blocks) = (ratio(&self.stationary.covariance), ratio(&self.blocks.covariance));
-        let (factor, freedom) = if blocks > self.surplus * stationary {
-            (blocks, self.blocks.freedom)
+        let model = Linearised::of(fitted, scale);
+        let (own, white) = (Uncertainty::at(&model), model.covariance(&model.white()));
+        let t = tested.len();
+        let block = |all: &[f64]| -> Vec<f64> {
+            (0..t * t).map(|i| all[tested[i / t] * own.np + tested[i % t]]).collect()
+        };
+        let white = inverse(&block(&white), t);
+        let ratio = |covariance: &[f64]| {
+            let covariance = block(covariance);
+            (0..t).map(|a| qr::dot(&white[a], &covariance[a * t..(a + 1) * t])).sum::<f64>() / t as f64
+        };
+        let (stationary, blocks) = (ratio(&own.stationary.covariance), ratio(&own.blocks.covariance));
+        let (factor, freedom) = if blocks > own.surplus * stationary {
+            (blocks, own.blocks.freedom)
         } else {
             (stationary, f64::INFINITY)
         };
@@ -180,67 +283,6 @@ fn between(inverse: &[Vec<f64>], meat: &[f64], np: usize) -> Vec<f64> {
     (0..np * np).map(|i| qr::dot(&half[i / np], &inverse[i % np])).collect()
 }
 
-/// Covariances of the scores in stationary noise.
-struct Stationary {
-    coloured: Vec<f64>,
-    /// In white noise of the same variance.
-    white: Vec<f64>,
-    /// How many independent samples they were estimated with, less the parameters.
-    freedom: f64,
-}
-
-fn stationary(fitted: &Fitted, segments: &[Projected], priors: &[f64]) -> Stationary {
-    let (ny, np) = (fitted.setup.system.ny, priors.len());
-    let (mut meat, mut white) = (vec![0.0; np * np], vec![0.0; np * np]);
-    let ranges = |c: usize| {
-        segments.iter().zip(&fitted.level.segments).map(move |(p, s)| {
-            let n = s.range.len();
-            (p, c * n..(c + 1) * n)
-        })
-    };
-    let measured: usize = ny * fitted.level.segments.iter().map(|s| s.range.len()).sum::<usize>();
-    let inflate = measured as f64 / measured.saturating_sub(np).max(1) as f64;
-    let mut independent = 0.0;
-    for c in 0..ny {
-        // A residual of zero is a sample that is missing, or that a whitening before has no row for.
-        let residuals: Vec<Vec<f64>> = ranges(c)
-            .map(|(p, range)| p.r[range].iter().map(|r| if *r == 0.0 { f64::NAN } else { *r }).collect())
-            .collect();
-        let stretches: Vec<&[f64]> = residuals.iter().map(Vec::as_slice).collect();
-        let noise = Autoregression::fit(&stretches, MOST);
-        let present = stretches.iter().flat_map(|s| s.iter()).filter(|r| r.is_finite()).count();
-        if noise.total_variance() > 0.0 {
-            independent += present as f64 * noise.variance() / noise.total_variance();
-        }
-        for (p, range) in ranges(c) {
-            let coloured = |a: usize| {
-                let mut column = p.jp[a * p.rows..(a + 1) * p.rows][range.clone()].to_vec();
-                noise.colour_transposed(&mut column);
-                column
-            };
-            let columns: Vec<Vec<f64>> = (0..np).map(coloured).collect();
-            add_gram(&mut meat, &columns, inflate * noise.variance());
-            let plain: Vec<&[f64]> =
-                (0..np).map(|a| &p.jp[a * p.rows..(a + 1) * p.rows][range.clone()]).collect();
-            add_gram(&mut white, &plain, inflate * noise.total_variance());
-        }
-    }
-    // What the priors of starts and parameters say is as uncertain as the samples are.
-    let rss: f64 = segments.iter().map(|p| qr::dot(&p.r, &p.r)).sum();
-    let variance = rss / measured.saturating_sub(np).max(1) as f64;
-    for (p, s) in segments.iter().zip(&fitted.level.segments) {
-        let columns: Vec<Vec<f64>> =
-            (0..np).map(|a| p.jp[a * p.rows..(a + 1) * p.rows][ny * s.range.len()..].to_vec()).collect();
-        add_gram(&mut meat, &columns, variance);
-        add_gram(&mut white, &columns, variance);
-    }
-    for (i, prior) in priors.iter().enumerate() {
-        meat[i * np + i] += variance * prior;
-        white[i * np + i] += variance * prior;
-    }
-    Stationary { coloured: meat, white, freedom: (independent - np as f64).max(2.0) }
-}
-
 /// Jᵀ r over each block of samples.
 fn block_scores(fitted: &Fitted, segments: &[Projected]) -> Vec<Vec<f64>> {
     let (ny, np) = (fitted.setup.system.ny, fitted.setup.free.len());
@@ -293,13 +335,13 @@ y = "b*f"
         (0.3 * f64::from(k)).sin()
     }
 
-    /// b with its uncertainty from one recording of the input f(k), in errors made of it and a first-order autoregression.
+    /// b, half of its interval and its inflation from one recording of the input f(k), in errors made of it and a first-order autoregression.
     fn estimate(
         seed: u64,
         colour: f64,
         input: fn(i32) -> f64,
         error: fn(f64, f64) -> f64,
-    ) -> (f64, Uncertainty) {
+    ) -> (f64, f64, Inflation) {
         let model = Model::from_toml(LINE, "model.toml").unwrap();
         let n = 1200;
         let f: Vec<f64> = (0..n).map(input).collect();
@@ -323,15 +365,16 @@ y = "b*f"
         let fit = setup.fit(&level, &[0.1], &[start], Limits::default());
         let estimate = fit.point.parameters[0];
         let fitted = Fitted { setup, parts: Vec::new(), level, fit };
-        (estimate, Uncertainty::of(&fitted, &[0.1]))
+        let width = Uncertainty::of(&fitted, &[0.1]).widths()[0];
+        (estimate, width, Uncertainty::inflation(&fitted, &[0.1], &[0]))
     }
 
     /// Share of 400 intervals of b that hold it.
     fn coverage(colour: f64, error: fn(f64, f64) -> f64) -> f64 {
         let seeds = 400;
         let holds = |seed: &u64| {
-            let (estimate, uncertainty) = estimate(*seed, colour, sine, error);
-            (estimate - 2.0).abs() <= uncertainty.widths()[0]
+            let (estimate, width, _) = estimate(*seed, colour, sine, error);
+            (estimate - 2.0).abs() <= width
         };
         100.0 * (0..seeds).filter(holds).count() as f64 / seeds as f64
     }
@@ -341,7 +384,7 @@ y = "b*f"
     #[test]
     fn a_slow_residual_overstates_what_is_slow() {
         let mean = |input: fn(i32) -> f64, error: fn(f64, f64) -> f64| {
-            (0..20).map(|seed| estimate(seed, 0.8, input, error).1.inflation(&[0]).factor).sum::<f64>() / 20.0
+            (0..20).map(|seed| estimate(seed, 0.8, input, error).2.factor).sum::<f64>() / 20.0
         };
         let slow = mean(|_| 1.0, |_, noise| noise);
         assert!((slow - 9.0).abs() < 2.0, "{slow}");
@@ -353,7 +396,7 @@ y = "b*f"
     #[test]
     fn what_comes_and_goes_with_the_motion_is_known_less() {
         let of = |error: fn(f64, f64) -> f64| {
-            (0..20).map(|seed| estimate(seed, 0.9, sine, error).1.inflation(&[0]).factor).sum::<f64>() / 20.0
+            (0..20).map(|seed| estimate(seed, 0.9, sine, error).2.factor).sum::<f64>() / 20.0
         };
         let (plain, coming) = (of(|_, noise| noise), of(|f, noise| f * noise));
         assert!(coming > 2.0 * plain, "{plain} {coming}");

@@ -3,7 +3,10 @@
 //! clipping the stopping impulse), which shares no code with the crates under test.
 #![allow(missing_docs, clippy::unwrap_used)]
 
-use greybox_diagnose::{Diagnosis, Options, Quiet, Verdict, calibrate, diagnose};
+use std::sync::{Arc, Mutex};
+
+use greybox_calibrate::Work;
+use greybox_diagnose::{Diagnosis, Observer, Options, Quiet, Verdict, Weighed, calibrate, diagnose};
 use greybox_model::Model;
 use greybox_recording::{Channel, Recording};
 use rand::SeedableRng;
@@ -282,6 +285,43 @@ fn a_search_that_runs_out_of_work_says_so() {
     let (none, all) = (with(0), with(Options::default().work));
     assert!(none.limited && none.mechanisms.is_empty() && none.verdict == Verdict::Unexplained);
     assert!(!all.limited && all.mechanisms.len() == 2);
+}
+
+/// Counts the work, and asks for all that is told, or not.
+#[derive(Default)]
+struct Listener {
+    asks: bool,
+    heard: Mutex<usize>,
+    work: Mutex<Vec<Arc<Work>>>,
+}
+
+impl Observer for Listener {
+    fn begins(&self, work: &Arc<Work>) {
+        self.work.lock().unwrap().push(work.clone());
+    }
+
+    fn weighed(&self, weighed: &Weighed<'_>) {
+        if self.asks {
+            assert!((weighed.robust)().is_finite());
+            *self.heard.lock().unwrap() += 1;
+        }
+    }
+}
+
+/// A search ends by its work: what is asked of it must not count.
+#[test]
+fn listening_costs_the_search_nothing() {
+    let model = Model::from_toml(MODEL, "oscillator.toml").unwrap();
+    let left = Left { coulomb: 0.8, ..Left::default() };
+    let (train, held) = ([record(1, left, 1e-3)], [record(1001, left, 1e-3)]);
+    let [(none, silent), (heard, asked)] = [false, true].map(|asks| {
+        let listener = Listener { asks, ..Listener::default() };
+        diagnose(&model, &train, &held, &Options::default(), &listener).unwrap();
+        let work: u64 = listener.work.lock().unwrap().iter().map(|work| work.done()).sum();
+        (*listener.heard.lock().unwrap(), work)
+    });
+    assert!(none == 0 && heard > 0 && silent > 0, "{none} {heard} {silent}");
+    assert_eq!(silent, asked);
 }
 
 /// Metres or millimetres, a shift of the clock: the physics is the same.

@@ -28,6 +28,7 @@ use greybox_report::Report;
 use self::case::{Case, Truth};
 use self::plan::{Left, Slot};
 use self::score::{Oracle, Score};
+use super::runs;
 use crate::{Ending, process};
 
 /// Cases when `--count` does not say: three rounds.
@@ -169,17 +170,7 @@ fn one(binary: &Path, slot: &Slot, options: &Options<'_>) -> Result<Option<Finis
     command.current_dir(&folder).arg("diagnose").arg("nominal.toml").args(&files[..files.len() - 1]);
     command.arg("--holdout").arg("holdout.csv").arg("--out").arg(&out);
     let run = process::run(&mut command, &out, options.limit)?;
-    let report = match run.status {
-        None => Err(format!("stopped after {:.0} s", run.seconds)),
-        Some(status) if !status.success() => {
-            let said = std::fs::read_to_string(out.join("stderr.txt")).unwrap_or_default();
-            let first = said.lines().find(|l| !l.trim().is_empty()).unwrap_or("no message").trim();
-            Err(format!("{status}: {first}"))
-        }
-        Some(_) => std::fs::read_to_string(out.join("report.json"))
-            .map_err(|e| format!("report.json: {e}"))
-            .and_then(|text| Report::from_json(&text).map_err(|e| e.to_string())),
-    };
+    let report = runs::report_of(&run, &out);
 
     // Only now is the truth written down.
     let (nominal, truth_model) = (case.nominal_model(), case.true_model(false));

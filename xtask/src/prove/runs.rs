@@ -82,7 +82,7 @@ impl<'a> Runs<'a> {
 }
 
 /// The report that a run left in `out`, or why there is none.
-fn report_of(run: &Measured, out: &Path) -> Result<Report, String> {
+pub(crate) fn report_of(run: &Measured, out: &Path) -> Result<Report, String> {
     match run.status {
         None => Err(format!("stopped after {:.0} s", run.seconds)),
         Some(status) if !status.success() => {
