@@ -9,8 +9,8 @@ use std::time::Duration;
 
 use greybox_calibrate::Work;
 use greybox_commands::{Failure, diagnose, identify};
-use greybox_diagnose::Stage;
 use greybox_diagnose::evidence::Evidence;
+use greybox_diagnose::{Stage, Weighed};
 use pyo3::prelude::*;
 
 use crate::error::raised;
@@ -96,7 +96,7 @@ impl greybox_diagnose::Observer for Watch {
         self.step();
     }
 
-    fn weighed(&self, _kind: &str, _evidence: &Evidence, _share: f64) {
+    fn weighed(&self, _weighed: &Weighed<'_>) {
         self.step();
     }
 
