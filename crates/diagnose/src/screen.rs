@@ -23,7 +23,6 @@ use rayon::prelude::*;
 
 use crate::along::Along;
 use crate::candidate::Candidate;
-use crate::evidence::price;
 use crate::library::{Mechanism, Scale};
 use crate::place::Place;
 use crate::spectra::Spectra;
@@ -960,15 +959,10 @@ pub struct Pair {
     pub gain: f64,
 }
 
-/// What a share of the residual's sum of squares is worth to first order, for the parameters that explain it:
-/// n ln(1/(1 − gain)) less their price, n the samples' information.
-fn worth(gain: f64, information: f64, complexity: (f64, f64)) -> f64 {
-    let (parameters, surcharge) = complexity;
-    -information * (1.0 - gain).max(1e-12).ln() - price(parameters, information) - 2.0 * surcharge
-}
+/// Least share that a pair must explain, and least surplus over its members alone.
+const PAIR_GAIN: f64 = 0.05;
 
-/// The pairs of candidates that are worth more than their members are alone, best first, at most `most`; `information` is
-/// that of the samples.
+/// The pairs of candidates that gain most beyond what their members gain alone, best first, at most `most`.
 ///
 /// With the parameters projected out, every pair is a regression on two to four columns of one common
 /// Gram matrix: all of them cost less than the fit of a single one.
@@ -979,7 +973,6 @@ pub fn screen_pairs(
     level: &Level,
     scale: &[f64],
     point: &Point,
-    information: f64,
     most: usize,
 ) -> Vec<Pair> {
     let (along, forces) = Along::observed(setup, level, scale, point);
@@ -1032,47 +1025,36 @@ pub fn screen_pairs(
         let allowed = c.iter().zip(positive).all(|(c, p)| !p || *c > 0.0);
         (allowed && gain.is_finite()).then_some((c, gain))
     };
-    let complexity = |v: &Variant| {
-        let mechanism = &library[candidates[v.candidate].mechanism];
-        (mechanism.parameters().count() as f64, mechanism.surcharge)
-    };
-    let usable: Vec<(usize, Vec<usize>, Vec<bool>)> = lanes
+    let usable: Vec<(usize, Vec<usize>, Vec<bool>, f64)> = lanes
         .variants
         .iter()
         .enumerate()
-        .map(|(i, v)| (i, v.columns.clone().collect::<Vec<usize>>(), positive(v)))
+        .map(|(i, v)| {
+            let (columns, positive): (Vec<usize>, Vec<bool>) = (v.columns.clone().collect(), positive(v));
+            let alone = regress(&columns, &positive).map_or(0.0, |r| r.1.max(0.0));
+            (i, columns, positive, alone)
+        })
         .filter(|v| v.1.len() <= 2 && v.1.iter().all(|&c| independent[c]))
         .collect();
-    // Of each candidate, what its best variant is worth alone.
-    let mut alone = vec![0.0f64; candidates.len()];
-    for (i, columns, positive) in &usable {
-        let v = &lanes.variants[*i];
-        let gain = regress(columns, positive).map_or(0.0, |r| r.1.max(0.0));
-        alone[v.candidate] = alone[v.candidate].max(worth(gain, information, complexity(v)));
-    }
-    let mut found: Vec<(f64, usize, usize, Vec<f64>, f64)> = (0..usable.len())
+    let mut found: Vec<(f64, usize, usize, Vec<f64>)> = (0..usable.len())
         .into_par_iter()
         .flat_map_iter(|i| {
-            let (usable, regress, lanes, alone, complexity) =
-                (&usable, &regress, &lanes, &alone, &complexity);
+            let (usable, regress, lanes) = (&usable, &regress, &lanes);
             (i + 1..usable.len()).filter_map(move |j| {
-                let ((v, cv, pv), (w, cw, pw)) = (&usable[i], &usable[j]);
-                let (v, w) = (&lanes.variants[*v], &lanes.variants[*w]);
-                if v.candidate == w.candidate {
+                let ((v, cv, pv, gv), (w, cw, pw, gw)) = (&usable[i], &usable[j]);
+                if lanes.variants[*v].candidate == lanes.variants[*w].candidate {
                     return None;
                 }
                 let columns: Vec<usize> = cv.iter().chain(cw).copied().collect();
                 let signs: Vec<bool> = pv.iter().chain(pw).copied().collect();
                 let (c, gain) = regress(&columns, &signs)?;
-                let ((kv, sv), (kw, sw)) = (complexity(v), complexity(w));
-                let worth = worth(gain, information, (kv + kw, sv + sw));
-                (worth > alone[v.candidate] + alone[w.candidate]).then_some((worth, i, j, c, gain))
+                (gain > gv + gw + PAIR_GAIN).then_some((gain, i, j, c))
             })
         })
         .collect();
     found.sort_by(|a, b| b.0.total_cmp(&a.0).then((a.1, a.2).cmp(&(b.1, b.2))));
     let mut out: Vec<Pair> = Vec::new();
-    for (_, i, j, c, gain) in found {
+    for (gain, i, j, c) in found {
         let (v, w) = (&lanes.variants[usable[i].0], &lanes.variants[usable[j].0]);
         let known = out
             .iter()
@@ -1189,21 +1171,6 @@ pub fn scored(library: &[Mechanism], candidates: &[Candidate], lanes: &Lanes, gr
 #[cfg(test)]
 mod tests {
     use super::*;
-
-    /// A tenth more of the residual does not pay for five parameters more where there is little to go by, and does where
-    /// there is much.
-    #[test]
-    fn what_is_explained_is_worth_its_likelihood_less_its_price() {
-        let (two, seven) = ((2.0, 0.0), (7.0, 0.0));
-        assert!(worth(0.35, 150.0, two) > worth(0.45, 150.0, seven));
-        assert!(worth(0.35, 1500.0, two) < worth(0.45, 1500.0, seven));
-        // 100 samples, 1 − 1/e of the sum of squares: a likelihood ratio of 100; BIC's price with 100/(100 − 2 − 1).
-        let price = 2.0 * 100f64.ln() * 100.0 / 97.0;
-        assert!((worth(1.0 - (-1f64).exp(), 100.0, two) - (100.0 - price)).abs() < 1e-9);
-        assert!((worth(0.5, 100.0, (2.0, 1.5)) - (worth(0.5, 100.0, two) - 3.0)).abs() < 1e-12);
-        // All of it, or more by rounding, is no infinite worth.
-        assert!(worth(1.0, 100.0, two).is_finite() && worth(1.0 + 1e-9, 100.0, two).is_finite());
-    }
 
     /// Leaving a parameter out of the inner products is leaving it out of every row, with what it did in the residual.
     #[test]

@@ -497,7 +497,19 @@ impl<'a> Search<'a> {
         let scale = state.scale.clone();
         let open: Vec<Candidate> =
             self.all.iter().filter(|c| !current.parts.iter().any(|p| p.candidate == **c)).cloned().collect();
-        let Some(best) = self.best_pair(&current, &open, &scale, &|_| true) else {
+        let pairs = screen_pairs(
+            &current.setup,
+            self.library,
+            &open,
+            &current.level,
+            &scale,
+            &current.fit.point,
+            PAIRS,
+        );
+        self.observer.stage(Stage::Fitting { candidates: pairs.len() });
+        let trials: Vec<Fitted> =
+            pairs.par_iter().filter_map(|p| self.extend_by_pair(&current, &open, p, &scale)).collect();
+        let Some(best) = trials.into_iter().min_by(|a, b| a.rss().total_cmp(&b.rss())) else {
             return false;
         };
         // (Beside a single candidate that was not believed either.)
@@ -526,34 +538,6 @@ impl<'a> Search<'a> {
         state.current = best;
         self.settle(state);
         state.current.parts.len() >= current.parts.len() + 2
-    }
-
-    /// The pair of candidates beside `base` that is worth most, of those that pay together and that `suits`.
-    fn best_pair(
-        &self,
-        base: &Fitted,
-        open: &[Candidate],
-        scale: &[f64],
-        suits: &(dyn Fn(&Fitted) -> bool + Sync),
-    ) -> Option<Fitted> {
-        let kappas = kappa(&base.setup, &base.level, scale, &base.fit.point);
-        let information = base.fit.count.iter().zip(&kappas).map(|(n, kappa)| *n as f64 * kappa).sum();
-        let point = &base.fit.point;
-        let pairs =
-            screen_pairs(&base.setup, self.library, open, &base.level, scale, point, information, PAIRS);
-        self.observer.stage(Stage::Fitting { candidates: pairs.len() });
-        let trials: Vec<Fitted> = pairs
-            .par_iter()
-            .filter_map(|pair| self.extend_by_pair(base, open, pair, scale))
-            .filter(suits)
-            .collect();
-        // One information per sample for all: that of the residual which fits best.
-        let nearest = trials.iter().min_by(|a, b| a.rss().total_cmp(&b.rss()))?;
-        let kappas = kappa(&nearest.setup, &nearest.level, scale, &nearest.fit.point);
-        let scores: Vec<f64> =
-            trials.par_iter().map(|f| self.weigh_with(base, f, scale, &kappas).score).collect();
-        let best = (0..trials.len()).max_by(|a, b| scores[*a].total_cmp(&scores[*b]).then(b.cmp(a)))?;
-        trials.into_iter().nth(best)
     }
 
     /// Fits `base` plus one candidate.
@@ -1740,8 +1724,16 @@ impl<'a> Search<'a> {
         else {
             return;
         };
-        let simpler = |f: &Fitted| self.complexity(f) < self.complexity(&current);
-        let best = self.best_pair(&base, &self.all, &scale, &simpler);
+        let pairs =
+            screen_pairs(&base.setup, self.library, &self.all, &base.level, &scale, &base.fit.point, PAIRS);
+        self.observer.stage(Stage::Fitting { candidates: pairs.len() });
+        let best = pairs
+            .par_iter()
+            .filter_map(|p| self.extend_by_pair(&base, &self.all, p, &scale))
+            .filter(|f| self.complexity(f) < self.complexity(&current))
+            .collect::<Vec<_>>()
+            .into_iter()
+            .min_by(|a, b| a.rss().total_cmp(&b.rss()));
         let Some(best) = best else { return };
         let evidence = self.weigh(&base, &best, &scale);
         if evidence.score + PARSIMONY > self.weigh(&base, &current, &scale).score {
