@@ -196,15 +196,15 @@ fn two_effects_at_once_are_both_named_and_share_what_they_explain() {
     }
 }
 
-/// The seeds for which a mechanism is named with more than 0.8.
+/// For how many of the seeds a mechanism is named with more than 0.8.
 fn confident(kind: &str, left: Left, seeds: Range<u64>) -> usize {
     let named = |s: &u64| answer(*s, left).mechanisms.iter().any(|m| m.kind == kind && m.confidence > 0.8);
     seeds.filter(named).count()
 }
 
 /// What looks like a gap may be a spring that hardens smoothly, and what looks like a hum a stiffness that swings:
-/// neither is in the library. (Two seeds of those: what is left over is explored, which takes a while. More of them are in
-/// the concealed suite.)
+/// neither is in the library. (Two seeds of those: what they leave is explored, which takes longest. The
+/// concealed suite has more laws of this sort.)
 #[test]
 fn a_law_outside_the_library_is_not_named_as_its_neighbour() {
     let gap = Left { gap: (60.0, 0.15), ..Left::default() };
@@ -230,7 +230,7 @@ k = { value = 8e-4, unit = "m^2/s" }
 balance = "A*h' + k*h = q"
 "#;
 
-/// A h' + a √(2 g h) = q, the inflow a new one every 150 s, the level to half a millimetre every two seconds.
+/// A h' + a √(2 g h) = q, the inflow a new one every 150 s, the level every two seconds, to half a millimetre.
 fn tank(seed: u64) -> Recording {
     let mut rng = rand_pcg::Pcg64Mcg::seed_from_u64(seed);
     let (inflow, noise) = (Uniform::new(1.3e-4, 5.7e-4).unwrap(), Normal::new(0.0, 5e-4).unwrap());
