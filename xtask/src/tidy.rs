@@ -425,5 +425,7 @@ fn the_python_package_is_the_version_of_the_workspace() {
             "python/Cargo.toml: {key}"
         );
     }
-    assert_eq!(package["profile"]["release"]["lto"], workspace["profile"]["release"]["lto"]);
+    for key in ["lto", "codegen-units"] {
+        assert_eq!(package["profile"]["release"][key], workspace["profile"]["release"][key], "{key}");
+    }
 }

@@ -60,6 +60,7 @@ impl Power {
     }
 
     /// x^α for x ≥ 0.
+    #[inline]
     fn raise(self, x: f64) -> f64 {
         match self {
             Self::One => x,
@@ -104,6 +105,7 @@ impl Fal {
 
     /// fal(e).
     #[must_use]
+    #[inline]
     pub fn apply(&self, e: f64) -> f64 {
         let size = e.abs();
         if size <= self.delta {
