@@ -90,6 +90,29 @@ fn published() -> Vec<(PathBuf, Table)> {
     packages
 }
 
+/// Of a crate whose tests are one program, a file that this program does not have would not be compiled.
+#[test]
+fn every_file_of_tests_is_compiled() {
+    for (manifest, package) in packages() {
+        if package["package"].get("autotests").is_none() {
+            continue; // cargo finds them
+        }
+        let folder = manifest.with_file_name("tests");
+        let program = read(&folder.join("all.rs"));
+        for entry in std::fs::read_dir(&folder).unwrap() {
+            let path = entry.unwrap().path();
+            let name = path.file_stem().unwrap().to_str().unwrap();
+            if path.extension().is_some_and(|e| e == "rs") && name != "all" {
+                assert!(
+                    program.contains(&format!("mod {name};\n")),
+                    "{} is in no test program",
+                    path.display()
+                );
+            }
+        }
+    }
+}
+
 /// The categories of the registry that are in use here; others are refused when they are published.
 const CATEGORIES: [&str; 9] = [
     "command-line-utilities",

@@ -1,8 +1,7 @@
 //! Memory that no sensor sees, and delays, through the seams of the segments.
 #![allow(missing_docs, clippy::unwrap_used)]
 
-mod common;
-use common::*;
+use crate::common::*;
 use greybox_calibrate::{Level, Segment};
 use greybox_model::Model;
 

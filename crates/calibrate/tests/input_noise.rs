@@ -1,10 +1,9 @@
 //! The noise of an input that was measured: told where it shows, and of no command.
 #![allow(missing_docs, clippy::unwrap_used)]
 
-mod common;
 use std::sync::Arc;
 
-use common::{OSCILLATOR, force, measure, normal};
+use crate::common::{OSCILLATOR, force, measure, normal};
 use greybox_calibrate::input_noise::{InputNoise, findings, input_noise};
 use greybox_calibrate::{Data, Setup};
 use greybox_model::Model;

@@ -2,10 +2,9 @@
 //! rows that were left out.
 #![allow(missing_docs, clippy::unwrap_used)]
 
-mod common;
 use std::sync::Arc;
 
-use common::{fit, force, normal};
+use crate::common::{fit, force, normal};
 use greybox_calibrate::{Data, Setup, free_parameters};
 use greybox_model::{Hold, Model};
 use greybox_recording::{Channel, Recording, parse_csv};

@@ -1,10 +1,9 @@
 //! Fits under coloured noise: what whitening gains, and whether the intervals can be believed.
 #![allow(missing_docs, clippy::unwrap_used)]
 
-mod common;
 use std::sync::Arc;
 
-use common::*;
+use crate::common::*;
 use greybox_calibrate::{Autoregression, Level, Limits, Point, Setup, qr};
 use greybox_model::Model;
 

@@ -1,8 +1,7 @@
 //! Samples that no longer can be computed with in SI units are refused, with the channel's name.
 #![allow(missing_docs, clippy::unwrap_used)]
 
-mod common;
-use common::OSCILLATOR;
+use crate::common::OSCILLATOR;
 use greybox_calibrate::{Data, DataError};
 use greybox_model::Model;
 use greybox_recording::{Channel, Recording};

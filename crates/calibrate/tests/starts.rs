@@ -1,8 +1,7 @@
 //! What is believed of the states at the start of a segment.
 #![allow(missing_docs, clippy::unwrap_used)]
 
-mod common;
-use common::*;
+use crate::common::*;
 use greybox_calibrate::{Limits, Point};
 use greybox_model::Model;
 

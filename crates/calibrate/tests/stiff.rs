@@ -1,10 +1,9 @@
 //! A mode far faster than the samples: followed in small steps, or refused by name.
 #![allow(missing_docs, clippy::unwrap_used)]
 
-mod common;
 use std::sync::Arc;
 
-use common::*;
+use crate::common::*;
 use greybox_calibrate::{Data, Setup, SetupError};
 use greybox_model::Model;
 use greybox_recording::{Channel, Recording};

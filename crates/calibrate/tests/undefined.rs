@@ -1,8 +1,7 @@
 //! What a simulation has no number for is a misfit, not a missing sample.
 #![allow(missing_docs, clippy::unwrap_used)]
 
-mod common;
-use common::*;
+use crate::common::*;
 use greybox_calibrate::{Criterion, Limits, Point};
 use greybox_model::Model;
 

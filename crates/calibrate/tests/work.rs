@@ -1,10 +1,9 @@
 //! What a fit may cost.
 #![allow(missing_docs, clippy::unwrap_used)]
 
-mod common;
 use std::sync::Arc;
 
-use common::*;
+use crate::common::*;
 use greybox_calibrate::{Ending, Fit, Limits, Point, Setup, Work};
 use greybox_model::Model;
 use rayon::prelude::*;

@@ -1,8 +1,7 @@
 //! What cannot be controlled is refused, with the mend.
 #![allow(missing_docs, clippy::unwrap_used)]
-mod common;
 
-use common::{CART, PENDULUM, load};
+use crate::common::{CART, PENDULUM, load};
 use greybox_control::{
     ControlError, DesignOptions, Equilibrium, Method, Plant, PlantOptions, design, equilibrium,
 };

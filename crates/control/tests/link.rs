@@ -1,8 +1,7 @@
 //! The rotary flexible link of the thesis, written in the model language.
 #![allow(missing_docs, clippy::unwrap_used)]
-mod common;
 
-use common::link;
+use crate::common::link;
 use greybox_control::{DesignOptions, Method, Plant, PlantOptions, Weights, design};
 use greybox_hjb::Plant as _;
 use greybox_simulate::rigs::RotaryFlexibleLink;

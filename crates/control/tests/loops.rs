@@ -1,8 +1,7 @@
 //! Closed loops: tracking, friction, families of plants, units.
 #![allow(missing_docs, clippy::unwrap_used)]
-mod common;
 
-use common::{CART, PENDULUM, load};
+use crate::common::{CART, PENDULUM, load};
 use greybox_control::{
     ClosedLoop, ControlError, DesignOptions, FamilyOptions, Feedback, LoopOptions, Method, Plant,
     PlantOptions, Reference, design,

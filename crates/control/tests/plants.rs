@@ -1,8 +1,7 @@
 //! Explicit forms of plants, and their limits.
 #![allow(missing_docs, clippy::unwrap_used)]
-mod common;
 
-use common::load;
+use crate::common::load;
 use greybox_control::{
     DesignOptions, Equilibrium, FeedForward, Method, Plant, PlantOptions, design, equilibrium,
 };
@@ -11,7 +10,7 @@ use greybox_simulate::{Environment, Method as Integration, Seeds, Signal, integr
 use nalgebra::{DMatrix, DVector};
 
 /// What the diagnosis of the demo returns, with values of its size.
-pub const DEMO: &str = r#"
+const DEMO: &str = r#"
 [inputs]
 v = { unit = "V" }
 [states]

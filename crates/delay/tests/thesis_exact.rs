@@ -1,7 +1,6 @@
 //! Exact delay regression on the virtual rigs of thesis chapter 3.
-mod common;
 
-use common::{DT, Duffing, Joint};
+use crate::common::{DT, Duffing, Joint};
 use greybox_algebraic::{Column, Hold, Kernel};
 use greybox_delay::bound::{Output, cramer_rao};
 use greybox_delay::exact::{Fit, Gain, Options, Warning};

@@ -1,7 +1,6 @@
 //! Algorithm 2 on the delayed Duffing oscillator of thesis §3.3.
-mod common;
 
-use common::{DT, Duffing, median};
+use crate::common::{DT, Duffing, median};
 use greybox_algebraic::{Column, Hold, Initial, Iterated, Kernel, Restart};
 use greybox_delay::expansion::{Expansion, Reading};
 use greybox_delay::taylor::{Data, Model, Options, Order, Search, search};

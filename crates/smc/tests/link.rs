@@ -1,13 +1,11 @@
 //! The laws on the virtual rotary flexible link of the thesis (chapter 4.2): 0.5 ms, 10 V, square waves of 0.25 Hz.
 #![allow(missing_docs, clippy::unwrap_used)]
 
-mod rig;
-
+use crate::rig::{DT, Figures, LIMIT, f, follow, rest};
 use greybox_simulate::rigs::RotaryFlexibleLink;
 use greybox_smc::check::ClosedLoop;
 use greybox_smc::thesis::{LinkTangent, PrintedLaw};
 use greybox_smc::{BoundaryLayer, Design, FlatOutput, Rate, Surface, Tangent, Target};
-use rig::{DT, Figures, LIMIT, f, follow, rest};
 
 const RIG: RotaryFlexibleLink = RotaryFlexibleLink::IDENTIFIED;
 const ANGLES: [f64; 5] = [10.0, 15.0, 20.0, 25.0, 30.0];

@@ -1,0 +1,8 @@
+//! The integration tests, in one program: to link one for each file takes longer than most of them run.
+#![allow(missing_docs, clippy::unwrap_used)]
+
+mod common;
+mod errors;
+mod link;
+mod loops;
+mod plants;

@@ -1,0 +1,10 @@
+//! The integration tests, in one program: to link one for each file takes longer than most of them run.
+#![allow(missing_docs, clippy::unwrap_used)]
+
+mod any_input;
+mod common;
+mod exact;
+mod spectrum;
+mod taylor;
+mod thesis_exact;
+mod thesis_taylor;

@@ -1,0 +1,12 @@
+//! The integration tests, in one program: to link one for each file takes longer than most of them run.
+#![allow(missing_docs, clippy::unwrap_used)]
+
+mod floor;
+mod handed_back;
+mod horizons;
+mod inputs;
+mod invariance;
+mod kinds;
+mod recovery;
+mod shapes;
+mod twins;

@@ -1,0 +1,10 @@
+//! The integration tests, in one program: to link one for each file takes longer than most of them run.
+#![allow(missing_docs, clippy::unwrap_used)]
+
+mod bad_files;
+mod blocks;
+mod health;
+mod mat;
+mod parquet;
+mod real_recordings;
+mod signals;
