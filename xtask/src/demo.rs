@@ -1,9 +1,29 @@
-//! What `greybox demo` diagnoses.
+//! What `greybox demo` diagnoses, and what its answer must be.
 
-use anyhow::Result;
+use std::path::Path;
+use std::process::Command;
+
+use anyhow::{Context, Result, bail, ensure};
 use greybox_diagnose::{Diagnosis, Options, Quiet, diagnose};
 use greybox_model::Model;
 use greybox_recording::{Recording, read_csv};
+use greybox_report::Report;
+use greybox_report::contract::Verdict;
+use serde_json::Value;
+
+use crate::{Ending, process, readme};
+
+/// What `greybox demo` leaves, sorted.
+const FILES: [&str; 6] = [
+    "improved.toml",
+    "report.html",
+    "report.json",
+    "rotary_link.toml",
+    "rotary_link_test.csv",
+    "rotary_link_train.csv",
+];
+/// Level of the Coulomb friction of the rig, N m. It is found within 15 %, since other physics stays unmodelled.
+const FRICTION: f64 = 0.0148;
 
 /// The embedded model and its recordings.
 pub(crate) struct Demo {
@@ -26,5 +46,80 @@ impl Demo {
 
     pub(crate) fn diagnose(&self) -> Result<Diagnosis> {
         Ok(diagnose(&self.model, &self.train, &self.holdout, &Options::default(), &Quiet)?)
+    }
+}
+
+/// Checks what `greybox demo --out OUT` printed (into the file `answer`) and left: the README shows this answer, and the
+/// files simulate as well as the report says.
+///
+/// # Errors
+/// What is not so, in words.
+pub(crate) fn check(root: &Path, answer: &Path, out: &Path) -> Result<Ending> {
+    let text = |path: &Path| {
+        std::fs::read_to_string(path).with_context(|| format!("{} cannot be read", path.display()))
+    };
+    is_shown(&text(answer)?, &text(&root.join("README.md"))?)?;
+    let mut files: Vec<String> = std::fs::read_dir(out)
+        .with_context(|| format!("{} cannot be read", out.display()))?
+        .map(|entry| Ok(entry?.file_name().to_string_lossy().into_owned()))
+        .collect::<Result<_>>()?;
+    files.sort();
+    ensure!(files == FILES, "{} holds {files:?} in place of {FILES:?}", out.display());
+
+    let report = Report::from_json(&text(&out.join("report.json"))?)?;
+    ensure!(report.verdict == Verdict::MissingPhysics, "the verdict is {:?}", report.verdict);
+    let Some(first) = report.mechanisms.first() else { bail!("no mechanism is named") };
+    ensure!(first.kind == "coulomb_friction", "{} is named first", first.kind);
+    let level = first.parameters.get("fc").context("the friction has no fc")?.value;
+    ensure!((level / FRICTION - 1.0).abs() < 0.15, "fc = {level} N m; the rig has {FRICTION} N m");
+
+    let command = process::build(root)?;
+    let scratch = process::target(root).join("demo.csv");
+    let held_out = &report.fit.holdout;
+    for (model, said) in [("improved.toml", &held_out.improved), ("rotary_link.toml", &held_out.nominal)] {
+        let said = said.get("theta").with_context(|| format!("no score of θ with {model}"))?.nrmse;
+        let run = Command::new(&command)
+            .arg("simulate")
+            .args([model, "rotary_link_test.csv"].map(|name| out.join(name)))
+            .args(["--json", "--out"])
+            .arg(&scratch)
+            .output()
+            .context("greybox could not be started")?;
+        ensure!(run.status.success(), "{model}: {}", String::from_utf8_lossy(&run.stderr));
+        let run: Value = serde_json::from_slice(&run.stdout)?;
+        let nrmse = run["fit"]["theta"]["nrmse"].as_f64().context("a simulation without a score of θ")?;
+        ensure!((nrmse / said - 1.0).abs() < 0.05, "{model} simulates θ to {nrmse}; the report says {said}");
+    }
+    println!("the answer is the README's, and its files simulate as the report says");
+    Ok(Ending::Done)
+}
+
+/// The README shows this answer; its last digits may be another machine's.
+fn is_shown(answer: &str, readme: &str) -> Result<()> {
+    let shown = readme::block_after(readme, "main answer")?;
+    ensure!(shown.lines().count() > 5, "the README shows hardly anything: {shown}");
+    let without_digits = |text: &str| text.replace(|c: char| c.is_ascii_digit(), "");
+    ensure!(
+        without_digits(answer).contains(&without_digits(&shown)),
+        "the README shows another answer than\n{answer}"
+    );
+    ensure!(!answer.contains("limit of work"), "the demo ends at its limit of work");
+    Ok(())
+}
+
+#[cfg(test)]
+mod tests {
+    use super::is_shown;
+
+    #[test]
+    fn an_answer_may_differ_from_the_readme_in_its_digits_alone() {
+        let readme = |shown: &str| format!("# x\n<!-- main answer -->\n```text\n{shown}```\n");
+        let shown = "a 1.5\nb 2\nc\nd\ne\nf 3 %\n";
+        assert!(is_shown("before\na 1.4\nb 7\nc\nd\ne\nf 9 %\nafter\n", &readme(shown)).is_ok());
+        for other in ["", "a 1.5\nb 2\nc\nd\ne\ng 3 %\n", "a 1.5\nb 2\nc\nd\ne\nf 3 %\nlimit of work\n"] {
+            assert!(is_shown(other, &readme(shown)).is_err(), "{other}");
+        }
+        assert!(is_shown("a", &readme("a\n")).is_err());
+        assert!(is_shown(shown, "# x\n").is_err());
     }
 }

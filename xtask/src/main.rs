@@ -53,6 +53,13 @@ enum Task {
     PythonPackage,
     /// Package every crate as it would be published, in the order of their dependencies, and build it from its package
     Crates(crates::Arguments),
+    /// Check what `greybox demo --out OUT` answered and left: the README shows it
+    Demo {
+        /// What the command printed
+        answer: PathBuf,
+        /// The folder that it wrote
+        out: PathBuf,
+    },
     /// Run what the continuous integration runs (.ci/run)
     Ci,
     /// Print the commands of the README's block behind `<!-- MARKER -->`
@@ -82,6 +89,7 @@ fn main() -> ExitCode {
         Task::Python => python(&root()),
         Task::Crates(arguments) => crates::run(&root(), &arguments),
         Task::PythonPackage => package::run(&root()),
+        Task::Demo { answer, out } => demo::check(&root(), &answer, &out),
         Task::Ci => ci(&root()),
         Task::ReadmeCommand { marker } => print_command(&root(), &marker),
     };
