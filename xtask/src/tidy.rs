@@ -90,7 +90,7 @@ fn published() -> Vec<(PathBuf, Table)> {
     packages
 }
 
-/// Of a crate whose tests are one program, a file that this program does not have would not be compiled.
+/// Where the tests of a crate are one program, cargo does not look for files: one that is not listed would not be compiled.
 #[test]
 fn every_file_of_tests_is_compiled() {
     for (manifest, package) in packages() {

@@ -1,5 +1,4 @@
 //! Memory that no sensor sees, and delays, through the seams of the segments.
-#![allow(missing_docs, clippy::unwrap_used)]
 
 use crate::common::*;
 use greybox_calibrate::{Level, Segment};

@@ -1,5 +1,4 @@
 //! The noise of an input that was measured: told where it shows, and of no command.
-#![allow(missing_docs, clippy::unwrap_used)]
 
 use std::sync::Arc;
 

@@ -1,6 +1,5 @@
 //! Inputs whose derivative is needed, constant inputs, recordings that differ in a known constant, and what an input does in
 //! rows that were left out.
-#![allow(missing_docs, clippy::unwrap_used)]
 
 use std::sync::Arc;
 

@@ -1,5 +1,4 @@
 //! A recording that lacks a channel: the error says how to give the model one of those that there are.
-#![allow(missing_docs, clippy::unwrap_used)]
 
 use greybox_calibrate::Data;
 use greybox_model::Model;

@@ -1,6 +1,5 @@
 //! The least squares of `calibrate` on the Statistical Reference Datasets for nonlinear regression (StRD) of the
 //! National Institute of Standards and Technology: 27 problems, each from two starts, against certified parameters.
-#![allow(missing_docs, clippy::unwrap_used)]
 
 use std::path::PathBuf;
 

@@ -1,5 +1,4 @@
 //! Fits under coloured noise: what whitening gains, and whether the intervals can be believed.
-#![allow(missing_docs, clippy::unwrap_used)]
 
 use std::sync::Arc;
 

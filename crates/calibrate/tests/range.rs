@@ -1,5 +1,4 @@
 //! Samples that no longer can be computed with in SI units are refused, with the channel's name.
-#![allow(missing_docs, clippy::unwrap_used)]
 
 use crate::common::OSCILLATOR;
 use greybox_calibrate::{Data, DataError};

@@ -1,5 +1,4 @@
 //! What is believed of the states at the start of a segment.
-#![allow(missing_docs, clippy::unwrap_used)]
 
 use crate::common::*;
 use greybox_calibrate::{Limits, Point};

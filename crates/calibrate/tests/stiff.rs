@@ -1,5 +1,4 @@
 //! A mode far faster than the samples: followed in small steps, or refused by name.
-#![allow(missing_docs, clippy::unwrap_used)]
 
 use std::sync::Arc;
 

@@ -1,5 +1,4 @@
 //! What a simulation has no number for is a misfit, not a missing sample.
-#![allow(missing_docs, clippy::unwrap_used)]
 
 use crate::common::*;
 use greybox_calibrate::{Criterion, Limits, Point};

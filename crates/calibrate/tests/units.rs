@@ -1,5 +1,4 @@
 //! The units of headers: absolute temperatures, differences of them, and symbols that the model declares.
-#![allow(missing_docs, clippy::unwrap_used)]
 
 use greybox_calibrate::{Data, DataError};
 use greybox_model::Model;

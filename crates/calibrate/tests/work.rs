@@ -1,5 +1,4 @@
 //! What a fit may cost.
-#![allow(missing_docs, clippy::unwrap_used)]
 
 use std::sync::Arc;
 

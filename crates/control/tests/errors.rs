@@ -1,5 +1,4 @@
 //! What cannot be controlled is refused, with the mend.
-#![allow(missing_docs, clippy::unwrap_used)]
 
 use crate::common::{CART, PENDULUM, load};
 use greybox_control::{

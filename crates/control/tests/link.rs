@@ -1,5 +1,4 @@
 //! The rotary flexible link of the thesis, written in the model language.
-#![allow(missing_docs, clippy::unwrap_used)]
 
 use crate::common::link;
 use greybox_control::{DesignOptions, Method, Plant, PlantOptions, Weights, design};

@@ -1,5 +1,4 @@
 //! Closed loops: tracking, friction, families of plants, units.
-#![allow(missing_docs, clippy::unwrap_used)]
 
 use crate::common::{CART, PENDULUM, load};
 use greybox_control::{

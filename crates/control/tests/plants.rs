@@ -1,5 +1,4 @@
 //! Explicit forms of plants, and their limits.
-#![allow(missing_docs, clippy::unwrap_used)]
 
 use crate::common::load;
 use greybox_control::{

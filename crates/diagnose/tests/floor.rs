@@ -1,6 +1,5 @@
 //! The noise floor is a floor: no model is below it, and where fast motion passes for noise the answer says that the noise
 //! is not known.
-#![allow(missing_docs, clippy::unwrap_used)]
 
 use greybox_diagnose::{Options, Quiet, Verdict, diagnose};
 use greybox_model::Model;

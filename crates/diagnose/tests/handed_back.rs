@@ -1,7 +1,6 @@
 //! What is handed back where no equation of the library is the machine's: a room that the sun heats too, which nobody
 //! measured. Whatever is proposed in its stead fits the training recording no worse than the calibrated model, and predicts
 //! another month no worse.
-#![allow(missing_docs, clippy::unwrap_used)]
 
 use greybox_diagnose::diagnosis::Role;
 use greybox_diagnose::{Options, Quiet, Verdict, diagnose};

@@ -1,6 +1,5 @@
 //! The optimum is found from far away, and what judges a machine is what it can be judged by. The recordings come from small
 //! explicit steps of this file's own.
-#![allow(missing_docs, clippy::unwrap_used)]
 
 use greybox_calibrate::Criterion;
 use greybox_diagnose::{Calibration, Quiet, calibrate};

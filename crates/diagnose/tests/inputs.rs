@@ -1,6 +1,5 @@
 //! Inputs that are constant, known constants that differ between recordings, and derivatives of inputs: a diagnosis runs,
 //! and offers nothing that only the changes of an input could tell.
-#![allow(missing_docs, clippy::unwrap_used)]
 
 use std::sync::Arc;
 

@@ -1,5 +1,4 @@
 //! What must not matter to a calibration and to a diagnosis: units, the order of channels and recordings, the clock.
-#![allow(missing_docs, clippy::unwrap_used)]
 
 use greybox_diagnose::{Calibration, Diagnosis, Options, Quiet, built_in, calibrate, diagnose};
 use greybox_model::Model;

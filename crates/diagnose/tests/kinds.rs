@@ -1,6 +1,5 @@
 //! Effects with memory, in time, in the sensor, and pairs that only pay together: each is named and sized.
 //! The recordings come from an integrator of this file's own (explicit steps, a hundred a sample).
-#![allow(missing_docs, clippy::unwrap_used)]
 
 use greybox_diagnose::{Diagnosis, Options, Quiet, Verdict, diagnose};
 use greybox_model::Model;

@@ -1,7 +1,6 @@
 //! Recovery over seeds: an effect that was left out is named, and nothing is named where nothing is
 //! missing. The recordings come from an integrator of this file's own (small explicit steps, friction by
 //! clipping the stopping impulse), which shares no code with the crates under test.
-#![allow(missing_docs, clippy::unwrap_used)]
 
 use std::ops::Range;
 use std::sync::{Arc, Mutex};

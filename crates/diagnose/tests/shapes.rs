@@ -1,5 +1,4 @@
 //! What forces of free shape explain beside a model: everything that is missing, and nothing of the noise.
-#![allow(missing_docs, clippy::unwrap_used)]
 
 use std::sync::Arc;
 

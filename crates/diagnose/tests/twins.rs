@@ -1,6 +1,5 @@
 //! Two carts, each on a spring of its own, with a damper between them: a constant force that was left out, the zero of a
 //! sensor and the zero of the actuator are one and the same, and the report says so.
-#![allow(missing_docs, clippy::unwrap_used)]
 
 use greybox_diagnose::{Options, Quiet, diagnose};
 use greybox_model::Model;

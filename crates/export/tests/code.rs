@@ -1,5 +1,4 @@
 //! The code compiles without a warning and gives what the expressions give.
-#![allow(missing_docs, clippy::unwrap_used)]
 
 use std::fmt::Write as _;
 use std::path::Path;

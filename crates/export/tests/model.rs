@@ -1,6 +1,5 @@
 //! Whole models in other languages: what the text says, what it refuses, and that no text of a model becomes code.
 //! That the Python module computes what `greybox simulate` computes is the business of the command's tests.
-#![allow(clippy::unwrap_used)]
 
 use greybox_export::{ExportError, latex, latex_document, modelica, python};
 use greybox_model::{Model, parse};

@@ -1,5 +1,5 @@
 //! Hamilton–Jacobi–Bellman equations with known solutions, and solutions that are none.
-#![allow(missing_docs, clippy::disallowed_methods, clippy::unwrap_used)]
+#![allow(clippy::disallowed_methods)]
 
 use greybox_hjb::{
     AdamaxOptions, Affine, Domain, Feedback, HjbError, Linear, Monomials, PolicyOptions, Problem,

@@ -1,5 +1,5 @@
 //! Riccati equations: the CAREX and DAREX collections, invariances, and input that has no answer.
-#![allow(missing_docs, clippy::disallowed_methods, clippy::unwrap_used)]
+#![allow(clippy::disallowed_methods)]
 
 use std::path::PathBuf;
 

@@ -1,5 +1,4 @@
 //! Recordings read in blocks: the answer of the whole, in constant memory.
-#![allow(missing_docs, clippy::unwrap_used)]
 
 use greybox_identify::{
     HoldoutSource, Identification, IdentifyError, Library, Linearisation, Monomials, Options, Quiet,

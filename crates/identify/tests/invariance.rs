@@ -1,5 +1,4 @@
 //! What must not matter to an identification: units, the order of channels and recordings, the clock.
-#![allow(missing_docs, clippy::unwrap_used)]
 
 use greybox_identify::{Identification, Library, Monomials, Options, Quiet, identify};
 use greybox_model::Hold;

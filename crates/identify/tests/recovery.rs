@@ -1,5 +1,4 @@
 //! Equations recovered from noisy recordings of systems integrated here.
-#![allow(missing_docs, clippy::unwrap_used)]
 
 use greybox_identify::{
     DelayedState, Identification, IdentifyError, Library, Monomials, Options, Quiet, identify,

@@ -1,5 +1,4 @@
 //! Properties of units: products, powers, prefixes, and what is written is read again.
-#![allow(missing_docs, clippy::unwrap_used)]
 
 use greybox_model::{Dimension, Model, Unit};
 use proptest::prelude::*;

@@ -1,7 +1,6 @@
 //! Every way a file can be wrong: the error names the place, what was found, and the mend.
 
 // Helpers of a test file are tests too; the lint configuration knows only the annotated functions.
-#![allow(clippy::unwrap_used)]
 
 use greybox_recording::{RecordingError, parse_csv, read_csv, write_csv, write_csv_file};
 

@@ -1,5 +1,4 @@
 //! A file read in blocks says what the file read whole says, faults included.
-#![allow(missing_docs, clippy::unwrap_used)]
 
 use greybox_recording::{CsvBlocks, Recording, RecordingError, read_csv};
 

@@ -1,7 +1,6 @@
 //! Each health check fires on its fault and stays silent on a sound recording.
 
 // Helpers of a test file are tests too; the lint configuration knows only the annotated functions.
-#![allow(clippy::unwrap_used)]
 
 use greybox_recording::health::{check, clock_offsets};
 use greybox_recording::{Channel, Finding, Recording, Severity};

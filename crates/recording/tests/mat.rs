@@ -1,7 +1,6 @@
 //! MAT-files as MATLAB, Simulink and SciPy write them (`tests/mat/make.py` made those read here), and damaged ones.
 #![cfg(feature = "mat")]
 // Helpers of a test file are tests too; the lint configuration knows only the annotated functions.
-#![allow(clippy::unwrap_used)]
 
 use greybox_recording::{Recording, RecordingError, parse_mat};
 use std::path::Path;

@@ -1,7 +1,6 @@
 //! Parquet files, written by the same library that reads them, and damaged ones.
 #![cfg(feature = "parquet")]
 // Helpers of a test file are tests too; the lint configuration knows only the annotated functions.
-#![allow(clippy::unwrap_used)]
 
 use std::sync::Arc;
 

@@ -2,7 +2,7 @@
 //! the workspace.
 
 // Helpers of a test file are tests too; the lint configuration knows only the annotated functions.
-#![allow(clippy::disallowed_methods, clippy::unwrap_used, clippy::print_stdout)]
+#![allow(clippy::disallowed_methods, clippy::print_stdout)]
 
 use greybox_recording::noise::{noise_sigma, quantisation_step};
 use greybox_recording::smooth::adaptive;

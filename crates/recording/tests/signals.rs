@@ -1,7 +1,6 @@
 //! Properties of gridding, noise estimates, smoothing and interpolation on signals that are known.
 
 // Helpers of a test file are tests too; the lint configuration knows only the annotated functions.
-#![allow(clippy::unwrap_used)]
 
 use greybox_recording::interpolate::upsample_band_limited;
 use greybox_recording::noise::{

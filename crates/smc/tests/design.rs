@@ -1,5 +1,4 @@
 //! What the checks let through, and what they refuse in which words.
-#![allow(missing_docs, clippy::unwrap_used)]
 
 use greybox_smc::check::ClosedLoop;
 use greybox_smc::thesis::{LinkTangent, PrintedLaw};

@@ -1,5 +1,4 @@
 //! The laws on the virtual rotary flexible link of the thesis (chapter 4.2): 0.5 ms, 10 V, square waves of 0.25 Hz.
-#![allow(missing_docs, clippy::unwrap_used)]
 
 use crate::rig::{DT, Figures, LIMIT, f, follow, rest};
 use greybox_simulate::rigs::RotaryFlexibleLink;

@@ -1,5 +1,4 @@
 //! What must hold for every controllable plant.
-#![allow(missing_docs, clippy::unwrap_used)]
 
 use greybox_smc::check::ClosedLoop;
 use greybox_smc::{BoundaryLayer, Command, FlatOutput, Law, Rate, SmcError, Surface, Tangent, Target, sat};

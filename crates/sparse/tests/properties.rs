@@ -1,5 +1,5 @@
 //! What must not change when columns are rescaled, reordered or turned round.
-#![allow(clippy::single_range_in_vec_init, clippy::unwrap_used)]
+#![allow(clippy::single_range_in_vec_init)]
 
 use greybox_sparse::folds::contiguous;
 use greybox_sparse::select::{Selector, path};

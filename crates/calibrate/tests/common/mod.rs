@@ -1,5 +1,5 @@
 //! Simulated recordings, and the intervals that Gauss–Newton promises.
-#![allow(dead_code, missing_docs, unreachable_pub, clippy::unwrap_used)]
+#![allow(missing_docs, unreachable_pub, clippy::unwrap_used)]
 
 use std::sync::Arc;
 

@@ -1,4 +1,4 @@
-#![allow(dead_code, unreachable_pub)]
+#![allow(unreachable_pub)]
 use greybox_model::Model;
 use greybox_simulate::rigs::{RotaryFlexibleLink, VoltageBalance};
 

@@ -1,5 +1,4 @@
 //! Recordings of the virtual rigs of thesis chapter 3, with noise.
-#![allow(dead_code)]
 use greybox_simulate::rigs::{DelayedDuffing, RotaryFlexibleJoint, Sampling, Sine, multisine, square_wave};
 use rand_distr::{Distribution, Normal};
 use rand_pcg::Pcg64Mcg;
@@ -45,12 +44,11 @@ impl Duffing {
     }
 }
 
-/// What is measured on the flexible joint, and its true velocity.
+/// What is measured on the flexible joint, and the true velocity of its base.
 pub(crate) struct Joint {
     pub(crate) theta: Vec<f64>,
     pub(crate) alpha: Vec<f64>,
     pub(crate) theta_dot: Vec<f64>,
-    pub(crate) alpha_dot: Vec<f64>,
     pub(crate) reference: Vec<f64>,
 }
 
@@ -68,7 +66,6 @@ impl Joint {
             theta: noisy(&column(0), noise, &mut rng),
             alpha: noisy(&column(1), noise, &mut rng),
             theta_dot: column(2),
-            alpha_dot: column(3),
             reference: (0..samples).map(|k| reference(k as f64 * DT)).collect(),
         }
     }
