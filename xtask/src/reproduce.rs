@@ -39,6 +39,9 @@ pub(crate) struct Arguments {
     /// Where to write [default: target/reproduction]
     #[arg(long, value_name = "DIR")]
     out: Option<PathBuf>,
+    /// What `greybox demo --out DIR` left: the story reads its models in place of diagnosing again
+    #[arg(long, value_name = "DIR")]
+    demo: Option<PathBuf>,
 }
 
 /// How a table or figure stands to that of the thesis.
@@ -144,12 +147,17 @@ impl Piece {
 /// Makes a piece; the fixture holds the thesis's numbers.
 pub(crate) type Maker = fn(&Fixture) -> Result<Piece>;
 
+/// Makes a piece from what `greybox demo` left in a folder.
+pub(crate) type Reader = fn(&Path) -> Result<Piece>;
+
 /// A table or figure of the thesis and who makes it again.
 pub(crate) struct Entry {
     /// As the thesis calls it: "Table 2.1".
     pub(crate) id: &'static str,
     /// Its maker; `None` while nobody has written it.
     pub(crate) make: Option<Maker>,
+    /// Who makes the same from the answer of `greybox demo`, for a piece that diagnoses it.
+    pub(crate) read: Option<Reader>,
     /// Whether it takes longer than a test may; it is judged by the command alone.
     pub(crate) slow: bool,
 }
@@ -157,12 +165,17 @@ pub(crate) struct Entry {
 impl Entry {
     /// A table or figure made in a moment.
     fn new(id: &'static str, make: Maker) -> Self {
-        Self { id, make: Some(make), slow: false }
+        Self { id, make: Some(make), read: None, slow: false }
     }
 
     /// One that takes many seconds.
     fn slow(self) -> Self {
         Self { slow: true, ..self }
+    }
+
+    /// One that may be made from the answer of `greybox demo`.
+    fn or_from_demo(self, read: Reader) -> Self {
+        Self { read: Some(read), ..self }
     }
 }
 
@@ -214,10 +227,16 @@ pub(crate) fn run(root: &Path, arguments: &Arguments) -> Result<Ending> {
             missing.push(fixture);
             continue;
         };
-        if entry.slow {
-            eprintln!("{}: this takes a while", entry.id);
+        let piece = match (&arguments.demo, entry.read) {
+            (Some(demo), Some(read)) => read(demo),
+            _ => {
+                if entry.slow {
+                    eprintln!("{}: this takes a while", entry.id);
+                }
+                make(&fixture)
+            }
         }
-        let piece = make(&fixture).with_context(|| entry.id.to_owned())?;
+        .with_context(|| entry.id.to_owned())?;
         let failures = judge(&piece, &fixture);
         println!("{:<11} {}", entry.id, piece.status.name());
         for failure in &failures {
@@ -235,7 +254,6 @@ pub(crate) fn run(root: &Path, arguments: &Arguments) -> Result<Ending> {
     Ok(if outcomes.iter().all(|o| o.failures.is_empty()) { Ending::Done } else { Ending::Missed })
 }
 
-/// The median; of an even number the mean of the middle two.
 /// The middle value; of an even number the mean of the two. NaN without values.
 pub(crate) fn median(mut values: Vec<f64>) -> f64 {
     values.sort_by(f64::total_cmp);
@@ -340,8 +358,11 @@ mod tests {
     #[test]
     fn the_folder_is_written_whole() {
         let out = tempfile::tempdir().unwrap();
-        let arguments =
-            Arguments { only: vec!["table 2.2".into(), "Figure 2.1".into()], out: Some(out.path().into()) };
+        let arguments = Arguments {
+            only: vec!["table 2.2".into(), "Figure 2.1".into()],
+            out: Some(out.path().into()),
+            demo: None,
+        };
         assert_eq!(run(&crate::root(), &arguments).unwrap(), Ending::Done);
         let json = std::fs::read_to_string(out.path().join("index.json")).unwrap();
         let entries: Vec<serde_json::Value> = serde_json::from_str(&json).unwrap();
@@ -353,7 +374,7 @@ mod tests {
         }
         let page = std::fs::read_to_string(out.path().join("index.html")).unwrap();
         assert!(page.contains("Table 2.2") && page.contains("<svg") && !page.contains("src="));
-        let wrong = Arguments { only: vec!["Table 7.7".into()], out: None };
+        let wrong = Arguments { only: vec!["Table 7.7".into()], out: None, demo: None };
         assert_eq!(run(&crate::root(), &wrong).unwrap(), Ending::Refused);
     }
 }

@@ -315,7 +315,7 @@ fn an_absolute_path_is_told_from_a_relative_one() {
 fn the_readme_states_the_commands_that_ci_runs() {
     let text = read(&root().join("README.md"));
     let test = readme::block_after(&text, "test command").unwrap();
-    assert_eq!(test, "cargo test --workspace --locked\n");
+    assert_eq!(test, "cargo test --release --workspace --locked\n");
     let main = readme::block_after(&text, "main command").unwrap();
     assert!(main.contains("greybox demo"), "the main command is the demo: {main}");
     let script = read(&root().join(".ci").join("run"));

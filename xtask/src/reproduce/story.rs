@@ -1,14 +1,16 @@
 //! What finding the physics buys: one design, made on the nominal, the calibrated and the improved model of the demo,
 //! each law run on the virtual rig that made the demo's recordings.
 
+use std::path::Path;
+
 use anyhow::{Context, Result};
 use greybox_control::{Controller, DesignOptions, Method, Metrics, Plant, PlantOptions, design};
 use greybox_model::Model;
+use greybox_report::Report;
 use greybox_simulate::rigs::{LinkRun, RigError, RotaryFlexibleLink, Sampling};
 
 use super::chapter2::draw;
 use super::figure::{Axis, Series, Style};
-use super::fixture::Fixture;
 use super::index::number;
 use super::{Check, Entry, Piece, Status, Table};
 use crate::demo::Demo;
@@ -33,7 +35,61 @@ const MODELS: [&str; 3] = ["nominal", "calibrated", "improved"];
 
 /// The piece.
 pub(crate) fn entry() -> Entry {
-    Entry::new("Story", story).slow()
+    Entry::new("Story", |_| story(&Answer::of_diagnosis()?))
+        .slow()
+        .or_from_demo(|out| story(&Answer::read(out)?))
+}
+
+/// What the diagnosis of the demo says.
+struct Answer {
+    nominal: Model,
+    calibrated: Model,
+    improved: Model,
+    /// Cells: kind, equations, share of the residual, confidence.
+    found: Vec<Vec<String>>,
+}
+
+impl Answer {
+    fn of_diagnosis() -> Result<Self> {
+        let diagnosis = Demo::read()?.diagnose()?;
+        let found = diagnosis.mechanisms.iter();
+        Ok(Self {
+            found: found.map(|m| cells(&m.kind, &m.equations, m.share_explained, m.confidence)).collect(),
+            nominal: diagnosis.nominal,
+            calibrated: diagnosis.calibrated,
+            improved: diagnosis.improved,
+        })
+    }
+
+    /// From what `greybox demo --out OUT` left.
+    fn read(out: &Path) -> Result<Self> {
+        let text = |name: &str| {
+            let path = out.join(name);
+            std::fs::read_to_string(&path).with_context(|| format!("{} cannot be read", path.display()))
+        };
+        let model = |name: &str| -> Result<Model> { Ok(Model::from_toml(&text(name)?, name)?) };
+        let report = Report::from_json(&text("report.json")?)?;
+        let nominal = model("rotary_link.toml")?;
+        let mut calibrated = nominal.clone();
+        for parameter in &mut calibrated.parameters {
+            if let Some(refitted) = report.parameters.get(&parameter.name).and_then(|p| p.calibrated) {
+                parameter.value = refitted;
+            }
+        }
+        let found = report.mechanisms.iter();
+        Ok(Self {
+            found: found
+                .map(|m| cells(&m.kind, m.equation.as_slice(), m.share_explained, m.confidence))
+                .collect(),
+            nominal,
+            calibrated,
+            improved: model("improved.toml")?,
+        })
+    }
+}
+
+fn cells(kind: &str, equations: &[String], share: f64, confidence: f64) -> Vec<String> {
+    vec![kind.to_owned(), equations.join(", "), number(share), number(confidence)]
 }
 
 /// One way to design.
@@ -160,9 +216,8 @@ fn curves(run: &LinkRun, amplitude: f64) -> [Vec<[f64; 2]>; 2] {
     [thin(&|k| run.states[k][0]), thin(&|k| run.states[k][0] - reference(amplitude, k))]
 }
 
-fn story(_: &Fixture) -> Result<Piece> {
-    let diagnosis = Demo::read()?.diagnose()?;
-    let models = [&diagnosis.nominal, &diagnosis.calibrated, &diagnosis.improved];
+fn story(answer: &Answer) -> Result<Piece> {
+    let models = [&answer.nominal, &answer.calibrated, &answer.improved];
     let mut piece = Piece::new(
         Status::VirtualRig,
         "The model and the recordings of greybox demo, diagnosed; then one and the same design on the model as given, \
@@ -174,19 +229,12 @@ fn story(_: &Fixture) -> Result<Piece> {
          the friction found out of the motion, ends nearer, and how near depends on how well the friction was \
          found. The RMS error is mostly the way there.",
     );
-    let found: Vec<Vec<String>> = diagnosis
-        .mechanisms
-        .iter()
-        .map(|m| {
-            vec![m.kind.clone(), m.equations.join(", "), number(m.share_explained), number(m.confidence)]
-        })
-        .collect();
     piece.tables.push(Table {
         caption: "What the diagnosis found.".into(),
         headings: ["mechanism", "equation", "share of the residual", "confidence"]
             .map(str::to_owned)
             .to_vec(),
-        rows: found,
+        rows: answer.found.clone(),
     });
     let mut rows = Vec::new();
     for way in ways() {
@@ -248,7 +296,7 @@ fn story(_: &Fixture) -> Result<Piece> {
     });
     // Torque per volt of the data sheet: that of the nominal model, which holds it fixed.
     let value = |name: &str| -> Result<f64> {
-        let model = &diagnosis.improved;
+        let model = &answer.improved;
         Ok(model.parameters[model.parameter(name).with_context(|| format!("no parameter {name}"))?].value)
     };
     let torque = value("eta")? * value("Kg")? * value("kt")? / value("Rm")?;
