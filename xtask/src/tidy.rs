@@ -256,10 +256,13 @@ fn our_crates_are_asked_for_in_the_version_they_have() {
 /// Names of the dependencies of a package that come from the workspace, and of those that do not.
 fn dependencies(manifest: &Table) -> (BTreeSet<String>, BTreeSet<String>) {
     let (mut shared, mut own) = (BTreeSet::new(), BTreeSet::new());
-    for key in ["dependencies", "dev-dependencies", "build-dependencies"] {
-        for (name, value) in manifest.get(key).and_then(Value::as_table).into_iter().flatten() {
-            let from_workspace = value.get("workspace").and_then(Value::as_bool) == Some(true);
-            if from_workspace { &mut shared } else { &mut own }.insert(name.clone());
+    let targets = manifest.get("target").and_then(Value::as_table).into_iter().flatten();
+    for table in targets.filter_map(|(_, of)| of.as_table()).chain([manifest]) {
+        for key in ["dependencies", "dev-dependencies", "build-dependencies"] {
+            for (name, value) in table.get(key).and_then(Value::as_table).into_iter().flatten() {
+                let from_workspace = value.get("workspace").and_then(Value::as_bool) == Some(true);
+                if from_workspace { &mut shared } else { &mut own }.insert(name.clone());
+            }
         }
     }
     (shared, own)
