@@ -89,7 +89,7 @@ impl<'a> Runs<'a> {
     }
 
     fn diagnose(&self, question: &Question, out: &Path) -> Result<Answered> {
-        eprintln!("{} …", out.display());
+        eprintln!("{} …", out.file_name().unwrap_or_default().display());
         // A report of an earlier run must not be taken for this one's.
         if out.exists() {
             std::fs::remove_dir_all(out).with_context(|| format!("{} cannot be emptied", out.display()))?;
