@@ -3,8 +3,6 @@
 use std::fs::File;
 use std::path::{Path, PathBuf};
 use std::process::{Command, ExitStatus, Stdio};
-use std::sync::atomic::{AtomicUsize, Ordering};
-use std::sync::{Mutex, PoisonError};
 use std::time::{Duration, Instant};
 
 use anyhow::{Context, Result, bail};
@@ -91,38 +89,6 @@ pub(crate) fn run(command: &mut Command, logs: &Path, limit: Duration) -> Result
     }
 }
 
-/// Works through the items in their order, several at a time; the results in the same order. After an error nothing new is
-/// begun.
-///
-/// # Errors
-/// The first of `work`.
-pub(crate) fn in_order<I: Sync, T: Send>(
-    items: &[I],
-    jobs: usize,
-    work: impl Fn(&I) -> Result<T> + Sync,
-) -> Result<Vec<T>> {
-    let next = AtomicUsize::new(0);
-    let results: Mutex<Vec<(usize, Result<T>)>> = Mutex::default();
-    std::thread::scope(|scope| {
-        for _ in 0..jobs.max(1) {
-            scope.spawn(|| {
-                loop {
-                    let i = next.fetch_add(1, Ordering::Relaxed);
-                    let Some(item) = items.get(i) else { break };
-                    let result = work(item);
-                    if result.is_err() {
-                        next.store(items.len(), Ordering::Relaxed);
-                    }
-                    results.lock().unwrap_or_else(PoisonError::into_inner).push((i, result));
-                }
-            });
-        }
-    });
-    let mut results = results.into_inner().unwrap_or_else(PoisonError::into_inner);
-    results.sort_by_key(|r| r.0);
-    results.into_iter().map(|(_, r)| r).collect()
-}
-
 /// User and system time of the text of `/proc/PID/stat`, s. Its unit is 10 ms on every Linux that Rust runs on.
 fn cpu_time(stat: &str) -> Option<f64> {
     // The name of the program, in parentheses, may hold anything.
@@ -141,22 +107,6 @@ fn high_water_mark(status: &str) -> Option<u64> {
 #[cfg(test)]
 mod tests {
     use super::*;
-
-    #[test]
-    fn work_is_done_side_by_side_and_told_in_order_until_an_error() {
-        let items: Vec<u64> = (0..20).collect();
-        let squares = in_order(&items, 3, |i| {
-            std::thread::sleep(Duration::from_millis(5 - i % 5));
-            Ok(i * i)
-        });
-        assert_eq!(squares.unwrap(), items.iter().map(|i| i * i).collect::<Vec<_>>());
-        let done = AtomicUsize::new(0);
-        let failed = in_order(&items, 1, |i| {
-            done.fetch_add(1, Ordering::Relaxed);
-            if *i == 4 { bail!("four") } else { Ok(()) }
-        });
-        assert_eq!((failed.unwrap_err().to_string().as_str(), done.into_inner()), ("four", 5));
-    }
 
     #[test]
     fn the_high_water_mark_is_read() {

@@ -19,7 +19,7 @@ use serde_json::json;
 
 use crate::{Ending, process};
 use cases::Case;
-use runs::Runs;
+use runs::{Question, Runs};
 
 /// What `prove` takes.
 #[derive(Debug, clap::Args)]
@@ -45,7 +45,7 @@ pub(crate) struct Arguments {
     /// Keep the concealed suite's cases, truths and results here (target/prove/concealed otherwise)
     #[arg(long, value_name = "DIR")]
     keep: Option<PathBuf>,
-    /// Cases of the concealed suite that run at the same time; with --times-advisory, real recordings too
+    /// Cases of the concealed suite that run at the same time
     #[arg(long, value_name = "N", default_value_t = 2)]
     jobs: usize,
     /// Beside greybox, judge what sparse regression of the missing acceleration says of the concealed suite
@@ -153,21 +153,15 @@ pub(crate) fn run(root: &Path, arguments: &Arguments) -> Result<Ending> {
     }
     let binary = process::build(root)?;
     let mut runs = Runs::new(&binary, Duration::from_secs(arguments.timeout));
-    let results = process::target(root).join("prove");
-    let of_case = |case: &Case| results.join(&case.name);
-    let of_sets = results.join("sets");
-    if arguments.times_advisory {
-        let mut questions: Vec<_> =
-            cases.iter().map(|case| (case.question(&folder), of_case(case))).collect();
-        questions.extend(sets.iter().flat_map(|sets| sets::questions(sets, &folder, &of_sets, only)));
-        runs.ask_all(questions, arguments.jobs)?;
-    }
     let mut outcomes = Vec::new();
     for case in &cases {
-        outcomes.push(measure(&mut runs, &folder, case, &of_case(case))?);
+        eprintln!("{} …", case.name);
+        let out = process::target(root).join("prove").join(&case.name);
+        outcomes.push(measure(&mut runs, &folder, case, &out)?);
     }
     if let Some(sets) = sets {
-        let answers = sets::run(&sets, &folder, &mut runs, &of_sets, only)?;
+        let out = process::target(root).join("prove").join("sets");
+        let answers = sets::run(&sets, &folder, &mut runs, &out, only)?;
         println!("{}", sets::text(&answers));
         let totals = sets::totals(&answers);
         let figures = match &arguments.floors {
@@ -236,7 +230,8 @@ fn select(cases: Vec<Case>, only: Option<&str>) -> Result<Vec<Case>> {
 
 /// Runs one case; a run that fails is a figure like any other.
 fn measure(runs: &mut Runs<'_>, folder: &Path, case: &Case, out: &Path) -> Result<Outcome> {
-    let answered = runs.ask(&case.question(folder), out)?;
+    let question = Question::of(&folder.join(&case.folder), &case.model, &case.train, &case.holdout);
+    let answered = runs.ask(&question, out)?;
     let mut figures = match &answered.report {
         Ok(report) => (case.judge)(report),
         Err(why) => vec![Figure::judged("run", why, "a report", false)],

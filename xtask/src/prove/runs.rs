@@ -23,12 +23,6 @@ impl Question {
         let at = |files: &[String]| files.iter().map(|file| folder.join(file)).collect();
         Question { model: folder.join(model), train: at(train), holdout: at(holdout) }
     }
-
-    /// Size of its recordings.
-    fn bytes(&self) -> u64 {
-        let files = self.train.iter().chain(&self.holdout);
-        files.filter_map(|file| std::fs::metadata(file).ok()).map(|of| of.len()).sum()
-    }
 }
 
 /// How the run went, and its report, or why there is none.
@@ -69,27 +63,7 @@ impl<'a> Runs<'a> {
         Ok(&self.done[at].1)
     }
 
-    /// Puts those of the questions that were not answered before, several at a time, the largest recordings first. Their times
-    /// are those of a busy machine.
-    ///
-    /// # Errors
-    /// As [`Runs::ask`].
-    pub(crate) fn ask_all(&mut self, questions: Vec<(Question, PathBuf)>, jobs: usize) -> Result<()> {
-        let mut open: Vec<(Question, PathBuf)> = Vec::new();
-        for (question, out) in questions {
-            let known = self.done.iter().map(|(asked, _)| asked).chain(open.iter().map(|(asked, _)| asked));
-            if !known.into_iter().any(|asked| *asked == question) {
-                open.push((question, out));
-            }
-        }
-        open.sort_by_key(|(question, _)| std::cmp::Reverse(question.bytes()));
-        let answers = process::in_order(&open, jobs, |(question, out)| self.diagnose(question, out))?;
-        self.done.extend(open.into_iter().map(|(question, _)| question).zip(answers));
-        Ok(())
-    }
-
     fn diagnose(&self, question: &Question, out: &Path) -> Result<Answered> {
-        eprintln!("{} …", out.file_name().unwrap_or_default().display());
         // A report of an earlier run must not be taken for this one's.
         if out.exists() {
             std::fs::remove_dir_all(out).with_context(|| format!("{} cannot be emptied", out.display()))?;
@@ -140,10 +114,7 @@ mod tests {
             let answered = runs.ask(&question(model), &place.path().join(out)).unwrap();
             assert!(answered.report.is_err());
         }
-        let all = ["two.toml", "three.toml", "three.toml"].map(|m| (question(m), place.path().join("4")));
-        runs.ask_all(all.to_vec(), 2).unwrap();
-        assert!(runs.ask(&question("three.toml"), &place.path().join("5")).unwrap().report.is_err());
-        assert_eq!(std::fs::read_to_string(&count).unwrap(), "run\n".repeat(3));
+        assert_eq!(std::fs::read_to_string(&count).unwrap(), "run\nrun\n");
         assert!(place.path().join("1").is_dir() && !place.path().join("2").exists());
     }
 }

@@ -3,7 +3,7 @@
 //!
 //! `reachable.json` beside the recordings tells what is reachable and which names are right. Only this scorer reads it.
 
-use std::path::{Path, PathBuf};
+use std::path::Path;
 
 use anyhow::{Context, Result, bail};
 use greybox_report::Report;
@@ -160,29 +160,14 @@ pub(crate) fn run(
     only: Option<&str>,
 ) -> Result<Vec<Answer>> {
     let wanted = sets.sets.iter().filter(|s| only.is_none_or(|w| s.name().contains(w)));
-    wanted
-        .zip(questions(sets, folder, out, only))
-        .map(|(set, (question, out))| {
-            let answered = runs.ask(&question, &out)?;
-            Ok(judge(set, answered.report.as_ref(), answered.run.seconds))
-        })
-        .collect()
+    wanted.map(|set| one(set, folder, runs, &out.join(set.name().replace('/', "-")))).collect()
 }
 
-/// What [`run`] asks, and where the files of the answers go.
-pub(crate) fn questions(
-    sets: &Sets,
-    folder: &Path,
-    out: &Path,
-    only: Option<&str>,
-) -> Vec<(Question, PathBuf)> {
-    let wanted = sets.sets.iter().filter(|s| only.is_none_or(|w| s.name().contains(w)));
-    wanted
-        .map(|set| {
-            let question = Question::of(&folder.join(&set.set), &set.model, &set.train, &set.holdout);
-            (question, out.join(set.name().replace('/', "-")))
-        })
-        .collect()
+fn one(set: &Set, folder: &Path, runs: &mut Runs<'_>, out: &Path) -> Result<Answer> {
+    eprintln!("{} …", set.name());
+    let question = Question::of(&folder.join(&set.set), &set.model, &set.train, &set.holdout);
+    let answered = runs.ask(&question, out)?;
+    Ok(judge(set, answered.report.as_ref(), answered.run.seconds))
 }
 
 /// The error of the worst channel by the report's criterion: infinite where a simulation diverges.
