@@ -7,6 +7,7 @@ use anyhow::{Context, Result};
 use greybox_control::{Controller, DesignOptions, Method, Metrics, Plant, PlantOptions, design};
 use greybox_model::Model;
 use greybox_report::Report;
+use greybox_report::contract::{Ordered, Parameter};
 use greybox_simulate::rigs::{LinkRun, RigError, RotaryFlexibleLink, Sampling};
 
 use super::chapter2::draw;
@@ -70,12 +71,7 @@ impl Answer {
         let model = |name: &str| -> Result<Model> { Ok(Model::from_toml(&text(name)?, name)?) };
         let report = Report::from_json(&text("report.json")?)?;
         let nominal = model("rotary_link.toml")?;
-        let mut calibrated = nominal.clone();
-        for parameter in &mut calibrated.parameters {
-            if let Some(refitted) = report.parameters.get(&parameter.name).and_then(|p| p.calibrated) {
-                parameter.value = refitted;
-            }
-        }
+        let calibrated = refitted(&nominal, &report.parameters)?;
         let found = report.mechanisms.iter();
         Ok(Self {
             found: found
@@ -86,6 +82,17 @@ impl Answer {
             improved: model("improved.toml")?,
         })
     }
+}
+
+/// The equations of a model with the parameters to which a report says that they were refitted, each in its own unit.
+fn refitted(nominal: &Model, parameters: &Ordered<Parameter>) -> Result<Model> {
+    let mut model = nominal.clone();
+    for parameter in &mut model.parameters {
+        let told = parameters.get(&parameter.name).and_then(|p| p.calibrated);
+        let told = told.with_context(|| format!("report.json: no refitted value of `{}`", parameter.name))?;
+        parameter.value = parameter.unit.as_ref().map_or(told, |unit| unit.to_si(told));
+    }
+    Ok(model)
 }
 
 fn cells(kind: &str, equations: &[String], share: f64, confidence: f64) -> Vec<String> {
@@ -341,6 +348,29 @@ fn judge(piece: &mut Piece, way: &Way, degrees: f64, reached: &[Reached]) {
 #[cfg(test)]
 mod tests {
     use super::*;
+
+    #[test]
+    fn a_refitted_parameter_is_read_in_its_unit() {
+        let text = "[states]\nx = { unit = \"m\" }\n[parameters]\nl = { value = 2, unit = \"mm\" }\nc = { value = 1, unit = \"1/s\" }\n\
+                    [equations]\nx = \"x' + c*(x - l) = 0\"\n";
+        let nominal = Model::from_toml(text, "x.toml").unwrap();
+        let told = |value: f64| Parameter {
+            nominal: value,
+            value,
+            ci95: None,
+            unit: None,
+            fixed: false,
+            calibrated: Some(value),
+            calibrated_ci95: None,
+        };
+        let mut report = Ordered::from_iter([("l".to_owned(), told(3.0)), ("c".to_owned(), told(0.5))]);
+        let model = refitted(&nominal, &report).unwrap();
+        let values: Vec<f64> = model.parameters.iter().map(|p| p.value).collect();
+        assert!((values[0] - 0.003).abs() < 1e-12 && (values[1] - 0.5).abs() < 1e-12, "{values:?}");
+        report["c"].calibrated = None;
+        let error = refitted(&nominal, &report).unwrap_err().to_string();
+        assert!(error.contains("`c`"), "{error}");
+    }
 
     /// Without the diagnosis, which takes a minute: the laws of the nominal model on the rig.
     #[test]
