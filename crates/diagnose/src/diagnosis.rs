@@ -512,12 +512,46 @@ fn conclude(
         if names {
             agreed = polished.fitted.parts.iter().map(|p| named_as(p, library, &nominal.model)).collect();
         }
-        let in_both = |part: &Part| agreed.contains(&named_as(part, library, &nominal.model));
-        let standing = (&found, &polished);
-        let explored = explored(search, standing, in_both, names, &baseline, &judge);
-        if let Some(Explored { found: other, polished: simulates, named }) = explored {
-            judged = judged_of(&other, &simulates, &|part| named.contains(&part.candidate));
-            (found, polished) = (other, simulates);
+        let closed = Closed::of(search, &found, &polished, &baseline, &judge);
+        let reaches = |closed: &Closed| {
+            let scale = residual_scale(&closed.polished.fitted, &closed.found.scale);
+            leaves_noise(&closed.scores(&judge), &closed.polished.origin, &scale)
+        };
+        let complete = closed.as_ref().is_some_and(reaches);
+        // What reaches the noise leaves no error of the model to be believed beside.
+        if !complete {
+            let in_both = |part: &Part| agreed.contains(&named_as(part, library, &nominal.model));
+            let standing = (&found, &polished);
+            let explored = explored(search, standing, in_both, names, &baseline, &judge);
+            if let Some(Explored { found: other, polished: simulates, named }) = explored {
+                judged = judged_of(&other, &simulates, &|part| named.contains(&part.candidate));
+                (found, polished) = (other, simulates);
+            }
+        }
+        if let Some(closed) = closed
+            && closed.outdoes((&found, &polished), &judge)
+        {
+            // The names that stand, as far as the closure holds them and no other terms can be in their place.
+            let stands = |part: &Part| found.errs && agreed.contains(&named_as(part, library, &nominal.model));
+            let all = judged.verdict == Verdict::MissingPhysics;
+            let standing = polished.fitted.parts.iter().zip(&judged.named);
+            let names: Vec<&Candidate> = standing
+                .filter(|(part, named)| (all && **named) || stands(part))
+                .map(|(part, _)| &part.candidate)
+                .collect();
+            let parts = &closed.polished.fitted.parts;
+            let held: Vec<usize> =
+                (0..parts.len()).filter(|&i| names.contains(&&parts[i].candidate)).collect();
+            if complete || held.len() == names.len() {
+                let named: Vec<Candidate> = held
+                    .into_iter()
+                    .filter(|&i| !search.is_replaceable(&closed.found, i))
+                    .map(|i| parts[i].candidate.clone())
+                    .collect();
+                let Closed { found: other, polished: simulates } = closed;
+                judged = judged_of(&other, &simulates, &|part| named.contains(&part.candidate));
+                (found, polished) = (other, simulates);
+            }
         }
         limited |= found.limited;
     }
@@ -599,7 +633,7 @@ fn conclude(
     let mut mechanisms =
         findings(&improved, &found, &nominal.model, library, &scale, &shares, &train_role, &uncertainty);
     let mut subsets = Vec::new();
-    if verdict == Verdict::MissingPhysics && believed.iter().all(|b| *b) {
+    if verdict == Verdict::MissingPhysics && believed.iter().all(|b| *b) && !found.closed {
         subsets = subsets_of(
             &shares,
             [&alone, &without].map(|rss| rss.iter().copied().map(share).collect()),
@@ -723,7 +757,11 @@ impl Judged {
             .map(|i| search.rss_without(improved, &[i], calibrated, &found.scale).unwrap_or(base))
             .collect();
         let share = |rss: f64| (rss / base.max(1e-300)).clamp(0.0, 1.0);
-        let alone = rss_alone(search, (calibrated, improved), &found.scale, &without, base);
+        // (Of the many terms of a closure none does much alone.)
+        let alone = match found.closed {
+            true => vec![base; without.len()],
+            false => rss_alone(search, (calibrated, improved), &found.scale, &without, base),
+        };
         let lost: Vec<f64> = without.iter().map(|rss| share(rss - full)).collect();
         let gained: Vec<f64> = alone.iter().map(|rss| share(base - rss)).collect();
         let shares = divided(&lost, &gained, share(base - full));
@@ -736,7 +774,10 @@ impl Judged {
         // A law that another one, which the library has no name for, stands in for.
         let doubts: Vec<Option<f64>> = (0..improved.parts.len())
             .into_par_iter()
-            .map(|i| if found.errs { None } else { search.doubt(&found.improved, i, &found.scale) })
+            .map(|i| match found.errs || found.closed {
+                true => None,
+                false => search.doubt(&found.improved, i, &found.scale),
+            })
             .collect();
         let beaten = |i: usize| doubts[i].is_some_and(|d| d > UNDECIDED);
         let is_imitation = (0..doubts.len()).any(|i| {
@@ -749,7 +790,8 @@ impl Judged {
             _ if !named.contains(&true) && !improved.parts.is_empty() => Verdict::Unexplained,
             // (The exploration has held free shapes against its laws.)
             _ if found.errs && (by_name < EXPLAINED || is_patchwork()) => Verdict::Unexplained,
-            _ if found.errs => Verdict::MissingPhysics,
+            // (Of a closure the names have been held against all other terms.)
+            _ if found.errs || found.closed => Verdict::MissingPhysics,
             Verdict::MissingPhysics
                 if is_imitation || is_patchwork() || is_rivalled(&comparable, &found.scale, library) =>
             {
@@ -758,6 +800,58 @@ impl Judged {
             verdict => verdict,
         };
         Judged { verdict, named, shares, left, surface, alone, without, full, base, doubts }
+    }
+}
+
+/// A closure that can be handed back, in the place of what stands.
+struct Closed {
+    found: Found,
+    polished: Polished,
+}
+
+impl Closed {
+    /// The closure that simulates best of those that begin with the calibrated model and with what stands.
+    fn of(
+        search: &Search<'_>,
+        found: &Found,
+        polished: &Polished,
+        baseline: &Baseline,
+        judge: &Judge,
+    ) -> Option<Closed> {
+        let mut from = vec![&found.calibrated];
+        if !polished.fitted.parts.is_empty() {
+            from.push(&found.improved);
+        }
+        let closed = from.into_iter().filter_map(|from| {
+            let mut found = search.closure(found, from)?;
+            let polished = polish(&found.improved, &found.scale, judge);
+            let polished = defend(search, &mut found, polished, baseline, judge, false);
+            (!polished.fitted.parts.is_empty()).then_some(Closed { found, polished })
+        });
+        closed.min_by(|a, b| a.misfit(judge).total_cmp(&b.misfit(judge)))
+    }
+
+    fn scores(&self, judge: &Judge) -> Vec<Score> {
+        let fitted = &self.polished.fitted;
+        let scale = residual_scale(fitted, &self.found.scale);
+        judge.scores(&fitted.setup, &fitted.fit.point.parameters, &scale)
+    }
+
+    fn misfit(&self, judge: &Judge) -> f64 {
+        judge.criterion.misfit(&self.scores(judge))
+    }
+
+    /// Whether it simulates the training recordings better than what stands, and predicts what was left out of its fit
+    /// better, beyond chance.
+    fn outdoes(&self, (found, polished): (&Found, &Polished), judge: &Judge) -> bool {
+        let errors = |found: &Found, polished: &Polished| {
+            let scale = residual_scale(&polished.fitted, &found.scale);
+            crate::validate::errors(&polished.origin, &scale, judge.criterion, judge.window)
+        };
+        let scale = residual_scale(&polished.fitted, &found.scale);
+        let (setup, parameters) = (&polished.fitted.setup, &polished.fitted.fit.point.parameters);
+        self.misfit(judge).total_cmp(&judge.misfit(setup, parameters, &scale)).is_lt()
+            && Gain::of(&errors(found, polished), &errors(&self.found, &self.polished)).is_beyond_chance()
     }
 }
 

@@ -7,6 +7,7 @@ struct Readme;
 
 pub mod along;
 pub mod candidate;
+mod closure;
 pub mod diagnosis;
 pub mod evidence;
 mod explore;

@@ -8,6 +8,7 @@
 //! force  = "s0*z"                # `replace = "…"` for an input (u), measurement (y), parameter (p), spring (k*d)
 //! linear = ["s0"]                # enter linearly: the score test gives their first values
 //! positive = ["s0", "fc"]        # physically positive
+//! named = false                  # optional: a term of a formula, without a name of its own
 //! [states.z]                     # memory: a state with an equation of its own
 //! equation = "z' = d' - s0/fc*abs(d')*z"
 //! unit     = "d'*t"              # has the unit of this expression
@@ -250,6 +251,8 @@ pub struct Mechanism {
     pub domain: Option<Domain>,
     /// What it acts on.
     pub on: On,
+    /// Whether diagnosis names it; else it is a term that a formula may hold where no name reaches.
+    pub named: bool,
     /// The force, or the replacement.
     pub law: Expr,
     /// On a pair: the force on the other coordinate's equation.
@@ -359,6 +362,8 @@ struct File {
     family: String,
     domain: Option<Domain>,
     on: On,
+    #[serde(default = "yes")]
+    named: bool,
     force: Option<String>,
     reaction: Option<String>,
     replace: Option<String>,
@@ -401,6 +406,10 @@ struct File {
     special_case: toml::map::Map<String, toml::Value>,
     #[serde(default)]
     about: About,
+}
+
+fn yes() -> bool {
+    true
 }
 
 #[derive(Deserialize)]
@@ -492,6 +501,7 @@ impl Mechanism {
             family: raw.family,
             domain: raw.domain,
             on: raw.on,
+            named: raw.named,
             law,
             reaction: raw.reaction.as_deref().map(|t| expression(t, "", "reaction")).transpose()?,
             states: raw
@@ -524,12 +534,31 @@ impl Mechanism {
             special_case: of_others("special_case", raw.special_case)?,
             about: raw.about,
         };
-        mechanism.own = mechanism.named().filter(|n| mechanism.uses(n)).map(str::to_string).collect();
+        mechanism.own = mechanism.names().filter(|n| mechanism.uses(n)).map(str::to_string).collect();
         mechanism.check_names()?;
         mechanism.check_parameters()?;
         mechanism.check_data()?;
         mechanism.check_linear()?;
+        if !mechanism.named && !mechanism.is_term() {
+            return Err(Fault::new(
+                "",
+                "named",
+                "a law without a name is a force times one coefficient: one name under `linear`, no `[inner]`, no `[first]`, no `[states]`, no `reaction`, and no `t`",
+            ));
+        }
         Ok(mechanism)
+    }
+
+    /// Whether it is a force of the machine's motion times one coefficient, and nothing else: what a formula is a sum of.
+    pub fn is_term(&self) -> bool {
+        !self.on.replaces()
+            && matches!((&self.linear[..], &self.own[..]), ([linear], [own]) if linear == own)
+            && self.inner.is_empty()
+            && self.first.is_empty()
+            && self.states.is_empty()
+            && self.reaction.is_none()
+            && self.doubts.is_empty()
+            && !self.law.mentions("t")
     }
 
     /// The recording that separates it from others, in the words of what moves or of what does not.
@@ -555,7 +584,7 @@ impl Mechanism {
     }
 
     /// Every name given to a parameter or a shape.
-    fn named(&self) -> impl Iterator<Item = &str> {
+    fn names(&self) -> impl Iterator<Item = &str> {
         self.linear
             .iter()
             .map(String::as_str)
@@ -639,7 +668,7 @@ impl Mechanism {
     /// What is said about parameters is about this mechanism's.
     fn check_parameters(&self) -> Result<(), Fault> {
         for name in &self.positive {
-            if !self.named().any(|n| n == name) {
+            if !self.names().any(|n| n == name) {
                 return Err(Fault::new(
                     "",
                     "positive",
@@ -673,7 +702,7 @@ impl Mechanism {
             }
         }
         if self.first.is_empty()
-            && let Some(name) = self.named().find(|n| !self.uses(n))
+            && let Some(name) = self.names().find(|n| !self.uses(n))
         {
             let (section, key) = if self.inner(name).is_some() { ("inner", name) } else { ("", "linear") };
             return Err(Fault::new(
@@ -1234,7 +1263,7 @@ mod tests {
         for (mechanism, (file, _)) in library.iter().zip(BUILT_IN) {
             assert!(file.starts_with(&mechanism.kind), "{file}: {}", mechanism.kind);
             assert!(!mechanism.about.signature.is_empty());
-            assert!(!mechanism.about.physics.is_empty(), "{file}: [about] physics");
+            assert!(!mechanism.named || !mechanism.about.physics.is_empty(), "{file}: [about] physics");
             let described: Vec<&String> = mechanism.about.parameters.keys().collect();
             let mut own = mechanism.own.clone();
             own.sort();
@@ -1310,6 +1339,7 @@ mod tests {
             ("replace = \"d\"", 4, "has `force`"),
             ("force = \"d\"\nreplace = \"d\"", 4, "none has both"),
             ("force = \"d\"\nreaction = \"d\"", 5, "only a mechanism on a pair"),
+            ("named = false\nforce = \"k*d*t\"\nlinear = [\"k\"]", 4, "a law without a name is a force"),
             ("force = \"fc*sign(d'\"\nlinear = [\"fc\"]", 4, "`force = \"fc*sign(d'\"`"),
             ("force = \"fc*sgn(d')\"\nlinear = [\"fc\"]", 4, "sgn"),
             ("force = \"fc*sign(d')\"", 4, "the law uses `fc`, which is neither a parameter"),

@@ -750,7 +750,7 @@ pub fn gram(
     let nx = setup.system.nx;
     let np = setup.free.len();
     let lanes = columns.len();
-    let rows = setup.with_problem(level, scale, |p| p.rows(point, true, Some(signals)));
+    let rows = setup.with_problem(level, scale, |p| p.rows(point, true, (lanes > 0).then_some(signals)));
     let parts: Vec<Gram> = rows
         .into_par_iter()
         .map(|rows| {
@@ -950,17 +950,127 @@ impl Gram {
     }
 }
 
-/// Two candidates that explain together what neither does alone.
+/// Candidates that explain more together, with the values that they have together.
 #[derive(Debug, Clone)]
-pub struct Pair {
-    /// The two, with the values that they have together.
-    pub members: [Scored; 2],
+pub struct Together {
+    /// Each with its share in this.
+    pub members: Vec<Scored>,
     /// Share of the residual sum of squares that they explain, to first order.
     pub gain: f64,
+    /// First-order shift of the free parameters that goes with them.
+    pub shift: Vec<f64>,
 }
 
 /// Least share that a pair must explain, and least surplus over its members alone.
 const PAIR_GAIN: f64 = 0.05;
+
+/// All candidates in one Gram matrix, the parameters projected out: a regression on a few of its columns costs
+/// next to nothing.
+struct Regressions<'a> {
+    library: &'a [Mechanism],
+    candidates: &'a [Candidate],
+    lanes: Lanes,
+    np: usize,
+    /// What the parameters do for each column, and for the residual.
+    solved: Vec<Vec<f64>>,
+    base: Vec<f64>,
+    /// GᵀG and Gᵀr, projected.
+    gg: Vec<f64>,
+    gr: Vec<f64>,
+    /// Columns that the parameters cannot do already.
+    independent: Vec<bool>,
+    /// rᵀPr.
+    rr: f64,
+}
+
+impl<'a> Regressions<'a> {
+    fn new(
+        setup: &Setup,
+        library: &'a [Mechanism],
+        candidates: &'a [Candidate],
+        level: &Level,
+        scale: &[f64],
+        point: &Point,
+    ) -> Regressions<'a> {
+        let (along, forces) = Along::observed(setup, level, scale, point);
+        let spectra = Spectra::new(setup, level, scale, point, &along, &forces);
+        let lanes = lanes(setup, library, candidates, &along, &spectra);
+        let n = lanes.columns.len();
+        let whole = 0..n;
+        let gram = gram(setup, level, scale, point, &lanes.signals, &lanes.columns, vec![whole]);
+        let Projection { gg, gr, columns: solved, base } = gram.projection(0);
+        let independent = |a: usize| gg[a * n + a] > 0.0 && gram.independence(a, gram.gg[0][a * n + a]) > INDEPENDENT;
+        let independent = (0..n).map(independent).collect();
+        let (np, rr) = (gram.np, gram.remaining().max(1e-300));
+        Regressions { library, candidates, lanes, np, solved, base, gg, gr, independent, rr }
+    }
+
+    /// Which of a variant's coefficients cannot be negative.
+    fn positive(&self, v: &Variant) -> Vec<bool> {
+        let mechanism = &self.library[self.candidates[v.candidate].mechanism];
+        match v.secant {
+            Some(_) => vec![true],
+            None => mechanism.linear.iter().map(|l| mechanism.positive.contains(l)).collect(),
+        }
+    }
+
+    /// Coefficients of a few columns and the share that they explain; `None` where a sign is impossible.
+    fn regress(&self, columns: &[usize], positive: &[bool]) -> Option<(Vec<f64>, f64)> {
+        if columns.iter().any(|&c| !self.independent[c]) {
+            return None;
+        }
+        let (n, m) = (self.lanes.columns.len(), columns.len());
+        let projected = |a: usize, b: usize| self.gg[columns[a] * n + columns[b]];
+        let d: Vec<f64> = (0..m).map(|i| projected(i, i).sqrt()).collect();
+        let mut a = vec![0.0; m * m];
+        for i in 0..m {
+            for j in 0..m {
+                a[i * m + j] = projected(i, j) / (d[i] * d[j]);
+            }
+            a[i * m + i] += 1e-6;
+        }
+        let b: Vec<f64> = (0..m).map(|i| self.gr[columns[i]] / d[i]).collect();
+        let x = qr::solve_spd(&a, m, &b);
+        let gain = qr::dot(&x, &b) / self.rr;
+        let c: Vec<f64> = x.iter().zip(&d).map(|(x, d)| x / d).collect();
+        let allowed = c.iter().zip(positive).all(|(c, p)| !p || *c > 0.0);
+        (allowed && gain.is_finite()).then_some((c, gain))
+    }
+
+    /// A variant with these coefficients of its columns.
+    fn member(&self, variant: &Variant, c: &[f64], gain: f64) -> Option<Scored> {
+        let mechanism = &self.library[self.candidates[variant.candidate].mechanism];
+        let values = match variant.secant {
+            None => mechanism.values(c, &variant.inner),
+            Some(true) if c[0] < 3.0 => mechanism.values(&[], &variant.scaled(mechanism, c[0])),
+            Some(_) => mechanism.values(&[], &variant.inner),
+        }?;
+        Some(Scored {
+            candidate: variant.candidate,
+            gain,
+            values,
+            shift: vec![0.0; self.np],
+            scales: variant.scales.clone(),
+            faint: None,
+            others: Vec::new(),
+        })
+    }
+
+    /// Variants with these coefficients of all their columns.
+    fn together(&self, variants: &[usize], coefficients: &[f64], gain: f64) -> Option<Together> {
+        let (mut members, mut shift, mut from) = (Vec::new(), self.base.clone(), 0);
+        for &v in variants {
+            let variant = &self.lanes.variants[v];
+            let own = &coefficients[from..from + variant.columns.len()];
+            from += own.len();
+            members.push(self.member(variant, own, gain)?);
+            for (column, c) in variant.columns.clone().zip(own) {
+                shift.iter_mut().zip(&self.solved[column]).for_each(|(s, x)| *s -= c * x);
+            }
+        }
+        Some(Together { members, gain, shift })
+    }
+}
 
 /// The pairs of candidates that gain most beyond what their members gain alone, best first, at most `most`.
 ///
@@ -974,120 +1084,99 @@ pub fn screen_pairs(
     scale: &[f64],
     point: &Point,
     most: usize,
-) -> Vec<Pair> {
-    let (along, forces) = Along::observed(setup, level, scale, point);
-    let spectra = Spectra::new(setup, level, scale, point, &along, &forces);
-    let lanes = lanes(setup, library, candidates, &along, &spectra);
-    let n = lanes.columns.len();
-    if n == 0 {
-        return Vec::new();
-    }
-    let whole = 0..n;
-    let gram = gram(setup, level, scale, point, &lanes.signals, &lanes.columns, vec![whole]);
-    let np = gram.np;
-    let solved: Vec<Vec<f64>> =
-        (0..n).map(|l| gram.solve(&(0..np).map(|a| gram.jg[a * n + l]).collect::<Vec<_>>())).collect();
-    let base = gram.solve(&gram.jr);
-    let onto = |l: usize, of: &[f64]| -> f64 { (0..np).map(|a| gram.jg[a * n + l] * of[a]).sum() };
-    let projected = |a: usize, b: usize| gram.gg[0][a * n + b] - onto(a, &solved[b]);
-    let against = |a: usize| gram.gr[a] - onto(a, &base);
-    let rr = gram.remaining().max(1e-300);
-    let diagonal: Vec<f64> = (0..n).map(|a| projected(a, a)).collect();
-    let independent: Vec<bool> = (0..n)
-        .map(|a| diagonal[a] > 0.0 && gram.independence(a, gram.gg[0][a * n + a]) > INDEPENDENT)
-        .collect();
-    let rest: Vec<f64> = (0..n).map(against).collect();
-    let positive = |v: &Variant| -> Vec<bool> {
-        let mechanism = &library[candidates[v.candidate].mechanism];
-        match v.secant {
-            Some(_) => vec![true],
-            None => mechanism.linear.iter().map(|l| mechanism.positive.contains(l)).collect(),
-        }
-    };
-    // Coefficients of a few columns and what they explain; `None` where a sign is impossible.
-    let regress = |columns: &[usize], positive: &[bool]| -> Option<(Vec<f64>, f64)> {
-        if columns.iter().any(|&c| !independent[c]) {
-            return None;
-        }
-        let m = columns.len();
-        let d: Vec<f64> = columns.iter().map(|&c| diagonal[c].sqrt()).collect();
-        let mut a = vec![0.0; m * m];
-        for i in 0..m {
-            for j in 0..m {
-                a[i * m + j] = projected(columns[i], columns[j]) / (d[i] * d[j]);
-            }
-            a[i * m + i] += 1e-6;
-        }
-        let b: Vec<f64> = (0..m).map(|i| rest[columns[i]] / d[i]).collect();
-        let x = qr::solve_spd(&a, m, &b);
-        let gain = qr::dot(&x, &b) / rr;
-        let c: Vec<f64> = x.iter().zip(&d).map(|(x, d)| x / d).collect();
-        let allowed = c.iter().zip(positive).all(|(c, p)| !p || *c > 0.0);
-        (allowed && gain.is_finite()).then_some((c, gain))
-    };
-    let usable: Vec<(usize, Vec<usize>, Vec<bool>, f64)> = lanes
-        .variants
+) -> Vec<Together> {
+    let all = Regressions::new(setup, library, candidates, level, scale, point);
+    let variants = &all.lanes.variants;
+    let usable: Vec<(usize, Vec<usize>, Vec<bool>, f64)> = variants
         .iter()
         .enumerate()
         .map(|(i, v)| {
-            let (columns, positive): (Vec<usize>, Vec<bool>) = (v.columns.clone().collect(), positive(v));
-            let alone = regress(&columns, &positive).map_or(0.0, |r| r.1.max(0.0));
+            let (columns, positive): (Vec<usize>, Vec<bool>) = (v.columns.clone().collect(), all.positive(v));
+            let alone = all.regress(&columns, &positive).map_or(0.0, |r| r.1.max(0.0));
             (i, columns, positive, alone)
         })
-        .filter(|v| v.1.len() <= 2 && v.1.iter().all(|&c| independent[c]))
+        .filter(|v| v.1.len() <= 2 && v.1.iter().all(|&c| all.independent[c]))
         .collect();
     let mut found: Vec<(f64, usize, usize, Vec<f64>)> = (0..usable.len())
         .into_par_iter()
         .flat_map_iter(|i| {
-            let (usable, regress, lanes) = (&usable, &regress, &lanes);
+            let (usable, all) = (&usable, &all);
             (i + 1..usable.len()).filter_map(move |j| {
                 let ((v, cv, pv, gv), (w, cw, pw, gw)) = (&usable[i], &usable[j]);
-                if lanes.variants[*v].candidate == lanes.variants[*w].candidate {
+                if variants[*v].candidate == variants[*w].candidate {
                     return None;
                 }
                 let columns: Vec<usize> = cv.iter().chain(cw).copied().collect();
                 let signs: Vec<bool> = pv.iter().chain(pw).copied().collect();
-                let (c, gain) = regress(&columns, &signs)?;
+                let (c, gain) = all.regress(&columns, &signs)?;
                 (gain > gv + gw + PAIR_GAIN).then_some((gain, i, j, c))
             })
         })
         .collect();
     found.sort_by(|a, b| b.0.total_cmp(&a.0).then((a.1, a.2).cmp(&(b.1, b.2))));
-    let mut out: Vec<Pair> = Vec::new();
+    let mut out: Vec<Together> = Vec::new();
     for (gain, i, j, c) in found {
-        let (v, w) = (&lanes.variants[usable[i].0], &lanes.variants[usable[j].0]);
-        let known = out
-            .iter()
-            .any(|p| p.members[0].candidate == v.candidate && p.members[1].candidate == w.candidate);
-        if known {
+        let (v, w) = (usable[i].0, usable[j].0);
+        let of = [variants[v].candidate, variants[w].candidate];
+        if out.iter().any(|p| p.members.iter().map(|m| m.candidate).eq(of)) {
             continue;
         }
-        let member = |variant: &Variant, c: &[f64]| -> Option<Scored> {
-            let mechanism = &library[candidates[variant.candidate].mechanism];
-            let values = match variant.secant {
-                None => mechanism.values(c, &variant.inner),
-                Some(true) if c[0] < 3.0 => mechanism.values(&[], &variant.scaled(mechanism, c[0])),
-                Some(_) => mechanism.values(&[], &variant.inner),
-            }?;
-            Some(Scored {
-                candidate: variant.candidate,
-                gain,
-                values,
-                shift: vec![0.0; np],
-                scales: variant.scales.clone(),
-                faint: None,
-                others: Vec::new(),
-            })
-        };
-        let split = usable[i].1.len();
-        if let (Some(a), Some(b)) = (member(v, &c[..split]), member(w, &c[split..])) {
-            out.push(Pair { members: [a, b], gain });
-        }
+        out.extend(all.together(&[v, w], &c, gain));
         if out.len() == most {
             break;
         }
     }
     out
+}
+
+/// Up to `most` candidates, each the one that explains most beside those before it, with the values that they have
+/// together: orthogonal matching pursuit (Pati, Rezaiifar and Krishnaprasad, Asilomar 1993) on the Gram matrix of all
+/// responses, the parameters refitted to first order. `None` where nothing explains anything.
+pub fn screen_set(
+    setup: &Setup,
+    library: &[Mechanism],
+    candidates: &[Candidate],
+    level: &Level,
+    scale: &[f64],
+    point: &Point,
+    most: usize,
+) -> Option<Together> {
+    let all = Regressions::new(setup, library, candidates, level, scale, point);
+    let variants = &all.lanes.variants;
+    let columns = |chosen: &[usize]| -> (Vec<usize>, Vec<bool>) {
+        let of = || chosen.iter().map(|&v| &variants[v]);
+        (of().flat_map(|v| v.columns.clone()).collect(), of().flat_map(|v| all.positive(v)).collect())
+    };
+    let mut chosen: Vec<usize> = Vec::new();
+    let mut best: Option<(Vec<f64>, f64)> = None;
+    while chosen.len() < most {
+        let open = (0..variants.len())
+            .filter(|&v| chosen.iter().all(|&c| variants[c].candidate != variants[v].candidate));
+        let tried = open.filter_map(|v| {
+            let with: Vec<usize> = chosen.iter().copied().chain([v]).collect();
+            let (columns, positive) = columns(&with);
+            Some((v, all.regress(&columns, &positive)?))
+        });
+        let least = best.as_ref().map_or(0.0, |b| b.1);
+        let next = tried.filter(|t| t.1.1 > least).max_by(|a, b| a.1.1.total_cmp(&b.1.1).then(b.0.cmp(&a.0)));
+        let Some((v, result)) = next else { break };
+        chosen.push(v);
+        best = Some(result);
+    }
+    let (coefficients, gain) = best?;
+    all.together(&chosen, &coefficients, gain)
+}
+
+/// First-order shift of the other free parameters when those at these positions go to zero from `values`.
+pub fn shift_without(
+    setup: &Setup,
+    level: &Level,
+    scale: &[f64],
+    point: &Point,
+    gone: &[(usize, f64)],
+) -> Vec<f64> {
+    let gram = gram(setup, level, scale, point, &[], &[], Vec::new()).without(gone);
+    gram.solve(&gram.jr)
 }
 
 /// Scores every candidate at the point of a fit, best first.

@@ -1,6 +1,7 @@
 //! The search: short-list by the score test, fit, decide, and again; on short segments first, on longer
 //! ones later.
 
+use std::cell::LazyCell;
 use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, Ordering};
 
@@ -15,7 +16,7 @@ use crate::evidence::{Evidence, Side, folds, kappa, least_kappa, robust, weigh};
 use crate::explore::{Belief, Explorer, Hypothesis, Posterior};
 use crate::library::Mechanism;
 use crate::place::{Place, places};
-use crate::screen::{Pair, Scored, first_states, first_values, inner_scales, screen, screen_pairs};
+use crate::screen::{Scored, Together, first_states, first_values, inner_scales, screen, screen_pairs};
 use crate::temperature::AnyScale;
 use crate::uncertainty::Uncertainty;
 use crate::validate::{Gain, errors};
@@ -37,7 +38,7 @@ const SLOWEST: f64 = 10.0;
 /// looks the same.
 const INDEPENDENT: f64 = 20.0;
 /// Most samples that a level of the search looks at; longer recordings are seen through windows.
-const MOST_SAMPLES: usize = 5000;
+pub(crate) const MOST_SAMPLES: usize = 5000;
 /// Work after which nothing more is looked for: laws that the library lacks are pieced together from mechanisms with
 /// memories and delays, each slower to simulate than the one before.
 pub const MOST_WORK: u64 = 120_000_000_000;
@@ -143,7 +144,7 @@ pub struct Fitted {
 
 impl Fitted {
     /// Residual sum of squares over all channels, in units of the fit's scale.
-    fn rss(&self) -> f64 {
+    pub(crate) fn rss(&self) -> f64 {
         self.fit.rss.iter().sum()
     }
 
@@ -206,6 +207,8 @@ pub struct Found {
     pub rejected: Vec<Fitted>,
     /// The mechanisms are believed beside an error of the model, by their posterior probability.
     pub errs: bool,
+    /// The improved model is a closure: a sum of terms that is proposed as a whole.
+    pub closed: bool,
 }
 
 /// The search with everything it needs.
@@ -224,12 +227,19 @@ pub struct Search<'a> {
     all: Vec<Candidate>,
     /// Laws that only cast doubt on others.
     doubts: Vec<Candidate>,
+    /// Terms without a name.
+    unnamed: Vec<Candidate>,
     /// Lengths of the segments, samples, level by level.
     lengths: Vec<usize>,
 }
 
+/// Twice the logarithm of the odds against one law among so many, each as likely as the others.
+pub(crate) fn odds(candidates: usize) -> f64 {
+    2.0 * (candidates.max(1) as f64).ln()
+}
+
 /// Samples of the longest segments that are looked at: whole pieces, as far as the search goes.
-fn whole(setup: &Setup) -> usize {
+pub(crate) fn whole(setup: &Setup) -> usize {
     setup.data.lengths().into_iter().max().unwrap_or(0).clamp(SHORTEST, MOST_SAMPLES)
 }
 
@@ -255,7 +265,7 @@ fn longest(level: &Level) -> usize {
     level.segments.iter().map(|s| s.range.len()).max().unwrap_or(0)
 }
 
-fn limits(iterations: usize) -> Limits {
+pub(crate) fn limits(iterations: usize) -> Limits {
     Limits { iterations, tolerance: 1e-5 }
 }
 
@@ -290,7 +300,7 @@ fn transfer(
 }
 
 /// The same segments with the priors of another model's states.
-fn same_level(setup: &Setup, level: &Level) -> Level {
+pub(crate) fn same_level(setup: &Setup, level: &Level) -> Level {
     let priors = level.segments.iter().map(|s| setup.start_prior(s.piece, s.range.start)).collect();
     Level { segments: level.segments.clone(), priors }
 }
@@ -324,7 +334,8 @@ impl<'a> Search<'a> {
         all.retain(|c| !matches!(c.place, Place::Input(i) if !drives(i)));
         let any_scale = AnyScale::of(&nominal.model);
         all.retain(|c| any_scale.admits(c, &library[c.mechanism]));
-        let (all, doubts) = all.into_iter().partition(|c| library[c.mechanism].doubts.is_empty());
+        let (all, doubts): (Vec<_>, _) = all.into_iter().partition(|c| library[c.mechanism].doubts.is_empty());
+        let (all, unnamed) = all.into_iter().partition(|c| library[c.mechanism].named);
         let lengths = lengths(&nominal);
         Search {
             library,
@@ -335,8 +346,24 @@ impl<'a> Search<'a> {
             nominal,
             all,
             doubts,
+            unnamed,
             lengths,
         }
+    }
+
+    /// What a formula is a sum of: forces times one coefficient, with a name or without.
+    pub(crate) fn terms(&self) -> impl Iterator<Item = &Candidate> {
+        self.all.iter().chain(&self.unnamed).filter(|c| self.library[c.mechanism].is_term())
+    }
+
+    /// The model as given, with its data.
+    pub(crate) fn nominal(&self) -> &Setup {
+        &self.nominal
+    }
+
+    /// Lengths of the segments, samples, level by level.
+    pub(crate) fn lengths(&self) -> &[usize] {
+        &self.lengths
     }
 
     /// The candidates it considers.
@@ -381,7 +408,7 @@ impl<'a> Search<'a> {
     }
 
     /// An integration method whose error is a fiftieth of the residual.
-    fn method(&self, fitted: &mut Fitted, scale: &[f64]) {
+    pub(crate) fn method(&self, fitted: &mut Fitted, scale: &[f64]) {
         for (p, v) in fitted.setup.model.parameters.iter_mut().zip(&fitted.fit.point.parameters) {
             p.value = *v;
         }
@@ -390,51 +417,70 @@ impl<'a> Search<'a> {
     }
 
     /// The model fitted at another level, from the stitched trajectory or the measurements.
-    fn relevel(&self, fitted: &Fitted, level: Level, scale: &[f64], iterations: usize) -> Fitted {
+    pub(crate) fn relevel(&self, fitted: &Fitted, level: Level, scale: &[f64], iterations: usize) -> Fitted {
         let level = same_level(&fitted.setup, &level);
         let fit = fitted.setup.lengthen(&fitted.level, &fitted.fit.point, &level, scale, limits(iterations));
         Fitted { level, fit, ..fitted.clone() }
     }
 
-    fn refit(&self, fitted: &Fitted, scale: &[f64], iterations: usize) -> Fitted {
+    pub(crate) fn refit(&self, fitted: &Fitted, scale: &[f64], iterations: usize) -> Fitted {
         let point = fitted.fit.point.clone();
         let fit = fitted.setup.fit(&fitted.level, scale, &[point], limits(iterations));
         Fitted { fit, ..fitted.clone() }
     }
 
-    /// Fits `base` plus two candidates.
-    fn extend_by_pair(
+    /// Fits `base` plus several candidates, the parameters as they are: from the values of all together, each times one of
+    /// these `factors` (how much of the values, how much of the shift of the parameters that goes with them).
+    pub(crate) fn extend_by(
         &self,
         base: &Fitted,
         open: &[Candidate],
-        pair: &Pair,
+        together: &Together,
+        factors: &[(f64, f64)],
         scale: &[f64],
+        iterations: usize,
     ) -> Option<Fitted> {
         let n0 = self.nominal.model.parameters.len();
         let old = &base.fit.point;
         let mut parts = self.laws(base);
         let mut fresh: Vec<Vec<f64>> = vec![Vec::new(); base.setup.data.pieces.len()];
-        let along = Along::smoothed(&base.setup, &base.level, scale, old);
-        for member in &pair.members {
+        let along = LazyCell::new(|| Along::smoothed(&base.setup, &base.level, scale, old));
+        for member in &together.members {
             let candidate = &open[member.candidate];
+            let mechanism = &self.library[candidate.mechanism];
             parts.push((candidate.clone(), member.values.clone(), member.scales.clone()));
-            let own = first_states(&base.setup, &self.library[candidate.mechanism], candidate, &along)?;
-            fresh.iter_mut().zip(own).for_each(|(f, o)| f.extend(o));
+            if !mechanism.states.is_empty() {
+                let own = first_states(&base.setup, mechanism, candidate, &along)?;
+                fresh.iter_mut().zip(own).for_each(|(f, o)| f.extend(o));
+            }
         }
         let (setup, parts) =
             self.assemble(&base.setup.holds, &old.parameters[..n0], &parts, &base.setup).ok()?;
-        let parameters = old
-            .parameters
-            .iter()
-            .chain(&pair.members[0].values)
-            .chain(&pair.members[1].values)
-            .copied()
-            .collect();
         let level = same_level(&setup, &base.level);
         let starts = transfer(&base.setup, &base.level, &old.starts, &setup, &fresh);
-        let fit = setup.fit(&level, scale, &[Point { parameters, starts }], limits(20));
+        let point = |&(values, shift): &(f64, f64)| {
+            let mut parameters = old.parameters.clone();
+            for (f, d) in base.setup.free.iter().zip(&together.shift) {
+                parameters[f.index] = (parameters[f.index] + shift * d).clamp(f.lower, f.upper);
+            }
+            parameters.extend(together.members.iter().flat_map(|m| &m.values).map(|v| values * v));
+            Point { parameters, starts: starts.clone() }
+        };
+        let points: Vec<Point> = factors.iter().map(point).collect();
+        let fit = setup.fit(&level, scale, &points, limits(iterations));
         let fitted = Fitted { setup, parts, level, fit };
         (fitted.fit.cost.is_finite() && self.admissible(&fitted, scale)).then_some(fitted)
+    }
+
+    /// Fits `base` plus two candidates, from the values that they have together.
+    fn extend_by_pair(
+        &self,
+        base: &Fitted,
+        open: &[Candidate],
+        pair: &Together,
+        scale: &[f64],
+    ) -> Option<Fitted> {
+        self.extend_by(base, open, pair, &[(1.0, 0.0)], scale, 20)
     }
 
     /// Complexity of all mechanisms of a model.
@@ -443,7 +489,7 @@ impl<'a> Search<'a> {
     }
 
     /// Whether every mechanism's requirements on its parameters hold, and no inertia is negative.
-    fn admissible(&self, fitted: &Fitted, scale: &[f64]) -> bool {
+    pub(crate) fn admissible(&self, fitted: &Fitted, scale: &[f64]) -> bool {
         self.is_admissible(&fitted.parts, &fitted.setup, &fitted.level, &fitted.fit.point, scale)
     }
 
@@ -619,7 +665,7 @@ impl<'a> Search<'a> {
     }
 
     /// `fitted` without part `index`, refitted.
-    fn without(&self, fitted: &Fitted, index: usize, scale: &[f64], iterations: usize) -> Option<Fitted> {
+    pub(crate) fn without(&self, fitted: &Fitted, index: usize, scale: &[f64], iterations: usize) -> Option<Fitted> {
         let mut parts = self.laws(fitted);
         parts.remove(index);
         self.reassembled(fitted, &parts, scale, iterations)
@@ -637,7 +683,7 @@ impl<'a> Search<'a> {
     }
 
     /// [`reassembled`](Self::reassembled) from there or from one of the `others`, values of all parameters.
-    fn reassembled_from(
+    pub(crate) fn reassembled_from(
         &self,
         fitted: &Fitted,
         parts: &[Law],
@@ -734,7 +780,7 @@ impl<'a> Search<'a> {
     }
 
     /// What is known of the strengths that `new` has and `old` has not ([`robust`]).
-    fn robust(&self, old: &Fitted, new: &Fitted, scale: &[f64]) -> f64 {
+    pub(crate) fn robust(&self, old: &Fitted, new: &Fitted, scale: &[f64]) -> f64 {
         // Whoever listens changes nothing: what it costs is not counted.
         let work = Arc::new(Work::of_fits_within(u64::MAX));
         let uncounted =
@@ -762,7 +808,7 @@ impl<'a> Search<'a> {
 
     /// What evidence must exceed for so many laws, each one of all candidates.
     fn threshold(&self, laws: usize) -> f64 {
-        2.0 * laws as f64 * (self.all.len().max(1) as f64).ln() + 6.0
+        laws as f64 * odds(self.all.len()) + 6.0
     }
 
     /// Tells what was weighed against what.
@@ -988,7 +1034,7 @@ impl<'a> Search<'a> {
             .map(|i| (i, self.nominal.holds[i], current.setup.holds[i]))
             .collect();
         let (accepted, scale, rejected) = (state.accepted, state.scale, state.rejected);
-        Found { calibrated, improved: current, accepted, better_holds, scale, limited, rejected, errs: false }
+        Found { calibrated, improved: current, accepted, better_holds, scale, limited, rejected, errs: false, closed: false }
     }
 
     /// Explores what the machine lacks where every model of it errs, from what this search found.
@@ -1040,6 +1086,7 @@ impl<'a> Search<'a> {
             limited: found.limited,
             rejected: Vec::new(),
             errs: true,
+            closed: false,
         })
     }
 
@@ -1048,9 +1095,9 @@ impl<'a> Search<'a> {
         self.without(fitted, index, scale, STEPS_WITHOUT)
     }
 
-    /// The part whose strengths the recordings determine least, where the 95 % intervals (half `widths`, of the free
-    /// parameters) of all of them hold zero: such a mechanism may as well not be there.
-    pub fn undetermined(&self, fitted: &Fitted, widths: &[f64]) -> Option<usize> {
+    /// How well the recordings determine each part: the largest of its strengths over the half `widths` of their 95 %
+    /// intervals (of the free parameters). −∞ for a part without strengths of its own, which shows nothing of the kind.
+    pub(crate) fn known(&self, fitted: &Fitted, widths: &[f64]) -> Vec<f64> {
         let known = |part: &Part| -> f64 {
             let mechanism = &self.library[part.candidate.mechanism];
             let counts =
@@ -1066,9 +1113,13 @@ impl<'a> Search<'a> {
             let known = names.filter(|(plain, _)| counts(plain)).filter_map(|(_, name)| ratio(name));
             known.fold(f64::NEG_INFINITY, f64::max)
         };
-        // A part without strengths of its own shows nothing of the kind.
-        let ratios =
-            fitted.parts.iter().map(known).enumerate().filter(|(_, ratio)| *ratio != f64::NEG_INFINITY);
+        fitted.parts.iter().map(known).collect()
+    }
+
+    /// The part whose strengths the recordings determine least, where the 95 % intervals (half `widths`, of the free
+    /// parameters) of all of them hold zero: such a mechanism may as well not be there.
+    pub fn undetermined(&self, fitted: &Fitted, widths: &[f64]) -> Option<usize> {
+        let ratios = self.known(fitted, widths).into_iter().enumerate().filter(|(_, r)| *r != f64::NEG_INFINITY);
         let least = ratios.filter(|(_, ratio)| *ratio < 1.0).min_by(|a, b| a.1.total_cmp(&b.1));
         least.map(|(index, _)| index)
     }
