@@ -22,8 +22,11 @@ const FILES: [&str; 6] = [
     "rotary_link_test.csv",
     "rotary_link_train.csv",
 ];
-/// Level of the Coulomb friction of the rig, N m. It is found within 15 %, since other physics stays unmodelled.
-const FRICTION: f64 = 0.0148;
+/// Level of the Coulomb friction of the rig, N m, and how near it is found.
+const FRICTION: f64 = 0.01478;
+const NEAR: f64 = 0.01;
+/// Held-out error over the noise.
+const HELD_OUT: f64 = 1.2;
 
 /// The embedded model and its recordings.
 pub(crate) struct Demo {
@@ -71,7 +74,11 @@ pub(crate) fn check(root: &Path, answer: &Path, out: &Path) -> Result<Ending> {
     let Some(first) = report.mechanisms.first() else { bail!("no mechanism is named") };
     ensure!(first.kind == "coulomb_friction", "{} is named first", first.kind);
     let level = first.parameters.get("fc").context("the friction has no fc")?.value;
-    ensure!((level / FRICTION - 1.0).abs() < 0.15, "fc = {level} N m; the rig has {FRICTION} N m");
+    ensure!((level / FRICTION - 1.0).abs() < NEAR, "fc = {level} N m; the rig has {FRICTION} N m");
+    for (channel, score) in &report.fit.holdout.improved {
+        let floor = report.noise_floor.get(channel).with_context(|| format!("no noise of {channel}"))?;
+        ensure!(score.nrmse < HELD_OUT * floor, "{channel}: {} held out; the noise is {floor}", score.nrmse);
+    }
 
     let command = process::build(root)?;
     let scratch = process::target(root).join("demo.csv");

@@ -110,7 +110,7 @@ pub(crate) fn pages(root: &Path) -> Result<Vec<(PathBuf, Option<String>)>> {
 fn kinds() -> Result<Vec<Kind>> {
     let mut by_kind: BTreeMap<(String, String), Vec<(String, Mechanism)>> = BTreeMap::new();
     for (file, mechanism) in library::built_in_files().zip(library::built_in()?) {
-        if !mechanism.doubts.is_empty() {
+        if !mechanism.named || !mechanism.doubts.is_empty() {
             continue; // never named, so without a page
         }
         let key = (mechanism.family.clone(), mechanism.kind.clone());

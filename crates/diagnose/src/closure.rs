@@ -47,11 +47,8 @@ impl Search<'_> {
             return None;
         }
         let nominal = self.nominal();
-        let terms: Vec<Candidate> = self
-            .terms()
-            .filter(|c| !self.is_bound_to_a_clock(c) && !self.mixes(c))
-            .cloned()
-            .collect();
+        let terms: Vec<Candidate> =
+            self.terms().filter(|c| !self.is_bound_to_a_clock(c) && !self.mixes(c)).cloned().collect();
         // With a limit of work of its own.
         let work = Arc::new(Work::of_fits_within(self.most_work));
         self.observer.begins(&work);
@@ -80,11 +77,14 @@ impl Search<'_> {
                     break;
                 }
                 match self.closer(&current, &terms, &scale) {
-                    Some(closer) if !seen.iter().any(|s| is_same(s, &candidates(&closer))) => current = closer,
+                    Some(closer) if !seen.iter().any(|s| is_same(s, &candidates(&closer))) => {
+                        current = closer
+                    }
                     _ => break,
                 }
             }
         }
+        current = self.plainer(current, &terms, &scale);
         if current.parts.is_empty() || is_same(&candidates(&current), &candidates(from)) {
             return None;
         }
@@ -108,7 +108,8 @@ impl Search<'_> {
     fn accepted(&self, found: &Found, closure: &Fitted, scale: &[f64]) -> Vec<Accepted> {
         let of = |index: usize| {
             let candidate = closure.parts[index].candidate.clone();
-            let score = self.less(closure, index, scale).map_or(0.0, |less| self.robust(&less, closure, scale));
+            let score =
+                self.less(closure, index, scale).map_or(0.0, |less| self.robust(&less, closure, scale));
             let known = found.accepted.iter().find(|a| a.candidate == candidate);
             let mut rivals = known.map_or(Vec::new(), |known| known.rivals.clone());
             rivals.retain(|r| r.equivalent && closure.parts.iter().all(|p| p.candidate != r.candidate));
@@ -120,19 +121,47 @@ impl Search<'_> {
 
     /// A round: more terms, and of all of them those that are known. `None` where nothing changes, or for the worse.
     fn closer(&self, current: &Fitted, terms: &[Candidate], scale: &[f64]) -> Option<Fitted> {
-        let larger = self.larger(current, terms, scale)?;
+        let larger = self.larger(current, terms, AT_ONCE, scale)?;
         let closer = self.known_alone(larger, odds(terms.len()), scale);
-        let is_better = closer.rss().total_cmp(&current.rss()).is_lt() || closer.parts.len() < current.parts.len();
+        let is_better =
+            closer.rss().total_cmp(&current.rss()).is_lt() || closer.parts.len() < current.parts.len();
         is_better.then_some(closer)
     }
 
-    /// The model with the terms that explain most together beside it.
-    fn larger(&self, base: &Fitted, terms: &[Candidate], scale: &[f64]) -> Option<Fitted> {
+    /// The model with up to `most` terms beside it, those that explain most together.
+    fn larger(&self, base: &Fitted, terms: &[Candidate], most: usize, scale: &[f64]) -> Option<Fitted> {
         let taken = |c: &Candidate| base.parts.iter().any(|p| p.candidate == *c);
         let open: Vec<Candidate> = terms.iter().filter(|c| !taken(c)).cloned().collect();
         let (setup, point) = (&base.setup, &base.fit.point);
-        let together = screen_set(setup, self.library, &open, &base.level, scale, point, AT_ONCE)?;
+        let together = screen_set(setup, self.library, &open, &base.level, scale, point, most)?;
         self.extend_by(base, &open, &together, &STARTS, scale, STEPS)
+    }
+
+    /// The model with laws of lower rank in the place of its terms, where they do as well: a linear spring for a sine, a
+    /// named law for a term without a name.
+    fn plainer(&self, model: Fitted, terms: &[Candidate], scale: &[f64]) -> Fitted {
+        let rank = |c: &Candidate| self.library[c.mechanism].rank;
+        let mut model = model;
+        let mut index = 0;
+        while index < model.parts.len() {
+            let own = &model.parts[index].candidate;
+            let plain = |c: &&Candidate| c.place == own.place && rank(c) < rank(own);
+            let plain: Vec<Candidate> = terms.iter().filter(plain).cloned().collect();
+            let other = (!plain.is_empty())
+                .then(|| {
+                    let less = self.less(&model, index, scale)?;
+                    let other = self.larger(&less, &plain, 1, scale)?;
+                    let lost = self.robust(&less, &model, scale) - self.robust(&less, &other, scale);
+                    (lost < UNDECIDED).then_some(other)
+                })
+                .flatten();
+            match other {
+                // (A part of lower rank stands at the end now.)
+                Some(other) => model = other,
+                None => index += 1,
+            }
+        }
+        model
     }
 
     /// The model without what the recordings do not tell: as long as the term that they determine least is not worth the
@@ -178,7 +207,7 @@ impl Search<'_> {
         let Some(less) = self.less(model, index, scale) else { return true };
         let others: Vec<Candidate> =
             self.terms().filter(|c| *c != candidate && !self.mixes(c)).cloned().collect();
-        let Some(other) = self.larger(&less, &others, scale) else { return false };
+        let Some(other) = self.larger(&less, &others, AT_ONCE, scale) else { return false };
         self.robust(&less, &other, scale) > self.robust(&less, model, scale) - UNDECIDED
     }
 
@@ -213,6 +242,177 @@ fn is_same(a: &[Candidate], b: &[Candidate]) -> bool {
 
 /// Whether more than white noise is left.
 fn leaves_something(fitted: &Fitted, scale: &[f64]) -> bool {
-    fitted.misfit(scale) > LEFT
-        || least_kappa(&fitted.setup, &fitted.level, scale, &fitted.fit.point) < WHITE
+    fitted.misfit(scale) > LEFT || least_kappa(&fitted.setup, &fitted.level, scale, &fitted.fit.point) < WHITE
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::Mechanism;
+    use greybox_calibrate::{Data, free_parameters};
+    use greybox_model::Model;
+    use greybox_recording::{Channel, Recording};
+    use rand::SeedableRng;
+    use rand_distr::{Distribution, StandardNormal};
+
+    /// Two wheels of 1 and 0.5 kg m², the first driven and on a spring, the second on a spring between them.
+    const BODIES: &str = r#"
+[inputs]
+f = { unit = "N m", hold = "linear" }
+[states]
+x = { unit = "rad" }
+y = { unit = "rad" }
+[parameters]
+m = { value = 1.0, unit = "kg m^2", fixed = true }
+n = { value = 0.5, unit = "kg m^2", fixed = true }
+b = { value = 0.6, unit = "N m s/rad" }
+c = { value = 0.4, unit = "N m s/rad" }
+k = { value = 20.0, unit = "N m/rad" }
+l = { value = 12.0, unit = "N m/rad" }
+[equations]
+first  = "m*x'' + b*x' + k*x + l*(x - y) = f"
+second = "n*y'' + c*y' + l*(y - x) = 0"
+"#;
+
+    /// 30 s of the bodies with more forces, of the state (x, y, x', y'), on each.
+    fn bodies(more: &dyn Fn([f64; 4]) -> [f64; 2], seed: u64) -> Setup {
+        let mut rng = rand_pcg::Pcg64::seed_from_u64(seed);
+        let mut normal = || -> f64 { StandardNormal.sample(&mut rng) };
+        let (dt, n, fine) = (0.02, 1500usize, 20usize);
+        let drive = |t: f64| 6.0 * (2.1 * t).sin() + 5.0 * (4.9 * t + 0.07 * t * t).cos();
+        let held = |t: f64| {
+            let k = (t / dt).floor();
+            let (a, b) = (drive(k * dt), drive((k + 1.0) * dt));
+            a + (b - a) * (t / dt - k)
+        };
+        let rates = |[x, y, v, w]: [f64; 4], t: f64| {
+            let [first, second] = more([x, y, v, w]);
+            let stretch = x - y;
+            [
+                v,
+                w,
+                held(t) - 0.5 * v - 21.0 * x - 11.0 * stretch - first,
+                (-0.35 * w + 11.0 * stretch - second) / 0.5,
+            ]
+        };
+        let mut s = [0.0; 4];
+        let mut columns = [const { Vec::new() }; 4];
+        for k in 0..n {
+            let t = dt * k as f64;
+            let row = [t, drive(t), s[0] + 1e-3 * normal(), s[1] + 1e-3 * normal()];
+            columns.iter_mut().zip(row).for_each(|(c, v)| c.push(v));
+            let h = dt / fine as f64;
+            for i in 0..fine {
+                let t = t + i as f64 * h;
+                let step = |s: [f64; 4], d: [f64; 4], h: f64| std::array::from_fn(|i| s[i] + h * d[i]);
+                let a = rates(s, t);
+                let b = rates(step(s, a, 0.5 * h), t + 0.5 * h);
+                s = step(s, b, h);
+            }
+        }
+        let [time, f, x, y] = columns;
+        let channel = |name: &str, values: Vec<f64>| Channel { name: name.into(), unit: None, values };
+        let channels = vec![channel("f", f), channel("x", x), channel("y", y)];
+        let recording = Recording::from_columns("bodies.csv", time, channels).unwrap();
+        let model = Model::from_toml(BODIES, "bodies.toml").unwrap();
+        let data = Arc::new(Data::new(&model, &[recording]).unwrap());
+        Setup::new(&model, data, free_parameters(&model)).unwrap()
+    }
+
+    /// What a search is that has found nothing.
+    fn nothing(search: &Search<'_>) -> Found {
+        let setup = search.nominal().clone();
+        let level = setup.windows(search.lengths()[0], MOST_SAMPLES);
+        let start = Point { parameters: setup.values(), starts: setup.starts(&level, &setup.values()) };
+        let fit = setup.fit(&level, &setup.data.spread, &[start], limits(30));
+        let scale = next_scale(&fit, &setup.data.spread, &setup.data.sigma);
+        let calibrated = Fitted { setup, parts: Vec::new(), level, fit };
+        Found {
+            improved: calibrated.clone(),
+            calibrated,
+            accepted: Vec::new(),
+            better_holds: Vec::new(),
+            scale,
+            limited: false,
+            rejected: Vec::new(),
+            errs: false,
+            closed: false,
+        }
+    }
+
+    /// Kind, equation and coefficient of each term, sorted.
+    fn terms(found: &Found, library: &[Mechanism], model: &Model) -> Vec<(String, String, f64)> {
+        let fitted = &found.improved;
+        let of = |part: &crate::search::Part| {
+            let index = fitted.setup.model.parameter(&part.instance.names[0]).unwrap();
+            let kind = library[part.candidate.mechanism].kind.clone();
+            let equations = part.candidate.place.equations(model).join(" ");
+            (kind, equations, fitted.fit.point.parameters[index])
+        };
+        let mut all: Vec<_> = fitted.parts.iter().map(of).collect();
+        all.sort_by(|a, b| (&a.0, &a.1).cmp(&(&b.0, &b.1)));
+        all
+    }
+
+    /// Three forces that the library has no name for are found as they are, and nothing where there is nothing.
+    #[test]
+    fn forces_without_a_name_are_found_with_their_coefficients() {
+        let library = crate::built_in().unwrap();
+        let truth = [
+            ("cubic_damping", "first", 0.12),
+            ("position_dependent_damping", "second", 2.5),
+            ("quadratic_coupling", "first", 8.0),
+        ];
+        let more = |[_, y, v, w]: [f64; 4]| [0.12 * v * v * v + 8.0 * y * y, 2.5 * y * y * w];
+        let seeds = 4u64;
+        let right = (0..seeds).filter(|seed| {
+            let search = Search::new(bodies(&more, 10 + seed), &library, &crate::Quiet);
+            let found = nothing(&search);
+            let closed = search.closure(&found, &found.calibrated).unwrap();
+            let told = terms(&closed, &library, &search.nominal().model);
+            told.len() == truth.len()
+                && told
+                    .iter()
+                    .zip(&truth)
+                    .all(|(a, b)| (&*a.0, &*a.1) == (b.0, b.1) && (a.2 / b.2 - 1.0).abs() < 0.01)
+        });
+        let right = right.count() as u64;
+        assert!(right >= seeds - 1, "{right} of {seeds}");
+        for seed in 0..seeds {
+            let search = Search::new(bodies(&|_| [0.0; 2], 20 + seed), &library, &crate::Quiet);
+            let found = nothing(&search);
+            let closed = search.closure(&found, &found.calibrated);
+            let told = closed.map(|closed| terms(&closed, &library, &search.nominal().model));
+            assert_eq!(told, None, "seed {seed}");
+        }
+    }
+
+    /// No other terms do what a dry friction does; what a weak hardening does, a sine does too.
+    #[test]
+    fn a_name_is_held_only_where_no_other_terms_do_its_work() {
+        let library = crate::built_in().unwrap();
+        let held = |kind: &str, more: &dyn Fn([f64; 4]) -> [f64; 2]| {
+            let search = Search::new(bodies(more, 31), &library, &crate::Quiet);
+            let found = nothing(&search);
+            let closed = search.closure(&found, &found.calibrated).unwrap();
+            let told = terms(&closed, &library, &search.nominal().model);
+            let index =
+                closed.improved.parts.iter().position(|p| library[p.candidate.mechanism].kind == kind);
+            let Some(index) = index else { panic!("{told:?}") };
+            !search.is_replaceable(&closed, index)
+        };
+        assert!(held("coulomb_friction", &|[_, _, v, _]| [0.8 * f64::tanh(1e3 * v), 0.0]));
+        assert!(!held("cubic_stiffness", &|[x, ..]| [0.02 * x * x * x, 0.0]));
+    }
+
+    /// The acceleration of one body has no place in the equation of the other.
+    #[test]
+    fn no_term_mixes_equations() {
+        let library = crate::built_in().unwrap();
+        let search = Search::new(bodies(&|_| [0.0; 2], 1), &library, &crate::Quiet);
+        let (mixing, other): (Vec<_>, Vec<_>) = search.terms().partition(|c| search.mixes(c));
+        assert!(mixing.iter().all(|c| library[c.mechanism].depends_on("o", 2)));
+        assert_eq!(mixing.len(), 2);
+        assert!(other.len() > 30 && other.iter().all(|c| !library[c.mechanism].depends_on("o", 2)));
+    }
 }

@@ -532,7 +532,8 @@ fn conclude(
             && closed.outdoes((&found, &polished), &judge)
         {
             // The names that stand, as far as the closure holds them and no other terms can be in their place.
-            let stands = |part: &Part| found.errs && agreed.contains(&named_as(part, library, &nominal.model));
+            let stands =
+                |part: &Part| found.errs && agreed.contains(&named_as(part, library, &nominal.model));
             let all = judged.verdict == Verdict::MissingPhysics;
             let standing = polished.fitted.parts.iter().zip(&judged.named);
             let names: Vec<&Candidate> = standing
@@ -757,11 +758,7 @@ impl Judged {
             .map(|i| search.rss_without(improved, &[i], calibrated, &found.scale).unwrap_or(base))
             .collect();
         let share = |rss: f64| (rss / base.max(1e-300)).clamp(0.0, 1.0);
-        // (Of the many terms of a closure none does much alone.)
-        let alone = match found.closed {
-            true => vec![base; without.len()],
-            false => rss_alone(search, (calibrated, improved), &found.scale, &without, base),
-        };
+        let alone = rss_alone(search, (calibrated, improved), &found.scale, &without, base);
         let lost: Vec<f64> = without.iter().map(|rss| share(rss - full)).collect();
         let gained: Vec<f64> = alone.iter().map(|rss| share(base - rss)).collect();
         let shares = divided(&lost, &gained, share(base - full));

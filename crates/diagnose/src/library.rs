@@ -515,7 +515,7 @@ impl Mechanism {
             first,
             report,
             own: Vec::new(),
-            rank: raw.rank.unwrap_or(if raw.on == On::Measurement {
+            rank: raw.rank.unwrap_or(if raw.on == On::Measurement || !raw.named {
                 2
             } else {
                 u8::from(raw.on == On::Input)

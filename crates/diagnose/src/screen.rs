@@ -999,7 +999,8 @@ impl<'a> Regressions<'a> {
         let whole = 0..n;
         let gram = gram(setup, level, scale, point, &lanes.signals, &lanes.columns, vec![whole]);
         let Projection { gg, gr, columns: solved, base } = gram.projection(0);
-        let independent = |a: usize| gg[a * n + a] > 0.0 && gram.independence(a, gram.gg[0][a * n + a]) > INDEPENDENT;
+        let independent =
+            |a: usize| gg[a * n + a] > 0.0 && gram.independence(a, gram.gg[0][a * n + a]) > INDEPENDENT;
         let independent = (0..n).map(independent).collect();
         let (np, rr) = (gram.np, gram.remaining().max(1e-300));
         Regressions { library, candidates, lanes, np, solved, base, gg, gr, independent, rr }

@@ -334,7 +334,8 @@ impl<'a> Search<'a> {
         all.retain(|c| !matches!(c.place, Place::Input(i) if !drives(i)));
         let any_scale = AnyScale::of(&nominal.model);
         all.retain(|c| any_scale.admits(c, &library[c.mechanism]));
-        let (all, doubts): (Vec<_>, _) = all.into_iter().partition(|c| library[c.mechanism].doubts.is_empty());
+        let (all, doubts): (Vec<_>, _) =
+            all.into_iter().partition(|c| library[c.mechanism].doubts.is_empty());
         let (all, unnamed) = all.into_iter().partition(|c| library[c.mechanism].named);
         let lengths = lengths(&nominal);
         Search {
@@ -665,7 +666,13 @@ impl<'a> Search<'a> {
     }
 
     /// `fitted` without part `index`, refitted.
-    pub(crate) fn without(&self, fitted: &Fitted, index: usize, scale: &[f64], iterations: usize) -> Option<Fitted> {
+    pub(crate) fn without(
+        &self,
+        fitted: &Fitted,
+        index: usize,
+        scale: &[f64],
+        iterations: usize,
+    ) -> Option<Fitted> {
         let mut parts = self.laws(fitted);
         parts.remove(index);
         self.reassembled(fitted, &parts, scale, iterations)
@@ -908,7 +915,13 @@ impl<'a> Search<'a> {
             let linear = self.library[candidate.mechanism].linear.len();
             faint.extend(values.iter().enumerate().map(|(i, v)| if i < linear { FAINT * v } else { *v }));
         }
-        let left = self.reassembled_from(fitted, &rest, vec![faint], scale, STEPS_WITHOUT * parts.len())?;
+        let left = self.reassembled_from(
+            fitted,
+            &rest,
+            vec![faint],
+            scale,
+            STEPS_WITHOUT * parts.len().min(MOST_MECHANISMS),
+        )?;
         Some(raw_rss(&left, scale).iter().sum())
     }
 
@@ -1034,7 +1047,17 @@ impl<'a> Search<'a> {
             .map(|i| (i, self.nominal.holds[i], current.setup.holds[i]))
             .collect();
         let (accepted, scale, rejected) = (state.accepted, state.scale, state.rejected);
-        Found { calibrated, improved: current, accepted, better_holds, scale, limited, rejected, errs: false, closed: false }
+        Found {
+            calibrated,
+            improved: current,
+            accepted,
+            better_holds,
+            scale,
+            limited,
+            rejected,
+            errs: false,
+            closed: false,
+        }
     }
 
     /// Explores what the machine lacks where every model of it errs, from what this search found.
@@ -1119,7 +1142,8 @@ impl<'a> Search<'a> {
     /// The part whose strengths the recordings determine least, where the 95 % intervals (half `widths`, of the free
     /// parameters) of all of them hold zero: such a mechanism may as well not be there.
     pub fn undetermined(&self, fitted: &Fitted, widths: &[f64]) -> Option<usize> {
-        let ratios = self.known(fitted, widths).into_iter().enumerate().filter(|(_, r)| *r != f64::NEG_INFINITY);
+        let ratios =
+            self.known(fitted, widths).into_iter().enumerate().filter(|(_, r)| *r != f64::NEG_INFINITY);
         let least = ratios.filter(|(_, ratio)| *ratio < 1.0).min_by(|a, b| a.1.total_cmp(&b.1));
         least.map(|(index, _)| index)
     }

@@ -98,14 +98,13 @@ fn proposed(report: &Report) -> Vec<String> {
     if report.candidates.is_empty() {
         return Vec::new();
     }
-    let laws: Vec<String> = report.candidates.iter().map(law).collect();
     let change = error_change(&report.fit, Baseline::Calibrated)
         .map(|c| format!(": the held-out error{} falls from {} to {}", c.of, c.from, c.to))
         .unwrap_or_default();
     let mut out = vec![format!(
-        "The improved model has {} in its stead and predicts what it was not fitted to better than the calibrated \
+        "The improved model has in its stead {} and predicts what it was not fitted to better than the calibrated \
          one{change}. What is missing may be something else.",
-        joined(&laws, "and")
+        laws(&report.candidates)
     )];
     out.extend(losses(&report.fit));
     out
@@ -113,17 +112,66 @@ fn proposed(report: &Report) -> Vec<String> {
 
 /// What the improved model holds beside the mechanisms that are believed.
 fn beside(report: &Report) -> Option<String> {
-    let laws: Vec<String> = report.candidates.iter().map(law).collect();
     let change = error_change(&report.fit, Baseline::Calibrated)
         .map(|c| format!(": the held-out error{} falls from {} to {}", c.of, c.from, c.to))
         .unwrap_or_default();
-    (!laws.is_empty()).then(|| {
+    (!report.candidates.is_empty()).then(|| {
         format!(
             "The improved model also has {} and predicts what it was not fitted to better than the calibrated \
              one{change}. What stands beside the named may be something else.",
-            joined(&laws, "and")
+            laws(&report.candidates)
         )
     })
+}
+
+/// What is proposed: each candidate with its law, or, of several forces times one coefficient each, one sum for each
+/// equation: `0.0533·θ − 0.197·θ³ in the hub equation`.
+fn laws(candidates: &[Mechanism]) -> String {
+    let terms: Vec<(&Names, f64, String)> = candidates.iter().filter_map(term).collect();
+    if terms.len() < 2 || terms.len() < candidates.len() {
+        return joined(&candidates.iter().map(law).collect::<Vec<_>>(), "and");
+    }
+    let mut sums: Vec<(&Names, String)> = Vec::new();
+    for (equation, value, rest) in terms {
+        let known = sums.iter().position(|s| s.0.as_slice() == equation.as_slice());
+        let at = known.unwrap_or_else(|| {
+            sums.push((equation, String::new()));
+            sums.len() - 1
+        });
+        let sum = &mut sums[at].1;
+        let joint = format::joint(sum.is_empty(), value);
+        let times = if rest.is_empty() { "" } else { "·" };
+        sum.push_str(&format!("{joint}{}{times}{rest}", format::number(value.abs())));
+    }
+    let sums: Vec<String> =
+        sums.into_iter().map(|(names, sum)| format!("{sum}{}", equations(names))).collect();
+    format!("the terms {} (SI units), proposed and not named,", joined(&sums, "and"))
+}
+
+/// The equations, the coefficient and the function of a force that is one coefficient times a function.
+fn term(candidate: &Mechanism) -> Option<(&Names, f64, String)> {
+    let mut parameters = candidate.parameters.iter();
+    let (Some((name, estimate)), None) = (parameters.next(), parameters.next()) else { return None };
+    let tokens = expression::tokens(&candidate.expression);
+    let (sign, tokens) = match &tokens[..] {
+        ["-", rest @ ..] => (-1.0, rest),
+        all => (1.0, all),
+    };
+    let rest = match tokens {
+        [first] if first == name => &[][..],
+        [first, "*", rest @ ..] if first == name && !rest.contains(&&**name) => rest,
+        _ => return None,
+    };
+    let mut depth = 0;
+    let is_sum = rest.iter().any(|token| {
+        depth += match *token {
+            "(" => 1,
+            ")" => -1,
+            _ => 0,
+        };
+        depth == 0 && matches!(*token, "+" | "-")
+    });
+    (!is_sum).then(|| (&candidate.equation, sign * estimate.value, expression::text(&rest.concat())))
 }
 
 /// A candidate and its law.
@@ -487,6 +535,36 @@ mod tests {
                  link equation."
             )
         );
+    }
+
+    #[test]
+    fn terms_are_told_as_one_sum_for_each_equation() {
+        let term = |equation: &str, name: &str, expression: &str, value: f64| {
+            let estimate = crate::contract::Estimate { value, ci95: None, unit: String::new() };
+            Mechanism {
+                expression: expression.into(),
+                parameters: [(name.to_owned(), estimate)].into(),
+                ..mechanism("cubic_stiffness", equation, Vec::new())
+            }
+        };
+        let cube = term("hub", "k3", "k3*theta^3", -0.1974);
+        assert_eq!(laws(std::slice::from_ref(&cube)), "cubic stiffness (k₃·θ³)");
+        let both = [
+            cube.clone(),
+            term("link", "f0", "f0", 0.5),
+            term("hub", "cg", "-cg*(theta' - alpha')", 0.0012),
+            term("hub", "fc", "fc*sign(theta' - alpha')", 0.01478),
+        ];
+        assert_eq!(
+            laws(&both),
+            "the terms −0.197·θ³ − 0.00120·(θ′ − α′) + 0.0148·sign(θ′ − α′) in the hub equation and 0.500 in the link \
+             equation (SI units), proposed and not named,"
+        );
+        // Two coefficients are no term, nor is a sum.
+        let mut two = term("hub", "k3", "k3*theta^3 + k5*theta^5", 1.0);
+        assert_eq!(super::term(&two), None);
+        two.parameters.extend(term("hub", "k5", "", 2.0).parameters);
+        assert_eq!(laws(&[two, cube]), "cubic stiffness (k₃·θ³ + k₅·θ⁵) and cubic stiffness (k₃·θ³)");
     }
 
     #[test]

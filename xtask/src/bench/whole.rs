@@ -46,7 +46,8 @@ fn smoothing() -> Result<Case> {
 }
 
 fn screening() -> Result<Case> {
-    let (Demo { model, train, .. }, library) = (Demo::read()?, built_in()?);
+    let (Demo { model, train, .. }, mut library) = (Demo::read()?, built_in()?);
+    library.retain(|m| m.named);
     let data = Arc::new(Data::new(&model, &train)?);
     let setup = Setup::new(&model, data, free_parameters(&model))?;
     let level = setup.windows(200, 20_000);

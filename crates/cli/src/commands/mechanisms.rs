@@ -40,7 +40,7 @@ pub(crate) fn run(arguments: &Arguments) -> Result<Answer, Failure> {
         Some(folder) => loading::mechanisms(folder)?.library.mechanisms,
         None => greybox_diagnose::built_in().map_err(|e| Failure::internal(e.to_string()))?,
     };
-    mechanisms.retain(|m| m.doubts.is_empty()); // never named, so nothing to list
+    mechanisms.retain(|m| m.named && m.doubts.is_empty()); // never named, so nothing to list
     mechanisms.sort_by(|a, b| (&a.family, &a.kind).cmp(&(&b.family, &b.kind)));
     let json = json!({ "mechanisms": mechanisms.iter().map(for_machines).collect::<Vec<_>>() });
     Ok(Answer::new(in_words(&mechanisms), json))
