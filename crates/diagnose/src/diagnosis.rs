@@ -1,6 +1,6 @@
 //! From recordings and a nominal model to the finished diagnosis.
 
-use std::cell::LazyCell;
+use std::cell::{LazyCell, OnceCell};
 use std::ops::Deref;
 use std::sync::Arc;
 
@@ -819,11 +819,21 @@ impl Closed {
         if !polished.fitted.parts.is_empty() {
             from.push(&found.improved);
         }
+        let gates = Gates::new(search, baseline, judge, false);
         let closed = from.into_iter().filter_map(|from| {
             let mut found = search.closure(found, from)?;
-            let polished = polish(&found.improved, &found.scale, judge);
-            let polished = defend(search, &mut found, polished, baseline, judge, false);
-            (!polished.fitted.parts.is_empty()).then_some(Closed { found, polished })
+            loop {
+                let polished = polish(&found.improved, &found.scale, judge);
+                let passed = gates.judge(&polished, &found.scale);
+                if passed.all() {
+                    return Some(Closed { found, polished });
+                }
+                // Whole recordings may not tell what segments with free starts told.
+                found.improved = search.smaller(&found.improved, passed.undetermined?, &found.scale)?;
+                if found.improved.parts.is_empty() {
+                    return None;
+                }
+            }
         });
         closed.min_by(|a, b| a.misfit(judge).total_cmp(&b.misfit(judge)))
     }
@@ -1073,10 +1083,7 @@ fn defend(
     judge: &Judge,
     named: bool,
 ) -> Polished {
-    let errors = |p: &Polished, scale: &[f64]| {
-        crate::validate::errors(&p.origin, scale, judge.criterion, judge.window)
-    };
-    let simpler = LazyCell::new(|| errors(&baseline.polished, &baseline.scale));
+    let gates = Gates::new(search, baseline, judge, named);
     let mut polished = polished;
     loop {
         let fitted = &polished.fitted;
@@ -1085,22 +1092,11 @@ fn defend(
             found.accepted.clear();
             return baseline.polished.clone();
         }
-        let scale = residual_scale(fitted, &found.scale);
-        let widths = Uncertainty::of(&polished.origin, &scale).widths();
-        let scores = judge.scores(&fitted.setup, &fitted.fit.point.parameters, &scale);
-        let worse = judge.criterion.misfit(&scores).total_cmp(&baseline.misfit).is_gt();
-        // (By the free run: starts that are free absorb what a model leaves, of segments as of windows.)
-        let likely = named && leaves_noise(&scores, &polished.origin, &scale);
-        let predicts = || Gain::of(&simpler, &errors(&polished, &scale)).is_beyond_chance();
-        let bound = if likely { Vec::new() } else { search.bound_to_a_clock(fitted) };
-        let fails = !bound.is_empty()
-            || search.undetermined(&polished.origin, &widths).is_some()
-            || worse
-            || search.has_negative_inertia(&fitted.setup, &fitted.level, &fitted.fit.point, &found.scale)
-            || !(likely || predicts());
-        if !fails {
+        let passed = gates.judge(&polished, &found.scale);
+        if passed.all() {
             return polished;
         }
+        let bound = passed.bound;
         // Without the part that is missed least. (That would be one that is not determined, unless it is so only beside
         // another that does the same.)
         let open = if bound.is_empty() { (0..fitted.parts.len()).collect() } else { bound };
@@ -1129,6 +1125,66 @@ fn defend(
                 return baseline.polished.clone();
             }
         }
+    }
+}
+
+/// What a model must pass to be handed back.
+struct Gates<'a> {
+    search: &'a Search<'a>,
+    baseline: &'a Baseline,
+    judge: &'a Judge,
+    /// A round believed its mechanisms.
+    named: bool,
+    /// Errors of the calibrated model on folds.
+    simpler: OnceCell<Vec<f64>>,
+}
+
+/// How a model fares at the gates.
+struct Passed {
+    /// Parts that act at certain times of a single recording and cannot be defended.
+    bound: Vec<usize>,
+    /// The part whose strengths the recordings determine least, if they do not determine them.
+    undetermined: Option<usize>,
+    /// All else.
+    otherwise: bool,
+}
+
+impl Passed {
+    fn all(&self) -> bool {
+        self.bound.is_empty() && self.undetermined.is_none() && self.otherwise
+    }
+}
+
+impl<'a> Gates<'a> {
+    fn new(search: &'a Search<'a>, baseline: &'a Baseline, judge: &'a Judge, named: bool) -> Gates<'a> {
+        Gates { search, baseline, judge, named, simpler: OnceCell::new() }
+    }
+
+    fn errors(&self, p: &Polished, scale: &[f64]) -> Vec<f64> {
+        crate::validate::errors(&p.origin, scale, self.judge.criterion, self.judge.window)
+    }
+
+    fn judge(&self, polished: &Polished, scale: &[f64]) -> Passed {
+        let (search, fitted) = (self.search, &polished.fitted);
+        let own = residual_scale(fitted, scale);
+        let undetermined =
+            search.undetermined(&polished.origin, &Uncertainty::of(&polished.origin, &own).widths());
+        let scores = self.judge.scores(&fitted.setup, &fitted.fit.point.parameters, &own);
+        let worse = self.judge.criterion.misfit(&scores).total_cmp(&self.baseline.misfit).is_gt();
+        // (By the free run: starts that are free absorb what a model leaves, of segments as of windows.)
+        let likely = self.named && leaves_noise(&scores, &polished.origin, &own);
+        let bound = if likely { Vec::new() } else { search.bound_to_a_clock(fitted) };
+        let predicts = || {
+            let simpler =
+                self.simpler.get_or_init(|| self.errors(&self.baseline.polished, &self.baseline.scale));
+            Gain::of(simpler, &self.errors(polished, &own)).is_beyond_chance()
+        };
+        let otherwise = bound.is_empty()
+            && undetermined.is_none()
+            && !worse
+            && !search.has_negative_inertia(&fitted.setup, &fitted.level, &fitted.fit.point, scale)
+            && (likely || predicts());
+        Passed { bound, undetermined, otherwise }
     }
 }
 
