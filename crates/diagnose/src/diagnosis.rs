@@ -506,20 +506,23 @@ fn conclude(
     let scores = judge.scores(&polished.fitted.setup, &polished.fitted.fit.point.parameters, &scale);
     let mut judged = judged_of(&found, &polished, &|_| named);
     // Where more than noise is left, every model of the machine errs, and output errors do not compare them.
-    let mut agreed = Vec::new();
-    if !leaves_noise(&scores, &polished.origin, &scale) {
-        let names = judged.verdict == Verdict::MissingPhysics;
-        if names {
-            agreed = polished.fitted.parts.iter().map(|p| named_as(p, library, &nominal.model)).collect();
-        }
+    let errs = !leaves_noise(&scores, &polished.origin, &scale);
+    let names = judged.verdict == Verdict::MissingPhysics;
+    let agreed: Vec<_> = match errs && names {
+        true => polished.fitted.parts.iter().map(|p| named_as(p, library, &nominal.model)).collect(),
+        false => Vec::new(),
+    };
+    // Of laws that are not believed together those stand that another comparison has named.
+    let believed = |judged: &Judged, found: &Found, fitted: &Fitted| -> Vec<bool> {
+        let all = judged.verdict == Verdict::MissingPhysics;
+        let stands = |part: &Part| found.errs && agreed.contains(&named_as(part, library, &nominal.model));
+        let parts = fitted.parts.iter().zip(&judged.named);
+        parts.map(|(part, named)| (all && *named) || stands(part)).collect()
+    };
+    if errs {
         let closed = Closed::of(search, &found, &polished, &baseline, &judge);
-        let reaches = |closed: &Closed| {
-            let scale = residual_scale(&closed.polished.fitted, &closed.found.scale);
-            leaves_noise(&closed.scores(&judge), &closed.polished.origin, &scale)
-        };
-        let complete = closed.as_ref().is_some_and(reaches);
         // What reaches the noise leaves no error of the model to be believed beside.
-        if !complete {
+        if !closed.as_ref().is_some_and(|closed| closed.leaves_noise) {
             let in_both = |part: &Part| agreed.contains(&named_as(part, library, &nominal.model));
             let standing = (&found, &polished);
             let explored = explored(search, standing, in_both, names, &baseline, &judge);
@@ -531,25 +534,11 @@ fn conclude(
         if let Some(closed) = closed
             && closed.outdoes((&found, &polished), &judge)
         {
-            // The names that stand, as far as the closure holds them and no other terms can be in their place.
-            let stands =
-                |part: &Part| found.errs && agreed.contains(&named_as(part, library, &nominal.model));
-            let all = judged.verdict == Verdict::MissingPhysics;
-            let standing = polished.fitted.parts.iter().zip(&judged.named);
-            let names: Vec<&Candidate> = standing
-                .filter(|(part, named)| (all && **named) || stands(part))
-                .map(|(part, _)| &part.candidate)
-                .collect();
-            let parts = &closed.polished.fitted.parts;
-            let held: Vec<usize> =
-                (0..parts.len()).filter(|&i| names.contains(&&parts[i].candidate)).collect();
-            if complete || held.len() == names.len() {
-                let named: Vec<Candidate> = held
-                    .into_iter()
-                    .filter(|&i| !search.is_replaceable(&closed.found, i))
-                    .map(|i| parts[i].candidate.clone())
-                    .collect();
-                let Closed { found: other, polished: simulates } = closed;
+            let standing = believed(&judged, &found, &polished.fitted);
+            let standing = polished.fitted.parts.iter().zip(standing).filter(|part| part.1);
+            let standing: Vec<&Candidate> = standing.map(|(part, _)| &part.candidate).collect();
+            if let Some(named) = closed.names(search, &standing) {
+                let Closed { found: other, polished: simulates, .. } = closed;
                 judged = judged_of(&other, &simulates, &|part| named.contains(&part.candidate));
                 (found, polished) = (other, simulates);
             }
@@ -622,11 +611,7 @@ fn conclude(
     let criterion = if elsewhere == Criterion::Windowed { elsewhere } else { judge.criterion };
 
     // Mechanisms, remainder, verdict.
-    // Of laws that are not believed together those stand that another comparison has named.
-    let stands = |part: &Part| found.errs && agreed.contains(&named_as(part, library, &nominal.model));
-    let all = judged.verdict == Verdict::MissingPhysics;
-    let parts = improved.parts.iter().zip(&judged.named);
-    let believed: Vec<bool> = parts.map(|(part, named)| (all && *named) || stands(part)).collect();
+    let believed = believed(&judged, &found, &improved);
     let verdict = if believed.contains(&true) { Verdict::MissingPhysics } else { judged.verdict };
     let Judged { shares, left, surface, alone, without, full, base, doubts, .. } = judged;
     let share = |rss: f64| (rss / base.max(1e-300)).clamp(0.0, 1.0);
@@ -804,6 +789,10 @@ impl Judged {
 struct Closed {
     found: Found,
     polished: Polished,
+    /// How its simulations of the training recordings are judged.
+    misfit: f64,
+    /// Whether they leave no more than noise.
+    leaves_noise: bool,
 }
 
 impl Closed {
@@ -826,7 +815,7 @@ impl Closed {
                 let polished = polish(&found.improved, &found.scale, judge);
                 let passed = gates.judge(&polished, &found.scale);
                 if passed.all() {
-                    return Some(Closed { found, polished });
+                    return Some(Closed::new(found, polished, judge));
                 }
                 // Whole recordings may not tell what segments with free starts told.
                 found.improved = search.smaller(&found.improved, passed.undetermined?, &found.scale)?;
@@ -835,17 +824,16 @@ impl Closed {
                 }
             }
         });
-        closed.min_by(|a, b| a.misfit(judge).total_cmp(&b.misfit(judge)))
+        closed.min_by(|a, b| a.misfit.total_cmp(&b.misfit))
     }
 
-    fn scores(&self, judge: &Judge) -> Vec<Score> {
-        let fitted = &self.polished.fitted;
-        let scale = residual_scale(fitted, &self.found.scale);
-        judge.scores(&fitted.setup, &fitted.fit.point.parameters, &scale)
-    }
-
-    fn misfit(&self, judge: &Judge) -> f64 {
-        judge.criterion.misfit(&self.scores(judge))
+    fn new(found: Found, polished: Polished, judge: &Judge) -> Closed {
+        let fitted = &polished.fitted;
+        let scale = residual_scale(fitted, &found.scale);
+        let scores = judge.scores(&fitted.setup, &fitted.fit.point.parameters, &scale);
+        let (misfit, leaves_noise) =
+            (judge.criterion.misfit(&scores), leaves_noise(&scores, &polished.origin, &scale));
+        Closed { found, polished, misfit, leaves_noise }
     }
 
     /// Whether it simulates the training recordings better than what stands, and predicts what was left out of its fit
@@ -857,8 +845,20 @@ impl Closed {
         };
         let scale = residual_scale(&polished.fitted, &found.scale);
         let (setup, parameters) = (&polished.fitted.setup, &polished.fitted.fit.point.parameters);
-        self.misfit(judge).total_cmp(&judge.misfit(setup, parameters, &scale)).is_lt()
+        self.misfit.total_cmp(&judge.misfit(setup, parameters, &scale)).is_lt()
             && Gain::of(&errors(found, polished), &errors(&self.found, &self.polished)).is_beyond_chance()
+    }
+
+    /// Of the names that stand those that it holds and that no other terms can have the place of. `None` where it leaves
+    /// more than noise and does not hold them all.
+    fn names(&self, search: &Search<'_>, standing: &[&Candidate]) -> Option<Vec<Candidate>> {
+        let parts = &self.polished.fitted.parts;
+        let held: Vec<usize> =
+            (0..parts.len()).filter(|&i| standing.contains(&&parts[i].candidate)).collect();
+        (self.leaves_noise || held.len() == standing.len()).then(|| {
+            let named = held.into_iter().filter(|&i| !search.is_replaceable(&self.found, i));
+            named.map(|i| parts[i].candidate.clone()).collect()
+        })
     }
 }
 
