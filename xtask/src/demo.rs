@@ -79,6 +79,12 @@ pub(crate) fn check(root: &Path, answer: &Path, out: &Path) -> Result<Ending> {
         let floor = report.noise_floor.get(channel).with_context(|| format!("no noise of {channel}"))?;
         ensure!(score.nrmse < HELD_OUT * floor, "{channel}: {} held out; the noise is {floor}", score.nrmse);
     }
+    let improved = text(&out.join("improved.toml"))?;
+    for name in report.candidates.iter().flat_map(|candidate| candidate.parameters.keys()) {
+        let line = improved.lines().find(|line| line.split(" = ").next() == Some(name));
+        let said = line.is_some_and(|line| line.contains("proposed by greybox, not named"));
+        ensure!(said, "improved.toml does not say that {name} is only proposed");
+    }
 
     let command = process::build(root)?;
     let scratch = process::target(root).join("demo.csv");

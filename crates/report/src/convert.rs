@@ -533,7 +533,9 @@ pub fn health_findings<'a>(model: &Model, recordings: impl Iterator<Item = &'a R
 /// explained.
 pub fn improved_toml(diagnosis: &Diagnosis, original: &str) -> String {
     let mut comments = Vec::new();
-    for m in &diagnosis.mechanisms {
+    let named = diagnosis.mechanisms.iter().map(|m| (m, "found by greybox"));
+    let proposed = diagnosis.candidates.iter().map(|m| (m, "proposed by greybox, not named"));
+    for (m, said) in named.chain(proposed) {
         for (name, _, e) in &m.parameters {
             let kind = crate::format::kind(&m.kind);
             let width = e.ci95.map_or_else(String::new, |(lo, hi)| {
@@ -543,7 +545,7 @@ pub fn improved_toml(diagnosis: &Diagnosis, original: &str) -> String {
                     crate::format::significant(hi, 4)
                 )
             });
-            comments.push((name.clone(), format!("{kind}, found by greybox{width}")));
+            comments.push((name.clone(), format!("{kind}, {said}{width}")));
         }
     }
     diagnosis.improved.to_toml(&WriteOptions { original: Some(original), comments: &comments })

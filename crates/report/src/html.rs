@@ -251,8 +251,8 @@ struct View {
     equations: Vec<EquationView>,
     shares: Vec<ShareView>,
     mechanisms: Vec<MechanismView>,
-    /// What the improved model holds without being believed: title, place, law.
-    candidates: Vec<(String, String, String)>,
+    /// What the improved model holds without being believed.
+    candidates: Vec<CandidateView>,
     /// Which mechanisms, how many, and what is left with these alone.
     subsets: Vec<[String; 3]>,
     remainder: RemainderView,
@@ -322,6 +322,16 @@ struct CorrelationView {
     title_html: String,
     note: String,
     svg: String,
+}
+
+/// A law that is proposed without its name.
+struct CandidateView {
+    title: String,
+    place: String,
+    expression_html: String,
+    /// Name, value with its interval, unit.
+    parameters: Vec<[String; 3]>,
+    share: String,
 }
 
 struct MechanismView {
@@ -440,11 +450,7 @@ impl View {
                 .enumerate()
                 .map(|(index, mechanism)| mechanism_view(page, index, mechanism))
                 .collect(),
-            candidates: report
-                .candidates
-                .iter()
-                .map(|m| (format::kind(&m.kind), placed(m), law_html(m)))
-                .collect(),
+            candidates: report.candidates.iter().map(candidate_view).collect(),
             subsets: subsets(report),
             remainder: remainder_view(page),
             parameters: parameters(page),
@@ -648,6 +654,8 @@ fn shares(page: &Page) -> Vec<ShareView> {
             (format::kind(&m.kind), known(m.share_explained), format!("share-{}", index.min(3)))
         })
         .collect();
+    let proposed = report.candidates.iter().map(|m| known(m.share_explained)).sum();
+    parts.push(("Proposed, not named".to_owned(), proposed, "share-proposed".to_owned()));
     let explained: f64 = parts.iter().map(|part| part.1).sum();
     let rest = known(report.remainder.share_of_residual);
     parts.push(("Unexplained".to_owned(), rest, "share-rest".to_owned()));
@@ -1069,6 +1077,19 @@ fn law_html(mechanism: &Mechanism) -> String {
     match &mechanism.replaces {
         Some(replaced) => format!("{} → {law}", expression::html(replaced)),
         None => law,
+    }
+}
+
+fn candidate_view(candidate: &Mechanism) -> CandidateView {
+    let parameters = candidate.parameters.iter().map(|(name, estimate)| {
+        [expression::html(name), format::cell(estimate.value, estimate.ci95), format::unit(&estimate.unit)]
+    });
+    CandidateView {
+        title: format::kind(&candidate.kind),
+        place: placed(candidate),
+        expression_html: law_html(candidate),
+        parameters: parameters.collect(),
+        share: format::probability(candidate.share_explained),
     }
 }
 

@@ -89,6 +89,26 @@ fn what_fewer_mechanisms_would_leave_stands_in_a_table() {
 }
 
 #[test]
+fn what_is_proposed_stands_in_a_table_and_in_the_bar() {
+    let mut page = sample::page();
+    assert!(!page.to_html().unwrap().contains("Proposed, not named"));
+    let mut cube = page.report.mechanisms[0].clone();
+    cube.kind = "cubic_stiffness".to_owned();
+    cube.expression = "fc*theta^3".to_owned();
+    cube.share_explained = 0.04;
+    page.report.candidates.push(cube);
+    let html = page.to_html().unwrap();
+    for text in [
+        "<h3>Proposed, not named</h3>",
+        "Cubic stiffness<small class=\"math\"><var>fc</var>·<var>θ</var><sup>3</sup></small>",
+        "= 0.0652 ±\u{a0}0.0018 N m",
+        "<span class=\"swatch share-proposed\"></span>Proposed, not named <b>4 %</b>",
+    ] {
+        assert!(html.contains(text), "the page lacks {text:?}");
+    }
+}
+
+#[test]
 fn nothing_is_loaded_from_elsewhere() {
     let html = sample::page().to_html().unwrap();
     assert!(html.contains("Content-Security-Policy\" content=\"default-src 'none'"));
