@@ -519,10 +519,11 @@ fn conclude(
         let parts = fitted.parts.iter().zip(&judged.named);
         parts.map(|(part, named)| (all && *named) || stands(part)).collect()
     };
-    if errs {
+    // (What passes for coloured noise may hold what no name explains.)
+    if errs || judged.verdict == Verdict::Unexplained {
         let closed = Closed::of(search, &found, &polished, &baseline, &judge);
         // What reaches the noise leaves no error of the model to be believed beside.
-        if !closed.as_ref().is_some_and(|closed| closed.leaves_noise) {
+        if errs && !closed.as_ref().is_some_and(|closed| closed.leaves_noise) {
             let in_both = |part: &Part| agreed.contains(&named_as(part, library, &nominal.model));
             let standing = (&found, &polished);
             let explored = explored(search, standing, in_both, names, &baseline, &judge);
