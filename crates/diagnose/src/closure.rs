@@ -24,6 +24,7 @@ use crate::screen::{screen_set, shift_without};
 use crate::search::{
     Accepted, Fitted, Found, MOST_SAMPLES, Search, UNDECIDED, limits, next_scale, odds, same_level, whole,
 };
+use crate::turns::Turns;
 use crate::uncertainty::Uncertainty;
 
 /// Terms that are added at once: of forces that compensate each other, none pays alone.
@@ -47,8 +48,7 @@ impl Search<'_> {
             return None;
         }
         let nominal = self.nominal();
-        let terms: Vec<Candidate> =
-            self.terms().filter(|c| !self.is_bound_to_a_clock(c) && !self.mixes(c)).cloned().collect();
+        let terms = self.closing();
         // With a limit of work of its own.
         let work = Arc::new(Work::of_fits_within(self.most_work));
         self.observer.begins(&work);
@@ -101,6 +101,16 @@ impl Search<'_> {
             errs: false,
             closed: true,
         })
+    }
+
+    /// The terms that a closure may hold: none that acts by a clock, that mixes equations, or that tells an angle from the same
+    /// angle a turn later where the equations do not.
+    fn closing(&self) -> Vec<Candidate> {
+        let turns = Turns::of(&self.nominal().model);
+        let holds = |c: &&Candidate| {
+            !self.is_bound_to_a_clock(c) && !self.mixes(c) && turns.admits(c, &self.library[c.mechanism])
+        };
+        self.terms().filter(holds).cloned().collect()
     }
 
     /// What the recordings say for each part of a closure, and what the search that found some of them could not tell from
@@ -205,8 +215,7 @@ impl Search<'_> {
         let (model, scale) = (&closure.improved, &closure.scale);
         let candidate = &model.parts[index].candidate;
         let Some(less) = self.less(model, index, scale) else { return true };
-        let others: Vec<Candidate> =
-            self.terms().filter(|c| *c != candidate && !self.mixes(c)).cloned().collect();
+        let others: Vec<Candidate> = self.closing().into_iter().filter(|c| c != candidate).collect();
         let Some(other) = self.larger(&less, &others, AT_ONCE, scale) else { return false };
         self.robust(&less, &other, scale) > self.robust(&less, model, scale) - UNDECIDED
     }

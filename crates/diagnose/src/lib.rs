@@ -21,6 +21,7 @@ pub mod smoother;
 pub mod spectra;
 pub mod surface;
 mod temperature;
+mod turns;
 mod twins;
 mod uncertainty;
 mod validate;
