@@ -4,9 +4,9 @@
 //! E(q, q', q'') + Σᵢ cᵢ φᵢ(q, q') = 0
 //! ```
 //!
-//! The terms φ are the laws of the library that have one coefficient and nothing else ([`Mechanism::is_term`](crate::Mechanism::is_term)), with a
-//! name or without. They are chosen, and refitted with all parameters of the machine, by the errors of the simulated
-//! output: sparse identification (Brunton, Proctor and Kutz, PNAS 113, 2016), on the simulated motion in place of
+//! The terms φ are the laws of the library that have one coefficient and nothing else
+//! ([`Mechanism::is_term`](crate::Mechanism::is_term)), with a name or without. They are chosen, and refitted with all
+//! parameters of the machine, by the errors of the simulated output: sparse identification (Brunton, Proctor and Kutz, PNAS 113, 2016), on the simulated motion in place of
 //! differentiated measurements. A round adds up to three terms that explain most together, and takes away, one after the
 //! other, the term that the recordings determine least, for as long as what is known of it
 //! ([`robust`](crate::evidence::robust)) is below the odds against one term among all. Rounds go on until none changes
@@ -85,6 +85,8 @@ impl Search<'_> {
             }
         }
         current = self.plainer(current, &terms, &scale);
+        // What is left is work of the search again.
+        self.observer.begins(&nominal.work);
         if current.parts.is_empty() || is_same(&candidates(&current), &candidates(from)) {
             return None;
         }

@@ -930,12 +930,14 @@ impl Observer for Untold<'_> {
 /// A search that changes parameters, and the holds of inputs if it may, and nothing else.
 fn alone(nominal: &Setup, keep_holds: bool, most_work: u64, observer: &dyn Observer) -> Found {
     // With a limit of work of its own.
-    let nominal = Setup { work: Arc::new(Work::of_fits_within(most_work)), ..nominal.clone() };
-    observer.begins(&nominal.work);
-    let mut search = Search::new(nominal, &[], observer);
+    let alone = Setup { work: Arc::new(Work::of_fits_within(most_work)), ..nominal.clone() };
+    observer.begins(&alone.work);
+    let mut search = Search::new(alone, &[], observer);
     search.keep_holds = keep_holds;
     search.most_work = most_work;
-    search.run()
+    let found = search.run();
+    observer.begins(&nominal.work);
+    found
 }
 
 /// A fit in segments, at parameters that a fit of whole pieces may have found.
