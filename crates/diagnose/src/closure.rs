@@ -22,7 +22,8 @@ use crate::evidence::{Evidence, least_kappa};
 use crate::place::own_coordinates;
 use crate::screen::{screen_set, shift_without};
 use crate::search::{
-    Accepted, Fitted, Found, MOST_SAMPLES, Search, UNDECIDED, limits, next_scale, odds, same_level, whole,
+    Accepted, Fitted, Found, MOST_SAMPLES, Search, UNDECIDED, WHITE, limits, next_scale, odds, same_level,
+    whole,
 };
 use crate::turns::Turns;
 use crate::uncertainty::Uncertainty;
@@ -37,8 +38,6 @@ const STEPS: usize = 20;
 const STEPS_WITHOUT: usize = 12;
 /// Residual over noise from which something is left.
 const LEFT: f64 = 1.03;
-/// Information per sample below which a residual is correlated.
-const WHITE: f64 = 0.8;
 
 impl Search<'_> {
     /// A closure that begins with the model `from`, in the place of what a search `found`. `None` where no term is worth its

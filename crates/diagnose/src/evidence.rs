@@ -11,8 +11,8 @@
 //! Consistency is judged on ten folds of contiguous blocks: leaving fold k out moves the parameters, to
 //! first order, by δ = −(H − H_k)⁻¹ s_k; what that does to fold k's own residual is its held-out error.
 //!
-//! Beside it, and deciding nothing yet, stands one quantity that could take the place of the score's κ and of all conditions on
-//! folds. It asks for the strength θ of the law itself: with its covariance S as its interval has it
+//! Beside it stands one quantity that could take the place of the score's κ and of all conditions on folds. It decides which
+//! terms a closure holds, and nothing else yet. It asks for the strength θ of the law itself: with its covariance S as its interval has it
 //! (`uncertainty.rs`) and S₀ in white noise,
 //!
 //! ```text

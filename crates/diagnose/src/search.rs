@@ -59,7 +59,7 @@ const PAIR_SAMPLES: usize = 500;
 /// Residual over noise from which a fit may be stuck.
 const STUCK: f64 = 1.2;
 /// Information per sample from which a residual counts as white.
-const WHITE: f64 = 0.8;
+pub(crate) const WHITE: f64 = 0.8;
 /// Residual over noise from which a model is far from the noise.
 const FAR: f64 = 2.0;
 /// Factor by which calibration may move a parameter before a model far from the noise is in doubt for it.
@@ -418,7 +418,7 @@ impl<'a> Search<'a> {
     }
 
     /// The model fitted at another level, from the stitched trajectory or the measurements.
-    pub(crate) fn relevel(&self, fitted: &Fitted, level: Level, scale: &[f64], iterations: usize) -> Fitted {
+    fn relevel(&self, fitted: &Fitted, level: Level, scale: &[f64], iterations: usize) -> Fitted {
         let level = same_level(&fitted.setup, &level);
         let fit = fitted.setup.lengthen(&fitted.level, &fitted.fit.point, &level, scale, limits(iterations));
         Fitted { level, fit, ..fitted.clone() }
@@ -490,7 +490,7 @@ impl<'a> Search<'a> {
     }
 
     /// Whether every mechanism's requirements on its parameters hold, and no inertia is negative.
-    pub(crate) fn admissible(&self, fitted: &Fitted, scale: &[f64]) -> bool {
+    fn admissible(&self, fitted: &Fitted, scale: &[f64]) -> bool {
         self.is_admissible(&fitted.parts, &fitted.setup, &fitted.level, &fitted.fit.point, scale)
     }
 
@@ -666,13 +666,7 @@ impl<'a> Search<'a> {
     }
 
     /// `fitted` without part `index`, refitted.
-    pub(crate) fn without(
-        &self,
-        fitted: &Fitted,
-        index: usize,
-        scale: &[f64],
-        iterations: usize,
-    ) -> Option<Fitted> {
+    fn without(&self, fitted: &Fitted, index: usize, scale: &[f64], iterations: usize) -> Option<Fitted> {
         let mut parts = self.laws(fitted);
         parts.remove(index);
         self.reassembled(fitted, &parts, scale, iterations)
