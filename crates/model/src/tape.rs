@@ -183,6 +183,9 @@ enum Smooth {
     Ln,
     Tanh,
     Atan,
+    /// The argument, zero where it is negative: of what is never negative by its form, beyond the point where a switch in it
+    /// is held (`abs(x)` is `x` there until the step ends).
+    Positive,
 }
 
 impl Smooth {
@@ -198,6 +201,7 @@ impl Smooth {
             Smooth::Ln => x.ln(),
             Smooth::Tanh => x.tanh(),
             Smooth::Atan => x.atan(),
+            Smooth::Positive => x.max(0.0),
         }
     }
 
@@ -222,7 +226,22 @@ impl Smooth {
             Smooth::Ln => 1.0 / x,
             Smooth::Tanh => 1.0 - y * y,
             Smooth::Atan => 1.0 / (1.0 + x * x),
+            Smooth::Positive => f64::from(u8::from(x > 0.0)),
         }
+    }
+}
+
+/// Whether the form of an expression keeps it from being negative, whatever its variables are.
+fn is_never_negative(e: &Expr) -> bool {
+    match e {
+        Expr::Num(v) => *v >= 0.0,
+        Expr::Bin(BinOp::Add | BinOp::Mul | BinOp::Div, a, b) => is_never_negative(a) && is_never_negative(b),
+        Expr::Bin(BinOp::Pow, a, b) => {
+            is_never_negative(a) || matches!(**b, Expr::Num(n) if n.rem_euclid(2.0) == 0.0)
+        }
+        Expr::Call(Func::Abs | Func::Exp | Func::Sqrt, _) => true,
+        Expr::Call(Func::Max, args) => args.iter().any(is_never_negative),
+        _ => false,
     }
 }
 
@@ -424,7 +443,10 @@ impl<'a> Compiler<'a> {
                     (BinOp::Pow, _, Some(y)) if y.fract() == 0.0 && y.abs() <= 64.0 => {
                         self.push(Op::Powi(ra, y as i32), &[ra])
                     }
-                    (BinOp::Pow, ..) => self.push(Op::Pow(ra, rb), &[ra, rb]),
+                    (BinOp::Pow, ..) => {
+                        let ra = if is_never_negative(a) { self.smooth(Smooth::Positive, ra) } else { ra };
+                        self.push(Op::Pow(ra, rb), &[ra, rb])
+                    }
                 }
             }
             Expr::Call(Func::Delay, args) => {
@@ -448,7 +470,11 @@ impl<'a> Compiler<'a> {
                     Func::Tan => self.smooth(Smooth::Tan, a),
                     Func::Exp => self.smooth(Smooth::Exp, a),
                     Func::Ln => self.smooth(Smooth::Ln, a),
-                    Func::Sqrt => self.smooth(Smooth::Sqrt, a),
+                    Func::Sqrt => {
+                        let held = is_never_negative(&args[0]);
+                        let a = if held { self.smooth(Smooth::Positive, a) } else { a };
+                        self.smooth(Smooth::Sqrt, a)
+                    }
                     Func::Tanh => self.smooth(Smooth::Tanh, a),
                     Func::Atan => self.smooth(Smooth::Atan, a),
                     Func::Sign => self.switch(SwitchKind::Sign, a, a),

@@ -75,6 +75,24 @@ fn coulomb_damped_decay_sticks_where_theory_says() {
     }
 }
 
+/// A root of what a switch keeps positive goes on through zero, where the switch is held for the rest of a step: a drag
+/// between viscous and quadratic, as a power, as a root, on a motion that turns round (`x' = sin t`).
+#[test]
+fn a_fractional_power_of_a_speed_that_changes_sign() {
+    for drag in ["abs(v)^1.5*sign(v)", "sqrt(abs(v))*v", "max(v, 0)^1.5 - max(-v, 0)^1.5"] {
+        let equation = format!("v' + c*({drag}) = cos(t) + c*sqrt(abs(sin(t)))*sin(t)");
+        let m = model(&[], &[("v", 1)], &[("c", 0.8)], &[&equation], &["v"]);
+        let n = 400;
+        for (method, within) in [(Method::Rk4 { substeps: 2 }, 1e-6), (FINE, 1e-9)] {
+            let t = run(&m, &free(n, 0.05), &[0.0], method);
+            for k in 0..n {
+                let error = (t.y[k] - (0.05 * k as f64).sin()).abs();
+                assert!(error < within, "{drag} {method:?} t={} error {error}", 0.05 * k as f64);
+            }
+        }
+    }
+}
+
 /// Driven block: sticks until the force exceeds the friction, then slips.
 #[test]
 fn a_ramp_breaks_the_block_loose_at_the_right_instant() {
