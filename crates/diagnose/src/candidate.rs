@@ -3,7 +3,7 @@
 use greybox_calibrate::{Free, Prior};
 use greybox_model::{Equation, Expr, Model, Parameter, State, Unit};
 
-use crate::library::{Mechanism, On};
+use crate::library::{Mechanism, On, arbitrary};
 use crate::place::{Motion, Place};
 
 /// A mechanism at a place.
@@ -144,11 +144,11 @@ impl Candidate {
         let slopes = |of: &str| -> Vec<Expr> {
             with.equations.iter().map(|e| e.residual().derivative(of, 0).simplify()).collect()
         };
-        let values = |slopes: &[Expr], point: usize| -> Option<Vec<f64>> {
-            // Arbitrary numbers, the same for a name every time.
+        let values = |slopes: &[Expr], point: u8| -> Option<Vec<f64>> {
+            // What the model gives a value is positive; a motion goes either way.
             let value = |n: &str, primes: u8| {
-                let code = n.bytes().fold(7u64 + u64::from(primes), |h, b| (h * 131 + u64::from(b)) % 10_007);
-                Some(0.3 + ((code * (3 + 2 * point as u64)) % 997) as f64 / 997.0)
+                let any = arbitrary(point, n, primes);
+                Some(if with.parameter(n).is_some() { 0.3 + any.abs() } else { any })
             };
             slopes.iter().map(|e| e.eval(&value)).collect()
         };
@@ -156,7 +156,7 @@ impl Candidate {
         model.parameters.iter().filter(|p| !p.fixed).any(|p| {
             let theirs = slopes(&p.name);
             let mut ratio: Option<f64> = None;
-            (0..4).all(|point| {
+            (0..8).all(|point| {
                 let (Some(a), Some(b)) = (values(&mine, point), values(&theirs, point)) else { return false };
                 let here = a.iter().zip(&b).find(|(a, _)| **a != 0.0).map(|(a, b)| b / a);
                 let Some(r) = here.filter(|r| *r != 0.0) else { return false };
@@ -379,5 +379,25 @@ impl Candidate {
                 Free { index: first + at, prior: Prior::Flat, lower, upper }
             })
             .collect()
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::place::places;
+
+    /// A damper's parameter has its law under another name; a force that does not turn with the motion has not.
+    #[test]
+    fn an_even_force_is_no_parameter_under_another_name() {
+        let text = "[inputs]\nf = { unit = \"N\" }\n[states]\nx = { unit = \"m\" }\n[parameters]\n\
+                    m = { value = 1.0, unit = \"kg\" }\nc = { value = 1.0, unit = \"N s/m\" }\n\
+                    k = { value = 9.0, unit = \"N/m\" }\n[equations]\nmass = \"m*x'' + c*x' + k*x = f\"\n";
+        let model = Model::from_toml(text, "mass.toml").unwrap();
+        let library = crate::built_in().unwrap();
+        let all = candidates(&model, &library, &places(&model));
+        let is_offered = |kind: &str| all.iter().any(|c| library[c.mechanism].kind == kind);
+        assert!(!is_offered("viscous_friction") && !is_offered("linear_stiffness"));
+        assert!(is_offered("asymmetric_damping") && is_offered("asymmetric_stiffness"));
     }
 }

@@ -1,14 +1,16 @@
-//! The closure: a sum of forces, each times one coefficient, where the names of the library leave more than noise.
+//! The closure: a sum of forces where the names of the library leave more than noise.
 //!
 //! ```text
-//! E(q, q', q'') + Σᵢ cᵢ φᵢ(q, q') = 0
+//! E(q, q', q'') + Σᵢ cᵢ φᵢ(q, q', zᵢ; θᵢ) = 0,    zᵢ' = ψᵢ(zᵢ, q, q'; θᵢ)
 //! ```
 //!
-//! The terms φ are the laws of the library that have one coefficient and nothing else
-//! ([`Mechanism::is_term`](crate::Mechanism::is_term)), with a name or without. They are chosen, and refitted with all
-//! parameters of the machine, by the errors of the simulated output: sparse identification (Brunton, Proctor and Kutz, PNAS 113, 2016), on the simulated motion in place of
-//! differentiated measurements. A round adds up to three terms that explain most together, and takes away, one after the
-//! other, the term that the recordings determine least, for as long as what is known of it
+//! The terms φ are the laws of the library that are forces and vanish with their coefficients c
+//! ([`Mechanism::is_term`](crate::Mechanism::is_term)), with a name or without; some have constants θ of their own (the
+//! speed at which a brake saturates), some a memory z (a spring and a damper in series). They are chosen, and refitted with
+//! all parameters of the machine, by the errors of the simulated output: sparse identification (Brunton, Proctor and Kutz,
+//! PNAS 113, 2016), on the simulated motion in place of differentiated measurements. A round adds up to three terms of one
+//! coefficient that explain most together, or one law with constants or a memory, whichever is worth more, and takes away,
+//! one after the other, the term that the recordings determine least, for as long as what is known of it
 //! ([`robust`](crate::evidence::robust)) is below the odds against one term among all. Rounds go on until none changes
 //! anything, on short segments first, where first order is good, on longer ones later, where small forces are seen.
 
@@ -20,7 +22,7 @@ use rayon::prelude::*;
 use crate::candidate::Candidate;
 use crate::evidence::{Evidence, least_kappa};
 use crate::place::own_coordinates;
-use crate::screen::{screen_set, shift_without};
+use crate::screen::{Scored, Together, screen, screen_set, shift_without};
 use crate::search::{
     Accepted, Fitted, Found, MOST_SAMPLES, Search, UNDECIDED, WHITE, limits, next_scale, odds, same_level,
     whole,
@@ -30,24 +32,45 @@ use crate::uncertainty::Uncertainty;
 
 /// Terms that are added at once: of forces that compensate each other, none pays alone.
 const AT_ONCE: usize = 3;
+/// Laws with constants or a memory of their own that a round fits a few steps, and those of them that go on.
+const TRIALS: usize = 6;
+const FINALISTS: usize = 2;
 /// Where a fit with new terms may begin: how much of their values, how much of the shift of the parameters that goes with
 /// them. First order may promise too much of either.
 const STARTS: [(f64, f64); 3] = [(1.0, 1.0), (1.0, 0.0), (1e-3, 0.0)];
-/// Steps of a fit with new terms, and of one without a term.
+/// Fall of the cost from which another hold of an input is considered.
+const SAME_HOLD: f64 = 0.002;
+/// Steps that tell which trial leads, of a fit with new terms, and of one without a term.
+const STEPS_TO_TELL: usize = 5;
 const STEPS: usize = 20;
 const STEPS_WITHOUT: usize = 12;
 /// Residual over noise from which something is left.
 const LEFT: f64 = 1.03;
 
+/// The terms that closures ended a level with: what comes there goes on from there as they did.
+#[derive(Default)]
+pub(crate) struct Ways(Vec<(usize, Vec<Candidate>)>);
+
+impl Ways {
+    /// Whether no other closure had these terms at the end of this level; from now on one has.
+    fn is_new(&mut self, level: usize, terms: Vec<Candidate>) -> bool {
+        let is_known = self.0.iter().any(|(l, t)| *l == level && is_same(t, &terms));
+        self.0.push((level, terms));
+        !is_known
+    }
+}
+
 impl Search<'_> {
     /// A closure that begins with the model `from`, in the place of what a search `found`. `None` where no term is worth its
-    /// odds, and of a model whose laws [mix](Self::mixes) equations.
-    pub(crate) fn closure(&self, found: &Found, from: &Fitted) -> Option<Found> {
+    /// odds, of a model whose laws [mix](Self::mixes) equations, and where it comes on one of the `ways` that others went.
+    pub(crate) fn closure(&self, found: &Found, from: &Fitted, ways: &mut Ways) -> Option<Found> {
         if from.parts.iter().any(|part| self.mixes(&part.candidate)) {
             return None;
         }
         let nominal = self.nominal();
         let terms = self.closing();
+        let (plain, rich): (Vec<_>, Vec<_>) =
+            terms.iter().cloned().partition(|c| self.library[c.mechanism].is_plain());
         // With a limit of work of its own.
         let work = Arc::new(Work::of_fits_within(self.most_work));
         self.observer.begins(&work);
@@ -75,15 +98,23 @@ impl Search<'_> {
                 if is_spent() || !leaves_something(&current, &scale) {
                     break;
                 }
-                match self.closer(&current, &terms, &scale) {
-                    Some(closer) if !seen.iter().any(|s| is_same(s, &candidates(&closer))) => {
-                        current = closer
-                    }
-                    _ => break,
-                }
+                let is_new = |model: &Fitted| !seen.iter().any(|s| is_same(s, &candidates(model)));
+                let plain = self.closer(&current, &plain, &scale).filter(is_new);
+                // A law with more to fit is tried where it promises more than they keep.
+                let kept = plain.as_ref().map_or(0.0, |plain| 1.0 - plain.rss() / current.rss());
+                let rich = self.richer(&current, &rich, kept, &scale).filter(is_new);
+                let told = |model: &Fitted| self.robust(&current, model, &scale);
+                let both = [plain, rich].into_iter().flatten();
+                let Some(next) = both.max_by(|a, b| told(a).total_cmp(&told(b))) else { break };
+                // (Another hold may have stood in for what has a term now.)
+                current = self.redecide_holds(&next, &scale, SAME_HOLD);
+            }
+            if !ways.is_new(step, candidates(&current)) {
+                self.observer.begins(&nominal.work);
+                return None;
             }
         }
-        current = self.plainer(current, &terms, &scale);
+        current = self.plainer(current, &plain, &scale);
         // What is left is work of the search again.
         self.observer.begins(&nominal.work);
         if current.parts.is_empty() || is_same(&candidates(&current), &candidates(from)) {
@@ -134,15 +165,48 @@ impl Search<'_> {
     fn closer(&self, current: &Fitted, terms: &[Candidate], scale: &[f64]) -> Option<Fitted> {
         let larger = self.larger(current, terms, AT_ONCE, scale)?;
         let closer = self.known_alone(larger, odds(terms.len()), scale);
-        let is_better =
-            closer.rss().total_cmp(&current.rss()).is_lt() || closer.parts.len() < current.parts.len();
-        is_better.then_some(closer)
+        self.is_closer(current, &closer).then_some(closer)
+    }
+
+    /// A round with laws that have constants or a memory of their own, one at a time: those that explain more than this
+    /// share to first order.
+    fn richer(&self, current: &Fitted, terms: &[Candidate], more: f64, scale: &[f64]) -> Option<Fitted> {
+        let richer = self.with_one(current, terms, more, scale)?;
+        let richer = self.known_alone(richer, odds(terms.len()), scale);
+        self.is_closer(current, &richer).then_some(richer)
+    }
+
+    /// The model with one law beside it: of those that explain most to first order, and more than this share, the one that
+    /// is worth most.
+    fn with_one(&self, base: &Fitted, terms: &[Candidate], more: f64, scale: &[f64]) -> Option<Fitted> {
+        let open = open(base, terms);
+        if open.is_empty() {
+            return None;
+        }
+        let scored = screen(&base.setup, self.library, &open, &base.level, scale, &base.fit.point);
+        let promising: Vec<Scored> =
+            scored.into_iter().take_while(|one| one.gain > more).take(TRIALS).collect();
+        let tried = promising.into_par_iter().filter_map(|one| {
+            let alone = Together { gain: one.gain, shift: one.shift.clone(), members: vec![one] };
+            self.extend_by(base, &open, &alone, &STARTS, scale, STEPS_TO_TELL)
+        });
+        let told = |model: Fitted| (self.robust(base, &model, scale), model);
+        let mut tried: Vec<(f64, Fitted)> = tried.map(told).collect();
+        tried.sort_by(|a, b| b.0.total_cmp(&a.0));
+        tried.truncate(FINALISTS);
+        let fitted = tried.into_par_iter().map(|(_, model)| self.refit(&model, scale, STEPS));
+        let allowed = fitted.filter(|model| self.admissible(model, scale)).map(told).collect::<Vec<_>>();
+        allowed.into_iter().max_by(|a, b| a.0.total_cmp(&b.0)).map(|best| best.1)
+    }
+
+    /// Whether a model has less error or fewer parts than another.
+    fn is_closer(&self, from: &Fitted, to: &Fitted) -> bool {
+        to.rss().total_cmp(&from.rss()).is_lt() || to.parts.len() < from.parts.len()
     }
 
     /// The model with up to `most` terms beside it, those that explain most together.
     fn larger(&self, base: &Fitted, terms: &[Candidate], most: usize, scale: &[f64]) -> Option<Fitted> {
-        let taken = |c: &Candidate| base.parts.iter().any(|p| p.candidate == *c);
-        let open: Vec<Candidate> = terms.iter().filter(|c| !taken(c)).cloned().collect();
+        let open = open(base, terms);
         let (setup, point) = (&base.setup, &base.fit.point);
         let together = screen_set(setup, self.library, &open, &base.level, scale, point, most)?;
         self.extend_by(base, &open, &together, &STARTS, scale, STEPS)
@@ -193,11 +257,15 @@ impl Search<'_> {
     /// The model without part `index`, from where the others go, to first order, when it does.
     fn less(&self, model: &Fitted, index: usize, scale: &[f64]) -> Option<Fitted> {
         let (setup, point) = (&model.setup, &model.fit.point);
-        let own: Vec<usize> =
-            model.parts[index].instance.names.iter().filter_map(|n| setup.model.parameter(n)).collect();
+        let part = &model.parts[index];
+        let own: Vec<usize> = part.instance.names.iter().filter_map(|n| setup.model.parameter(n)).collect();
+        // (Constants that do not grow with the strengths mean nothing without them.)
+        let law = &self.library[part.candidate.mechanism];
+        let stays: Vec<bool> =
+            law.grow_with_strength().iter().map(|g| !g && !law.linear.is_empty()).collect();
         let gone: Vec<(usize, f64)> = (0..setup.free.len())
-            .filter(|&i| own.contains(&setup.free[i].index))
-            .map(|i| (i, point.parameters[setup.free[i].index]))
+            .filter_map(|i| Some((i, own.iter().position(|&o| o == setup.free[i].index)?)))
+            .map(|(i, k)| (i, if stays[k] { 0.0 } else { point.parameters[own[k]] }))
             .collect();
         let shift = shift_without(setup, &model.level, scale, point, &gone);
         let mut shifted = point.parameters.clone();
@@ -216,9 +284,17 @@ impl Search<'_> {
         let (model, scale) = (&closure.improved, &closure.scale);
         let candidate = &model.parts[index].candidate;
         let Some(less) = self.less(model, index, scale) else { return true };
-        let others: Vec<Candidate> = self.closing().into_iter().filter(|c| c != candidate).collect();
-        let Some(other) = self.larger(&less, &others, AT_ONCE, scale) else { return false };
-        self.robust(&less, &other, scale) > self.robust(&less, model, scale) - UNDECIDED
+        let others = self.closing().into_iter().filter(|c| c != candidate);
+        let (plain, mut rich): (Vec<_>, Vec<_>) = others.partition(|c| self.library[c.mechanism].is_plain());
+        // (Of two laws that do as well the plainer one has the name.)
+        let complexity = |c: &Candidate| self.library[c.mechanism].complexity();
+        rich.retain(|c| complexity(c) <= complexity(candidate));
+        let does_as_well = |other: Option<Fitted>| {
+            let lost = |other| self.robust(&less, model, scale) - self.robust(&less, &other, scale);
+            other.is_some_and(|other| lost(other) < UNDECIDED)
+        };
+        does_as_well(self.larger(&less, &plain, AT_ONCE, scale))
+            || does_as_well(self.with_one(&less, &rich, 0.0, scale))
     }
 
     /// Whether a law brings a coordinate's highest derivative into an equation that neither has it nor governs that
@@ -243,6 +319,12 @@ impl Search<'_> {
 
 fn candidates(fitted: &Fitted) -> Vec<Candidate> {
     fitted.parts.iter().map(|part| part.candidate.clone()).collect()
+}
+
+/// The terms that a model does not hold.
+fn open(model: &Fitted, terms: &[Candidate]) -> Vec<Candidate> {
+    let is_held = |c: &&Candidate| model.parts.iter().any(|p| p.candidate == **c);
+    terms.iter().filter(|c| !is_held(c)).cloned().collect()
 }
 
 /// Whether two models have the same parts, in whatever order.
@@ -284,8 +366,8 @@ first  = "m*x'' + b*x' + k*x + l*(x - y) = f"
 second = "n*y'' + c*y' + l*(y - x) = 0"
 "#;
 
-    /// 30 s of the bodies with more forces, of the state (x, y, x', y'), on each.
-    fn bodies(more: &dyn Fn([f64; 4]) -> [f64; 2], seed: u64) -> Setup {
+    /// 30 s of the bodies with more forces on each and a memory, of the state (x, y, x', y', z): force, force, z'.
+    fn bodies(more: &dyn Fn([f64; 5]) -> [f64; 3], seed: u64) -> Setup {
         let mut rng = rand_pcg::Pcg64::seed_from_u64(seed);
         let mut normal = || -> f64 { StandardNormal.sample(&mut rng) };
         let (dt, n, fine) = (0.02, 1500usize, 20usize);
@@ -295,17 +377,18 @@ second = "n*y'' + c*y' + l*(y - x) = 0"
             let (a, b) = (drive(k * dt), drive((k + 1.0) * dt));
             a + (b - a) * (t / dt - k)
         };
-        let rates = |[x, y, v, w]: [f64; 4], t: f64| {
-            let [first, second] = more([x, y, v, w]);
+        let rates = |[x, y, v, w, z]: [f64; 5], t: f64| {
+            let [first, second, memory] = more([x, y, v, w, z]);
             let stretch = x - y;
             [
                 v,
                 w,
                 held(t) - 0.5 * v - 21.0 * x - 11.0 * stretch - first,
                 (-0.35 * w + 11.0 * stretch - second) / 0.5,
+                memory,
             ]
         };
-        let mut s = [0.0; 4];
+        let mut s = [0.0; 5];
         let mut columns = [const { Vec::new() }; 4];
         for k in 0..n {
             let t = dt * k as f64;
@@ -314,7 +397,7 @@ second = "n*y'' + c*y' + l*(y - x) = 0"
             let h = dt / fine as f64;
             for i in 0..fine {
                 let t = t + i as f64 * h;
-                let step = |s: [f64; 4], d: [f64; 4], h: f64| std::array::from_fn(|i| s[i] + h * d[i]);
+                let step = |s: [f64; 5], d: [f64; 5], h: f64| std::array::from_fn(|i| s[i] + h * d[i]);
                 let a = rates(s, t);
                 let b = rates(step(s, a, 0.5 * h), t + 0.5 * h);
                 s = step(s, b, h);
@@ -373,12 +456,12 @@ second = "n*y'' + c*y' + l*(y - x) = 0"
             ("position_dependent_damping", "second", 2.5),
             ("quadratic_coupling", "first", 8.0),
         ];
-        let more = |[_, y, v, w]: [f64; 4]| [0.12 * v * v * v + 8.0 * y * y, 2.5 * y * y * w];
+        let more = |[_, y, v, w, _]: [f64; 5]| [0.12 * v * v * v + 8.0 * y * y, 2.5 * y * y * w, 0.0];
         let seeds = 4u64;
         let right = (0..seeds).filter(|seed| {
             let search = Search::new(bodies(&more, 10 + seed), &library, &crate::Quiet);
             let found = nothing(&search);
-            let closed = search.closure(&found, &found.calibrated).unwrap();
+            let closed = search.closure(&found, &found.calibrated, &mut Ways::default()).unwrap();
             let told = terms(&closed, &library, &search.nominal().model);
             told.len() == truth.len()
                 && told
@@ -389,11 +472,42 @@ second = "n*y'' + c*y' + l*(y - x) = 0"
         let right = right.count() as u64;
         assert!(right >= seeds - 1, "{right} of {seeds}");
         for seed in 0..seeds {
-            let search = Search::new(bodies(&|_| [0.0; 2], 20 + seed), &library, &crate::Quiet);
+            let search = Search::new(bodies(&|_| [0.0; 3], 20 + seed), &library, &crate::Quiet);
             let found = nothing(&search);
-            let closed = search.closure(&found, &found.calibrated);
+            let closed = search.closure(&found, &found.calibrated, &mut Ways::default());
             let told = closed.map(|closed| terms(&closed, &library, &search.nominal().model));
             assert_eq!(told, None, "seed {seed}");
+        }
+    }
+
+    /// A brake that saturates and a spring that gives way, each alone, with their constants.
+    #[test]
+    fn laws_with_constants_or_a_memory_are_found() {
+        let library = crate::built_in().unwrap();
+        let told = |more: &dyn Fn([f64; 5]) -> [f64; 3], seed: u64| {
+            let search = Search::new(bodies(more, seed), &library, &crate::Quiet);
+            let found = nothing(&search);
+            let closed = search.closure(&found, &found.calibrated, &mut Ways::default()).unwrap();
+            let fitted = closed.improved;
+            let value =
+                |name: &String| fitted.fit.point.parameters[fitted.setup.model.parameter(name).unwrap()];
+            let law = |part: &crate::search::Part| {
+                let values: Vec<f64> = part.instance.names.iter().map(value).collect();
+                let place = part.candidate.place.equations(&search.nominal().model).join(" ");
+                (library[part.candidate.mechanism].kind.clone(), place, values)
+            };
+            fitted.parts.iter().map(law).collect::<Vec<_>>()
+        };
+        let near = |found: &[(String, String, Vec<f64>)], kind: &str, place: &str, values: [f64; 2]| {
+            let [(k, p, v)] = found else { return false };
+            let close = v.iter().zip(values).all(|(a, b)| (a / b - 1.0).abs() < 0.05);
+            k == kind && p == place && close
+        };
+        for seed in 40..43 {
+            let brake = told(&|[_, _, v, ..]| [3.0 * v / (1.0 + (v / 0.4).powi(2)), 0.0, 0.0], seed);
+            assert!(near(&brake, "saturating_damping", "first", [3.0, 0.4]), "{brake:?}");
+            let spring = told(&|[_, y, _, _, z]| [0.0, 6.0 * (y - z), 2.0 * (y - z)], seed);
+            assert!(near(&spring, "relaxing_spring", "second", [6.0, 2.0]), "{spring:?}");
         }
     }
 
@@ -401,28 +515,34 @@ second = "n*y'' + c*y' + l*(y - x) = 0"
     #[test]
     fn a_name_is_held_only_where_no_other_terms_do_its_work() {
         let library = crate::built_in().unwrap();
-        let held = |kind: &str, more: &dyn Fn([f64; 4]) -> [f64; 2]| {
+        let held = |kind: &str, more: &dyn Fn([f64; 5]) -> [f64; 3]| {
             let search = Search::new(bodies(more, 31), &library, &crate::Quiet);
             let found = nothing(&search);
-            let closed = search.closure(&found, &found.calibrated).unwrap();
+            let closed = search.closure(&found, &found.calibrated, &mut Ways::default()).expect(kind);
             let told = terms(&closed, &library, &search.nominal().model);
             let index =
                 closed.improved.parts.iter().position(|p| library[p.candidate.mechanism].kind == kind);
             let Some(index) = index else { panic!("{told:?}") };
             !search.is_replaceable(&closed, index)
         };
-        assert!(held("coulomb_friction", &|[_, _, v, _]| [0.8 * f64::tanh(1e3 * v), 0.0]));
-        assert!(!held("cubic_stiffness", &|[x, ..]| [0.02 * x * x * x, 0.0]));
+        assert!(held("coulomb_friction", &|[_, _, v, ..]| [0.8 * f64::tanh(1e3 * v), 0.0, 0.0]));
+        assert!(!held("cubic_stiffness", &|[x, ..]| [0.02 * x * x * x, 0.0, 0.0]));
     }
 
     /// The acceleration of one body has no place in the equation of the other.
     #[test]
     fn no_term_mixes_equations() {
         let library = crate::built_in().unwrap();
-        let search = Search::new(bodies(&|_| [0.0; 2], 1), &library, &crate::Quiet);
+        let search = Search::new(bodies(&|_| [0.0; 3], 1), &library, &crate::Quiet);
         let (mixing, other): (Vec<_>, Vec<_>) = search.terms().partition(|c| search.mixes(c));
-        assert!(mixing.iter().all(|c| library[c.mechanism].depends_on("o", 2)));
-        assert_eq!(mixing.len(), 2);
+        let kinds = |of: &[&Candidate]| -> Vec<&str> {
+            of.iter().map(|c| library[c.mechanism].kind.as_str()).collect()
+        };
+        // (Of a body, and of the spring between them: its inertia has both accelerations.)
+        let named = ["coupling", "position_dependent_inertia"];
+        assert!(kinds(&mixing).iter().all(|kind| named.contains(kind)), "{:?}", kinds(&mixing));
         assert!(other.len() > 30 && other.iter().all(|c| !library[c.mechanism].depends_on("o", 2)));
+        let inertias = kinds(&other).iter().filter(|kind| **kind == named[1]).count();
+        assert_eq!((mixing.len(), inertias), (3, 2));
     }
 }

@@ -14,6 +14,7 @@ use rayon::prelude::*;
 
 use crate::along::Along;
 use crate::candidate::Candidate;
+use crate::closure::Ways;
 use crate::evidence::{Evidence, fall, kappa};
 use crate::library::{Mechanism, MechanismError, built_in};
 use crate::locate::{Location, force, locate};
@@ -532,13 +533,13 @@ fn conclude(
                 (found, polished) = (other, simulates);
             }
         }
-        if let Some(closed) = closed
-            && closed.outdoes((&found, &polished), &judge)
-        {
+        if let Some(closed) = closed {
             let standing = believed(&judged, &found, &polished.fitted);
             let standing = polished.fitted.parts.iter().zip(standing).filter(|part| part.1);
             let standing: Vec<&Candidate> = standing.map(|(part, _)| &part.candidate).collect();
-            if let Some(named) = closed.names(search, &standing) {
+            if closed.outdoes((&found, &polished), !standing.is_empty(), &judge)
+                && let Some(named) = closed.names(search, &standing)
+            {
                 let Closed { found: other, polished: simulates, .. } = closed;
                 judged = judged_of(&other, &simulates, &|part| named.contains(&part.candidate));
                 (found, polished) = (other, simulates);
@@ -810,22 +811,37 @@ impl Closed {
             from.push(&found.improved);
         }
         let gates = Gates::new(search, baseline, judge, false);
-        let closed = from.into_iter().filter_map(|from| {
-            let mut found = search.closure(found, from)?;
-            loop {
-                let polished = polish(&found.improved, &found.scale, judge);
-                let passed = gates.judge(&polished, &found.scale);
-                if passed.all() {
-                    return Some(Closed::new(found, polished, judge));
-                }
-                // Whole recordings may not tell what segments with free starts told.
-                found.improved = search.smaller(&found.improved, passed.undetermined?, &found.scale)?;
-                if found.improved.parts.is_empty() {
-                    return None;
-                }
+        let mut ways = Ways::default();
+        let mut best: Option<Closed> = None;
+        for from in from {
+            let Some(closed) = search.closure(found, from, &mut ways) else { continue };
+            let Some(closed) = Closed::defended(search, closed, &gates, judge) else { continue };
+            if best.as_ref().is_none_or(|best| closed.misfit.total_cmp(&best.misfit).is_lt()) {
+                best = Some(closed);
             }
-        });
-        closed.min_by(|a, b| a.misfit.total_cmp(&b.misfit))
+            // (There is no less than noise.)
+            if best.as_ref().is_some_and(|best| best.leaves_noise) {
+                break;
+            }
+        }
+        best
+    }
+
+    /// A closure that passes all gates, without what whole recordings do not determine, if it does.
+    fn defended(search: &Search<'_>, found: Found, gates: &Gates<'_>, judge: &Judge) -> Option<Closed> {
+        let mut found = found;
+        loop {
+            let polished = polish(&found.improved, &found.scale, judge);
+            let passed = gates.judge(&polished, &found.scale);
+            if passed.all() {
+                return Some(Closed::new(found, polished, judge));
+            }
+            // Whole recordings may not tell what segments with free starts told.
+            found.improved = search.smaller(&found.improved, passed.undetermined?, &found.scale)?;
+            if found.improved.parts.is_empty() {
+                return None;
+            }
+        }
     }
 
     fn new(found: Found, polished: Polished, judge: &Judge) -> Closed {
@@ -838,16 +854,18 @@ impl Closed {
     }
 
     /// Whether it simulates the training recordings better than what stands, and predicts what was left out of its fit
-    /// better, beyond chance.
-    fn outdoes(&self, (found, polished): (&Found, &Polished), judge: &Judge) -> bool {
+    /// better: beyond chance where that has names, on the whole where it is a proposal as well.
+    fn outdoes(&self, (found, polished): (&Found, &Polished), has_names: bool, judge: &Judge) -> bool {
         let errors = |found: &Found, polished: &Polished| {
             let scale = residual_scale(&polished.fitted, &found.scale);
             crate::validate::errors(&polished.origin, &scale, judge.criterion, judge.window)
         };
         let scale = residual_scale(&polished.fitted, &found.scale);
         let (setup, parameters) = (&polished.fitted.setup, &polished.fitted.fit.point.parameters);
-        self.misfit.total_cmp(&judge.misfit(setup, parameters, &scale)).is_lt()
-            && Gain::of(&errors(found, polished), &errors(&self.found, &self.polished)).is_beyond_chance()
+        self.misfit.total_cmp(&judge.misfit(setup, parameters, &scale)).is_lt() && {
+            let gain = Gain::of(&errors(found, polished), &errors(&self.found, &self.polished));
+            if has_names { gain.is_beyond_chance() } else { gain.mean > 0.0 }
+        }
     }
 
     /// Of the names that stand those that it holds and that no other terms can have the place of. `None` where it leaves

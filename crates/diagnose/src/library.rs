@@ -543,22 +543,37 @@ impl Mechanism {
             return Err(Fault::new(
                 "",
                 "named",
-                "a law without a name is a force times one coefficient: one name under `linear`, no `[inner]`, no `[first]`, no `[states]`, no `reaction`, and no `t`",
+                "a law without a name is a force that is added, with strengths under `linear`, and knows no time `t`",
             ));
         }
         Ok(mechanism)
     }
 
-    /// Whether it is a force of the machine's motion times one coefficient, and nothing else: what a formula is a sum of.
+    /// Whether it is a force on one motion that vanishes with its strengths and knows no time: what a formula is a sum of. One
+    /// that equals the sum of others is none.
     pub fn is_term(&self) -> bool {
         !self.on.replaces()
-            && matches!((&self.linear[..], &self.own[..]), ([linear], [own]) if linear == own)
-            && self.inner.is_empty()
-            && self.first.is_empty()
-            && self.states.is_empty()
+            && !self.linear.is_empty()
             && self.reaction.is_none()
             && self.doubts.is_empty()
+            && self.equals.is_empty()
             && !self.law.mentions("t")
+    }
+
+    /// Whether such a force is a function of the motion times one coefficient.
+    pub(crate) fn is_plain(&self) -> bool {
+        self.states.is_empty() && self.inner.is_empty() && self.first.is_empty() && self.linear.len() == 1
+    }
+
+    /// Which of the law's own parameters grow in proportion with its strengths: all that vanish with the force.
+    pub(crate) fn grow_with_strength(&self) -> Vec<bool> {
+        let at = |strength: f64| {
+            let linear: Vec<f64> = (1..=self.linear.len()).map(|i| strength * i as f64).collect();
+            let inner: Vec<f64> = (1..=self.inner.len()).map(|i| 0.7 * i as f64).collect();
+            self.values(&linear, &inner)
+        };
+        let (Some(once), Some(twice)) = (at(1.0), at(2.0)) else { return vec![false; self.own.len()] };
+        once.iter().zip(twice).map(|(a, b)| *a != 0.0 && (b / a - 2.0).abs() < 1e-9).collect()
     }
 
     /// The recording that separates it from others, in the words of what moves or of what does not.
@@ -1518,6 +1533,22 @@ mod tests {
         // A law of two strengths has none that theirs could equal.
         assert!(at_equal(law("stribeck_friction")).is_empty());
         assert_eq!(at_equal(law("quadratic_drag")), ["quadratic_drag"]);
+    }
+
+    #[test]
+    fn a_force_vanishes_with_what_grows_with_its_strengths() {
+        let library = built_in().unwrap();
+        let grow = |kind: &str| {
+            library.iter().find(|m| m.kind == kind).map(Mechanism::grow_with_strength).unwrap_or_default()
+        };
+        assert_eq!(grow("presliding_friction"), [true, true]);
+        assert_eq!(grow("bouc_wen_hysteresis"), [true, false, false]);
+        assert_eq!(grow("stribeck_friction"), [true, true, false]);
+        // (ncg, acg and pcg.)
+        assert_eq!(grow("cogging"), [false, true, false]);
+        assert_eq!(grow("unmodeled_resonance"), [true, true, true]);
+        // A law without strengths has none that its parameters could grow with.
+        assert_eq!(grow("input_saturation"), [false]);
     }
 
     #[test]

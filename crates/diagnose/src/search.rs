@@ -352,7 +352,7 @@ impl<'a> Search<'a> {
         }
     }
 
-    /// What a formula is a sum of: forces times one coefficient, with a name or without.
+    /// What a formula is a sum of: forces that vanish with their strengths, with a name or without.
     pub(crate) fn terms(&self) -> impl Iterator<Item = &Candidate> {
         self.all.iter().chain(&self.unnamed).filter(|c| self.library[c.mechanism].is_term())
     }
@@ -430,8 +430,8 @@ impl<'a> Search<'a> {
         Fitted { fit, ..fitted.clone() }
     }
 
-    /// Fits `base` plus several candidates, the parameters as they are: from the values of all together, each times one of
-    /// these `factors` (how much of the values, how much of the shift of the parameters that goes with them).
+    /// Fits `base` plus several candidates, the parameters as they are: from the values of all together, by each of these
+    /// `factors` (how much of the strengths, how much of the shift of the parameters that goes with them).
     pub(crate) fn extend_by(
         &self,
         base: &Fitted,
@@ -464,7 +464,11 @@ impl<'a> Search<'a> {
             for (f, d) in base.setup.free.iter().zip(&together.shift) {
                 parameters[f.index] = (parameters[f.index] + shift * d).clamp(f.lower, f.upper);
             }
-            parameters.extend(together.members.iter().flat_map(|m| &m.values).map(|v| values * v));
+            for member in &together.members {
+                let grow = self.library[open[member.candidate].mechanism].grow_with_strength();
+                let value = |(v, grows): (&f64, bool)| if grows { values * v } else { *v };
+                parameters.extend(member.values.iter().zip(grow).map(value));
+            }
             Point { parameters, starts: starts.clone() }
         };
         let points: Vec<Point> = factors.iter().map(point).collect();
@@ -490,7 +494,7 @@ impl<'a> Search<'a> {
     }
 
     /// Whether every mechanism's requirements on its parameters hold, and no inertia is negative.
-    fn admissible(&self, fitted: &Fitted, scale: &[f64]) -> bool {
+    pub(crate) fn admissible(&self, fitted: &Fitted, scale: &[f64]) -> bool {
         self.is_admissible(&fitted.parts, &fitted.setup, &fitted.level, &fitted.fit.point, scale)
     }
 
@@ -708,7 +712,7 @@ impl<'a> Search<'a> {
     }
 
     /// Tries the other holds of every input; switches where the cost falls by more than `margin`.
-    fn redecide_holds(&self, fitted: &Fitted, scale: &[f64], margin: f64) -> Fitted {
+    pub(crate) fn redecide_holds(&self, fitted: &Fitted, scale: &[f64], margin: f64) -> Fitted {
         let mut best = fitted.clone();
         if self.keep_holds {
             return best;
@@ -1117,8 +1121,7 @@ impl<'a> Search<'a> {
     pub(crate) fn known(&self, fitted: &Fitted, widths: &[f64]) -> Vec<f64> {
         let known = |part: &Part| -> f64 {
             let mechanism = &self.library[part.candidate.mechanism];
-            let counts =
-                |plain: &str| mechanism.linear.is_empty() || mechanism.linear.iter().any(|l| l == plain);
+            let grow = mechanism.grow_with_strength();
             let ratio = |name: &String| {
                 let index = fitted.setup.model.parameter(name)?;
                 let at = fitted.setup.free.iter().position(|f| f.index == index)?;
@@ -1126,8 +1129,9 @@ impl<'a> Search<'a> {
                 let ratio = value / widths[at];
                 Some(if ratio.is_nan() || value == 0.0 { 0.0 } else { ratio })
             };
-            let names = mechanism.parameters().zip(&part.instance.names);
-            let known = names.filter(|(plain, _)| counts(plain)).filter_map(|(_, name)| ratio(name));
+            let names = part.instance.names.iter().zip(grow);
+            let known =
+                names.filter(|(_, g)| *g || mechanism.linear.is_empty()).filter_map(|(name, _)| ratio(name));
             known.fold(f64::NEG_INFINITY, f64::max)
         };
         fitted.parts.iter().map(known).collect()

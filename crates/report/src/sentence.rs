@@ -127,39 +127,68 @@ fn beside(report: &Report) -> Option<String> {
 /// What is proposed: each candidate with its law, or, of several forces times one coefficient each, one sum for each
 /// equation: `0.0533·θ − 0.197·θ³ in the hub equation`.
 fn laws(candidates: &[Mechanism]) -> String {
-    let terms: Vec<(&Names, f64, String)> = candidates.iter().filter_map(term).collect();
+    let terms: Vec<Term<'_>> = candidates.iter().filter_map(term).collect();
     if terms.len() < 2 || terms.len() < candidates.len() {
         return joined(&candidates.iter().map(law).collect::<Vec<_>>(), "and");
     }
     let mut sums: Vec<(&Names, String)> = Vec::new();
-    for (equation, value, rest) in terms {
-        let known = sums.iter().position(|s| s.0.as_slice() == equation.as_slice());
+    for term in &terms {
+        let known = sums.iter().position(|s| s.0.as_slice() == term.equations.as_slice());
         let at = known.unwrap_or_else(|| {
-            sums.push((equation, String::new()));
+            sums.push((term.equations, String::new()));
             sums.len() - 1
         });
         let sum = &mut sums[at].1;
-        let joint = format::joint(sum.is_empty(), value);
-        let times = if rest.is_empty() { "" } else { "·" };
-        sum.push_str(&format!("{joint}{}{times}{rest}", format::number(value.abs())));
+        let joint = format::joint(sum.is_empty(), term.coefficient);
+        let times = if term.function.is_empty() { "" } else { "·" };
+        let size = format::number(term.coefficient.abs());
+        sum.push_str(&format!("{joint}{size}{times}{}", term.function));
     }
     let sums: Vec<String> =
         sums.into_iter().map(|(names, sum)| format!("{sum}{}", equations(names))).collect();
-    format!("the terms {} (SI units), proposed and not named,", joined(&sums, "and"))
+    let memory: Vec<String> = terms.into_iter().flat_map(|term| term.memory).collect();
+    match memory.is_empty() {
+        true => format!("the terms {} (SI units), proposed and not named,", joined(&sums, "and")),
+        false => format!(
+            "the terms {}, with {} (SI units), proposed and not named,",
+            joined(&sums, "and"),
+            joined(&memory, "and")
+        ),
+    }
 }
 
-/// The equations, the coefficient and the function of a force that is one coefficient times a function.
-fn term(candidate: &Mechanism) -> Option<(&Names, f64, String)> {
-    let mut parameters = candidate.parameters.iter();
-    let (Some((name, estimate)), None) = (parameters.next(), parameters.next()) else { return None };
+/// A force that is one coefficient times a function.
+#[derive(Debug, PartialEq)]
+struct Term<'a> {
+    equations: &'a Names,
+    coefficient: f64,
+    /// The function, its constants as numbers.
+    function: String,
+    /// The equations of the states that the function remembers by, likewise: `z′ = 0.32·(x − z)`.
+    memory: Vec<String>,
+}
+
+fn term(candidate: &Mechanism) -> Option<Term<'_>> {
+    let value = |name: &str| {
+        let (_, estimate) = candidate.parameters.iter().find(|(known, _)| *known == name)?;
+        Some(estimate.value)
+    };
+    let numbers = |tokens: &[&str]| -> String {
+        let number = |token: &&str| match value(token) {
+            Some(value) if value < 0.0 => format!("({})", format::number(value)),
+            Some(value) => format::number(value),
+            None => (*token).to_owned(),
+        };
+        expression::text(&tokens.iter().map(number).collect::<String>())
+    };
     let tokens = expression::tokens(&candidate.expression);
     let (sign, tokens) = match &tokens[..] {
         ["-", rest @ ..] => (-1.0, rest),
         all => (1.0, all),
     };
-    let rest = match tokens {
-        [first] if first == name => &[][..],
-        [first, "*", rest @ ..] if first == name && !rest.contains(&&**name) => rest,
+    let (coefficient, rest) = match tokens {
+        [first] => (value(first)?, &[][..]),
+        [first, "*", rest @ ..] if !rest.contains(first) => (value(first)?, rest),
         _ => return None,
     };
     let mut depth = 0;
@@ -171,7 +200,13 @@ fn term(candidate: &Mechanism) -> Option<(&Names, f64, String)> {
         };
         depth == 0 && matches!(*token, "+" | "-")
     });
-    (!is_sum).then(|| (&candidate.equation, sign * estimate.value, expression::text(&rest.concat())))
+    let memory = candidate.states.iter().map(|(_, equation)| numbers(&expression::tokens(equation)));
+    (!is_sum).then(|| Term {
+        equations: &candidate.equation,
+        coefficient: sign * coefficient,
+        function: numbers(rest),
+        memory: memory.collect(),
+    })
 }
 
 /// A candidate and its law.
@@ -560,10 +595,22 @@ mod tests {
             "the terms −0.197·θ³ − 0.00120·(θ′ − α′) + 0.0148·sign(θ′ − α′) in the hub equation and 0.500 in the link \
              equation (SI units), proposed and not named,"
         );
-        // Two coefficients are no term, nor is a sum.
+        // Constants are numbers, memories are told.
+        let mut brake = term("hub", "bs", "bs*theta'/(1 + (theta'/vs)^2)", 2.808);
+        brake.parameters.extend(term("hub", "vs", "", 0.385).parameters);
+        let mut series = term("hub", "km", "km*(theta - z)", 8.05);
+        series.parameters.extend(term("hub", "wm", "", 0.5).parameters);
+        series.states = [("z".to_owned(), "z' = wm*(theta - z)".to_owned())].into();
+        assert_eq!(
+            laws(&[brake, series]),
+            "the terms 2.81·θ′/(1 + (θ′/0.385)²) + 8.05·(θ − z) in the hub equation, with z′ = 0.500·(θ − z) (SI units), \
+             proposed and not named,"
+        );
+        // A sum of two coefficients is no term.
         let mut two = term("hub", "k3", "k3*theta^3 + k5*theta^5", 1.0);
         assert_eq!(super::term(&two), None);
         two.parameters.extend(term("hub", "k5", "", 2.0).parameters);
+        assert_eq!(super::term(&two), None);
         assert_eq!(laws(&[two, cube]), "cubic stiffness (k₃·θ³ + k₅·θ⁵) and cubic stiffness (k₃·θ³)");
     }
 

@@ -278,6 +278,15 @@ fn places(kind: Kind, family: Family) -> Vec<usize> {
         (QuinticStiffness, Table) => &[1],
         (ParametricExcitation, Oscillator | Duffing) => &[0],
         (ParametricExcitation, Table) => &[1],
+        (EddyBrake | PowerDrag, Oscillator | Duffing | Pendulum | Servo) => &[0],
+        (EddyBrake | PowerDrag, Table) => &[1],
+        (MaxwellElement, Oscillator | Duffing) => &[0],
+        (MaxwellElement, Table | FlexibleLink) => &[1],
+        (AgeingFriction, Oscillator | Pendulum | Servo) => &[0],
+        (OneWayDamper, Oscillator | Duffing | QuarterCar) => &[0],
+        (OneWayDamper, Table) => &[1],
+        (LockingSpring, Oscillator | QuarterCar) => &[0],
+        (LockingSpring, Table | FlexibleLink) => &[1],
         _ => &[],
     };
     places.to_vec()
@@ -531,6 +540,24 @@ fn grow(kind: Kind, place: usize, machine: &Machine, scene: &Scene, rng: &mut Pc
         Kind::ParametricExcitation => {
             let f = scene.omega / TAU * rng.random_range(0.15..0.6);
             Box::new(move |s| [0.5 * s * force / rd, f, 0.0])
+        }
+        Kind::EddyBrake => {
+            let vb = rng.random_range(0.4..1.2) * rr;
+            Box::new(move |s| [1.5 * s * force / vb, vb, 0.0])
+        }
+        Kind::MaxwellElement => {
+            let time = rng.random_range(0.5..2.0) / scene.omega;
+            Box::new(move |s| [s * force / rd, time, 0.0])
+        }
+        Kind::AgeingFriction => {
+            let (vw, time) = (rng.random_range(0.2..0.6) * rr, rng.random_range(0.2..0.6) * period);
+            Box::new(move |s| [2.0 * s * force, vw, time])
+        }
+        Kind::OneWayDamper => one(force / rr),
+        Kind::PowerDrag => one(0.8 * force / rr.powf(1.5)),
+        Kind::LockingSpring => {
+            let le = rng.random_range(0.3..0.6) * top;
+            Box::new(move |s| [s * force / (rd / le).sinh(), le, 0.0])
         }
     };
     Growing { effect: Effect { kind, at: place, p: [0.0; 3], which }, at, given }

@@ -49,6 +49,18 @@ pub(crate) enum Kind {
     QuinticStiffness,
     /// `ap*cos(2*pi*fp*t)*d`: a spring that is pumped.
     ParametricExcitation,
+    /// `bv*d'/(1 + (d'/vb)^2)`: an eddy-current brake.
+    EddyBrake,
+    /// `km*(d - s)`, `tm*s' = d - s`: a spring and a damper in series.
+    MaxwellElement,
+    /// `fw*sign(d')/(1 + s/vw)`, `tw*s' = abs(d') - s`: friction that grows at rest.
+    AgeingFriction,
+    /// `bo*max(d', 0)`: a damper that acts one way.
+    OneWayDamper,
+    /// `cp*abs(d')^1.5*sign(d')`: a drag between viscous and quadratic.
+    PowerDrag,
+    /// `ke*sinh(d/le)`: a spring that locks.
+    LockingSpring,
 }
 
 use Kind::*;
@@ -88,7 +100,7 @@ pub(crate) const LIBRARY: [Kind; 30] = [
 ];
 
 /// Effects that no kind of the library describes.
-pub(crate) const OUTSIDE: [Kind; 8] = [
+pub(crate) const OUTSIDE: [Kind; 14] = [
     DisplacementDamping,
     SineOfPower,
     BreathingQuadratic,
@@ -97,6 +109,12 @@ pub(crate) const OUTSIDE: [Kind; 8] = [
     TiringActuator,
     QuinticStiffness,
     ParametricExcitation,
+    EddyBrake,
+    MaxwellElement,
+    AgeingFriction,
+    OneWayDamper,
+    PowerDrag,
+    LockingSpring,
 ];
 
 impl Kind {
@@ -141,6 +159,12 @@ impl Kind {
             TiringActuator => "outside_tiring_actuator",
             QuinticStiffness => "outside_quintic_stiffness",
             ParametricExcitation => "outside_parametric_excitation",
+            EddyBrake => "outside_eddy_brake",
+            MaxwellElement => "outside_maxwell_element",
+            AgeingFriction => "outside_ageing_friction",
+            OneWayDamper => "outside_one_way_damper",
+            PowerDrag => "outside_power_drag",
+            LockingSpring => "outside_locking_spring",
         }
     }
 
@@ -212,6 +236,12 @@ impl Kind {
             TiringActuator => &["bf", "tf"],
             QuinticStiffness => &["k5"],
             ParametricExcitation => &["ap", "fp"],
+            EddyBrake => &["bv", "vb"],
+            MaxwellElement => &["km", "tm"],
+            AgeingFriction => &["fw", "vw", "tw"],
+            OneWayDamper => &["bo"],
+            PowerDrag => &["cp"],
+            LockingSpring => &["ke", "le"],
         }
     }
 
@@ -248,6 +278,9 @@ impl Kind {
             ProductCoupling => &["coupling"],
             QuinticStiffness => &["cubic_stiffness", "end_stop"],
             TiringActuator => &["input_saturation"],
+            AgeingFriction => &["coulomb_friction", "stribeck_friction"],
+            PowerDrag => &["quadratic_drag"],
+            LockingSpring => &["cubic_stiffness", "end_stop"],
             _ => &[],
         }
     }

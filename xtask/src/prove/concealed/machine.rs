@@ -318,6 +318,9 @@ impl Machine {
             }
             let place = self.place(e);
             let (d, r) = self.motion(e, y);
+            if e.kind == Kind::AgeingFriction {
+                extra[slot] = (r.abs() - y[EXTRA + slot]) / a[2];
+            }
             if let Some(pair) = self.friction_levels(e, d, r, &p, u, elastic, y) {
                 levels[contact] = pair;
                 contact += 1;
@@ -373,6 +376,14 @@ impl Machine {
                 Kind::ProductCoupling => a[0] * q[0] * q[1],
                 Kind::QuinticStiffness => a[0] * d.powi(5),
                 Kind::ParametricExcitation => a[0] * (std::f64::consts::TAU * a[1] * t).cos() * d,
+                Kind::EddyBrake => a[0] * r / (1.0 + (r / a[1]).powi(2)),
+                Kind::MaxwellElement => {
+                    extra[slot] = (d - z) / a[1];
+                    a[0] * (d - z)
+                }
+                Kind::OneWayDamper => a[0] * r.max(0.0),
+                Kind::PowerDrag => a[0] * r.abs().powf(1.5).copysign(r),
+                Kind::LockingSpring => a[0] * (d / a[1]).sinh(),
                 _ => 0.0,
             };
             (0..2).for_each(|i| h[i] += place.w[i] * force);
@@ -468,6 +479,10 @@ impl Machine {
                 Some([a[0] * load.abs(); 2])
             }
             Kind::PositionFriction => Some([a[0] * d * d; 2]),
+            Kind::AgeingFriction => {
+                let slot = self.effects.iter().position(|o| std::ptr::eq(o, e)).map_or(0, |i| self.slot(i));
+                Some([a[0] / (1.0 + y[EXTRA + slot] / a[1]); 2])
+            }
             _ => None,
         }
     }
@@ -757,7 +772,12 @@ impl Machine {
 /// Further states of an effect.
 fn states_of(kind: Kind) -> usize {
     match kind {
-        Kind::PreslidingFriction | Kind::BoucWenHysteresis | Kind::ActuatorLag | Kind::TiringActuator => 1,
+        Kind::PreslidingFriction
+        | Kind::BoucWenHysteresis
+        | Kind::ActuatorLag
+        | Kind::TiringActuator
+        | Kind::MaxwellElement
+        | Kind::AgeingFriction => 1,
         Kind::UnmodeledResonance => 2,
         _ => 0,
     }
@@ -771,6 +791,7 @@ fn is_dry(kind: Kind) -> bool {
             | Kind::StribeckFriction
             | Kind::LoadDependentFriction
             | Kind::PositionFriction
+            | Kind::AgeingFriction
     )
 }
 

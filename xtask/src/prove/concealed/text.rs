@@ -485,6 +485,20 @@ fn force(
         }
         Kind::QuinticStiffness => format!("{}*{d}^5", n(0)),
         Kind::ParametricExcitation => format!("{}*cos(2*pi*{}*t)*{d}", n(0), n(1)),
+        Kind::EddyBrake => format!("{}*{r}/(1 + ({r}/{})^2)", n(0), n(1)),
+        Kind::MaxwellElement => {
+            let _ = writeln!(states, "s{index} = {{ measured = false, initial = 0 }}");
+            let _ = writeln!(own, "series{index} = \"{}*s{index}' = {d} - s{index}\"", n(1));
+            format!("{}*({d} - s{index})", n(0))
+        }
+        Kind::AgeingFriction => {
+            let _ = writeln!(states, "s{index} = {{ measured = false, initial = 0 }}");
+            let _ = writeln!(own, "ageing{index} = \"{}*s{index}' = abs({r}) - s{index}\"", n(2));
+            format!("{}*sign({r})/(1 + s{index}/{})", n(0), n(1))
+        }
+        Kind::OneWayDamper => format!("{}*max({r}, 0)", n(0)),
+        Kind::PowerDrag => format!("{}*abs({r})^1.5*sign({r})", n(0)),
+        Kind::LockingSpring => format!("{0}*0.5*(exp({d}/{1}) - exp(-({d}/{1})))", n(0), n(1)),
         // The others transform an input, a measurement or a parameter.
         _ => "0".to_owned(),
     }
