@@ -645,6 +645,12 @@ fn conclude(
     // What is not believed explains nothing: all that the equations lack is what is missing. (Where too little is
     // known of the noise for that, what those mechanisms leave over shows the place.)
     let lacks = if unexplained { self::surface(&calibrated, &calibrated_scale) } else { None };
+    // (What a closure leaves shows nothing of what it models: that is its own variable.)
+    let of_closure = if unexplained && found.closed { only_variable(&improved, library) } else { None };
+    let surface = match (of_closure, surface) {
+        (Some(variable), Some(left)) => Some(Surface { variable: Some((variable, left.gain)), ..left }),
+        (_, surface) => surface,
+    };
     let remainder = match lacks {
         Some(lacks) => remainder(&calibrated, Some(lacks), significant, 1.0),
         None => {
@@ -1786,6 +1792,21 @@ pub fn left_over(setup: &Setup, hats: &Along<'_>, equation: usize) -> Option<Vec
         }
     }
     Some(total)
+}
+
+/// What the forces of a model's parts depend on, where that is one motion.
+fn only_variable(improved: &Fitted, library: &[Mechanism]) -> Option<Variable> {
+    let acts = |part: &&Part| !library[part.candidate.mechanism].is_constant();
+    let parts: Vec<&Candidate> = improved.parts.iter().filter(acts).map(|part| &part.candidate).collect();
+    let motion = parts.first()?.motion()?;
+    let is_only = parts.iter().all(|c| matches!(&c.place, Place::Motion(own) if own == motion));
+    let depends = |primes| parts.iter().any(|c| library[c.mechanism].depends_on("d", primes));
+    match (depends(0), depends(1)) {
+        _ if !is_only || depends(2) => None,
+        (true, false) => Some(Variable::Position(motion.clone())),
+        (false, true) => Some(Variable::Rate(motion.clone())),
+        _ => Some(Variable::Both(motion.clone())),
+    }
 }
 
 fn remainder(improved: &Fitted, surface: Option<Surface>, significant: bool, left: f64) -> Remainder {
