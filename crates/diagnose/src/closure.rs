@@ -503,7 +503,7 @@ second = "n*y'' + c*y' + l*(y - x) = 0"
             let close = v.iter().zip(values).all(|(a, b)| (a / b - 1.0).abs() < 0.05);
             k == kind && p == place && close
         };
-        for seed in 40..43 {
+        for seed in 40..42 {
             let brake = told(&|[_, _, v, ..]| [3.0 * v / (1.0 + (v / 0.4).powi(2)), 0.0, 0.0], seed);
             assert!(near(&brake, "saturating_damping", "first", [3.0, 0.4]), "{brake:?}");
             let spring = told(&|[_, y, _, _, z]| [0.0, 6.0 * (y - z), 2.0 * (y - z)], seed);
