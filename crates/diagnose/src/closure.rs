@@ -11,7 +11,7 @@
 //! PNAS 113, 2016), on the simulated motion in place of differentiated measurements. A round adds up to three terms of one
 //! coefficient that explain most together, or one law with constants or a memory, whichever is worth more, and takes away,
 //! one after the other, the term that the recordings determine least, for as long as what is known of it
-//! ([`robust`](crate::evidence::robust)) is below the odds against one term among all. Rounds go on until none changes
+//! ([`robust`](crate::evidence::robust)) is below the odds against one among those that the round chose from. Rounds go on until none changes
 //! anything, on short segments first, where first order is good, on longer ones later, where small forces are seen.
 
 use std::sync::Arc;
@@ -24,8 +24,8 @@ use crate::evidence::{Evidence, least_kappa};
 use crate::place::own_coordinates;
 use crate::screen::{Scored, Together, screen, screen_set, shift_without};
 use crate::search::{
-    Accepted, Fitted, Found, MOST_SAMPLES, Search, UNDECIDED, WHITE, limits, next_scale, odds, same_level,
-    whole,
+    Accepted, Fitted, Found, MOST_SAMPLES, SAME_HOLD, Search, UNDECIDED, WHITE, limits, next_scale, odds,
+    same_level, whole,
 };
 use crate::turns::Turns;
 use crate::uncertainty::Uncertainty;
@@ -38,22 +38,20 @@ const FINALISTS: usize = 2;
 /// Where a fit with new terms may begin: how much of their values, how much of the shift of the parameters that goes with
 /// them. First order may promise too much of either.
 const STARTS: [(f64, f64); 3] = [(1.0, 1.0), (1.0, 0.0), (1e-3, 0.0)];
-/// Fall of the cost from which another hold of an input is considered.
-const SAME_HOLD: f64 = 0.002;
-/// Steps that tell which trial leads, of a fit with new terms, and of one without a term.
-const STEPS_TO_TELL: usize = 5;
+/// Steps of a trial, of a fit with new terms, and of one without a term.
+const STEPS_OF_A_TRIAL: usize = 5;
 const STEPS: usize = 20;
 const STEPS_WITHOUT: usize = 12;
 /// Residual over noise from which something is left.
 const LEFT: f64 = 1.03;
 
-/// The terms that closures ended a level with: what comes there goes on from there as they did.
+/// The terms that closures ended each level with: another one that comes there goes on from there as they did.
 #[derive(Default)]
-pub(crate) struct Ways(Vec<(usize, Vec<Candidate>)>);
+pub(crate) struct Visited(Vec<(usize, Vec<Candidate>)>);
 
-impl Ways {
+impl Visited {
     /// Whether no other closure had these terms at the end of this level; from now on one has.
-    fn is_new(&mut self, level: usize, terms: Vec<Candidate>) -> bool {
+    fn insert(&mut self, level: usize, terms: Vec<Candidate>) -> bool {
         let is_known = self.0.iter().any(|(l, t)| *l == level && is_same(t, &terms));
         self.0.push((level, terms));
         !is_known
@@ -62,8 +60,8 @@ impl Ways {
 
 impl Search<'_> {
     /// A closure that begins with the model `from`, in the place of what a search `found`. `None` where no term is worth its
-    /// odds, of a model whose laws [mix](Self::mixes) equations, and where it comes on one of the `ways` that others went.
-    pub(crate) fn closure(&self, found: &Found, from: &Fitted, ways: &mut Ways) -> Option<Found> {
+    /// odds, of a model whose laws [mix](Self::mixes) equations, and where it comes to what others `visited`.
+    pub(crate) fn closure(&self, found: &Found, from: &Fitted, visited: &mut Visited) -> Option<Found> {
         if from.parts.iter().any(|part| self.mixes(&part.candidate)) {
             return None;
         }
@@ -98,18 +96,22 @@ impl Search<'_> {
                 if is_spent() || !leaves_something(&current, &scale) {
                     break;
                 }
-                let is_new = |model: &Fitted| !seen.iter().any(|s| is_same(s, &candidates(model)));
-                let plain = self.closer(&current, &plain, &scale).filter(is_new);
+                let settled = |more: Option<Fitted>, terms: &[Candidate]| {
+                    let settled = self.settled(&current, more?, odds(terms.len()), &scale)?;
+                    let is_new = !seen.iter().any(|s| is_same(s, &candidates(&settled)));
+                    is_new.then_some(settled)
+                };
+                let plain = settled(self.larger(&current, &plain, AT_ONCE, &scale), &plain);
                 // A law with more to fit is tried where it promises more than they keep.
                 let kept = plain.as_ref().map_or(0.0, |plain| 1.0 - plain.rss() / current.rss());
-                let rich = self.richer(&current, &rich, kept, &scale).filter(is_new);
+                let rich = settled(self.with_one(&current, &rich, kept, &scale), &rich);
                 let told = |model: &Fitted| self.robust(&current, model, &scale);
                 let both = [plain, rich].into_iter().flatten();
                 let Some(next) = both.max_by(|a, b| told(a).total_cmp(&told(b))) else { break };
                 // (Another hold may have stood in for what has a term now.)
                 current = self.redecide_holds(&next, &scale, SAME_HOLD);
             }
-            if !ways.is_new(step, candidates(&current)) {
+            if !visited.insert(step, candidates(&current)) {
                 self.observer.begins(&nominal.work);
                 return None;
             }
@@ -161,19 +163,12 @@ impl Search<'_> {
         (0..closure.parts.len()).into_par_iter().map(of).collect()
     }
 
-    /// A round: more terms, and of all of them those that are known. `None` where nothing changes, or for the worse.
-    fn closer(&self, current: &Fitted, terms: &[Candidate], scale: &[f64]) -> Option<Fitted> {
-        let larger = self.larger(current, terms, AT_ONCE, scale)?;
-        let closer = self.known_alone(larger, odds(terms.len()), scale);
-        self.is_closer(current, &closer).then_some(closer)
-    }
-
-    /// A round with laws that have constants or a memory of their own, one at a time: those that explain more than this
-    /// share to first order.
-    fn richer(&self, current: &Fitted, terms: &[Candidate], more: f64, scale: &[f64]) -> Option<Fitted> {
-        let richer = self.with_one(current, terms, more, scale)?;
-        let richer = self.known_alone(richer, odds(terms.len()), scale);
-        self.is_closer(current, &richer).then_some(richer)
+    /// What is known of a model with `more`, where that changes anything and for the better: the end of a round. `odds` are
+    /// those against what the round chose.
+    fn settled(&self, current: &Fitted, more: Fitted, odds: f64, scale: &[f64]) -> Option<Fitted> {
+        let settled = self.known_alone(more, odds, scale);
+        let is_closer = settled.rss().total_cmp(&current.rss()).is_lt();
+        (is_closer || settled.parts.len() < current.parts.len()).then_some(settled)
     }
 
     /// The model with one law beside it: of those that explain most to first order, and more than this share, the one that
@@ -188,7 +183,7 @@ impl Search<'_> {
             scored.into_iter().take_while(|one| one.gain > more).take(TRIALS).collect();
         let tried = promising.into_par_iter().filter_map(|one| {
             let alone = Together { gain: one.gain, shift: one.shift.clone(), members: vec![one] };
-            self.extend_by(base, &open, &alone, &STARTS, scale, STEPS_TO_TELL)
+            self.extend_by(base, &open, &alone, &STARTS, scale, STEPS_OF_A_TRIAL)
         });
         let told = |model: Fitted| (self.robust(base, &model, scale), model);
         let mut tried: Vec<(f64, Fitted)> = tried.map(told).collect();
@@ -197,11 +192,6 @@ impl Search<'_> {
         let fitted = tried.into_par_iter().map(|(_, model)| self.refit(&model, scale, STEPS));
         let allowed = fitted.filter(|model| self.admissible(model, scale)).map(told).collect::<Vec<_>>();
         allowed.into_iter().max_by(|a, b| a.0.total_cmp(&b.0)).map(|best| best.1)
-    }
-
-    /// Whether a model has less error or fewer parts than another.
-    fn is_closer(&self, from: &Fitted, to: &Fitted) -> bool {
-        to.rss().total_cmp(&from.rss()).is_lt() || to.parts.len() < from.parts.len()
     }
 
     /// The model with up to `most` terms beside it, those that explain most together.
@@ -259,13 +249,11 @@ impl Search<'_> {
         let (setup, point) = (&model.setup, &model.fit.point);
         let part = &model.parts[index];
         let own: Vec<usize> = part.instance.names.iter().filter_map(|n| setup.model.parameter(n)).collect();
-        // (Constants that do not grow with the strengths mean nothing without them.)
-        let law = &self.library[part.candidate.mechanism];
-        let stays: Vec<bool> =
-            law.grow_with_strength().iter().map(|g| !g && !law.linear.is_empty()).collect();
+        // (Constants mean nothing without the force.)
+        let vanish = self.library[part.candidate.mechanism].vanish_with_force();
         let gone: Vec<(usize, f64)> = (0..setup.free.len())
             .filter_map(|i| Some((i, own.iter().position(|&o| o == setup.free[i].index)?)))
-            .map(|(i, k)| (i, if stays[k] { 0.0 } else { point.parameters[own[k]] }))
+            .map(|(i, k)| (i, if vanish[k] { point.parameters[own[k]] } else { 0.0 }))
             .collect();
         let shift = shift_without(setup, &model.level, scale, point, &gone);
         let mut shifted = point.parameters.clone();
@@ -461,7 +449,7 @@ second = "n*y'' + c*y' + l*(y - x) = 0"
         let right = (0..seeds).filter(|seed| {
             let search = Search::new(bodies(&more, 10 + seed), &library, &crate::Quiet);
             let found = nothing(&search);
-            let closed = search.closure(&found, &found.calibrated, &mut Ways::default()).unwrap();
+            let closed = search.closure(&found, &found.calibrated, &mut Visited::default()).unwrap();
             let told = terms(&closed, &library, &search.nominal().model);
             told.len() == truth.len()
                 && told
@@ -474,7 +462,7 @@ second = "n*y'' + c*y' + l*(y - x) = 0"
         for seed in 0..seeds {
             let search = Search::new(bodies(&|_| [0.0; 3], 20 + seed), &library, &crate::Quiet);
             let found = nothing(&search);
-            let closed = search.closure(&found, &found.calibrated, &mut Ways::default());
+            let closed = search.closure(&found, &found.calibrated, &mut Visited::default());
             let told = closed.map(|closed| terms(&closed, &library, &search.nominal().model));
             assert_eq!(told, None, "seed {seed}");
         }
@@ -487,7 +475,7 @@ second = "n*y'' + c*y' + l*(y - x) = 0"
         let told = |more: &dyn Fn([f64; 5]) -> [f64; 3], seed: u64| {
             let search = Search::new(bodies(more, seed), &library, &crate::Quiet);
             let found = nothing(&search);
-            let closed = search.closure(&found, &found.calibrated, &mut Ways::default()).unwrap();
+            let closed = search.closure(&found, &found.calibrated, &mut Visited::default()).unwrap();
             let fitted = closed.improved;
             let value =
                 |name: &String| fitted.fit.point.parameters[fitted.setup.model.parameter(name).unwrap()];
@@ -505,9 +493,9 @@ second = "n*y'' + c*y' + l*(y - x) = 0"
         };
         for seed in 40..42 {
             let brake = told(&|[_, _, v, ..]| [3.0 * v / (1.0 + (v / 0.4).powi(2)), 0.0, 0.0], seed);
-            assert!(near(&brake, "saturating_damping", "first", [3.0, 0.4]), "{brake:?}");
+            assert!(near(&brake, "eddy_current_damping", "first", [3.0, 0.4]), "{brake:?}");
             let spring = told(&|[_, y, _, _, z]| [0.0, 6.0 * (y - z), 2.0 * (y - z)], seed);
-            assert!(near(&spring, "relaxing_spring", "second", [6.0, 2.0]), "{spring:?}");
+            assert!(near(&spring, "maxwell_element", "second", [6.0, 2.0]), "{spring:?}");
         }
     }
 
@@ -518,7 +506,7 @@ second = "n*y'' + c*y' + l*(y - x) = 0"
         let held = |kind: &str, more: &dyn Fn([f64; 5]) -> [f64; 3]| {
             let search = Search::new(bodies(more, 31), &library, &crate::Quiet);
             let found = nothing(&search);
-            let closed = search.closure(&found, &found.calibrated, &mut Ways::default()).expect(kind);
+            let closed = search.closure(&found, &found.calibrated, &mut Visited::default()).expect(kind);
             let told = terms(&closed, &library, &search.nominal().model);
             let index =
                 closed.improved.parts.iter().position(|p| library[p.candidate.mechanism].kind == kind);

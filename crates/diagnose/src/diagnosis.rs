@@ -14,7 +14,7 @@ use rayon::prelude::*;
 
 use crate::along::Along;
 use crate::candidate::Candidate;
-use crate::closure::Ways;
+use crate::closure::Visited;
 use crate::evidence::{Evidence, fall, kappa};
 use crate::library::{Mechanism, MechanismError, built_in};
 use crate::locate::{Location, force, locate};
@@ -645,16 +645,16 @@ fn conclude(
     // What is not believed explains nothing: all that the equations lack is what is missing. (Where too little is
     // known of the noise for that, what those mechanisms leave over shows the place.)
     let lacks = if unexplained { self::surface(&calibrated, &calibrated_scale) } else { None };
-    // (What a closure leaves shows nothing of what it models: that is its own variable.)
-    let of_closure = if unexplained && found.closed { only_variable(&improved, library) } else { None };
-    let surface = match (of_closure, surface) {
-        (Some(variable), Some(left)) => Some(Surface { variable: Some((variable, left.gain)), ..left }),
-        (_, surface) => surface,
-    };
     let remainder = match lacks {
         Some(lacks) => remainder(&calibrated, Some(lacks), significant, 1.0),
         None => {
             let all = if unexplained { share(base - full) } else { 0.0 };
+            // What a closure leaves shows nothing of what it models: that has the closure's own variable.
+            let own = if unexplained && found.closed { only_variable(&improved, library) } else { None };
+            let surface = surface.map(|left| match own {
+                Some(variable) => Surface { variable: Some((variable, left.gain)), ..left },
+                None => left,
+            });
             let left = remainder(&improved, surface, significant, share(full));
             Remainder { share_of_residual: (all + left.share_of_residual).min(1.0), ..left }
         }
@@ -804,7 +804,8 @@ struct Closed {
 }
 
 impl Closed {
-    /// The closure that simulates best of those that begin with the calibrated model and with what stands.
+    /// The closure that begins with the calibrated model or, where that leaves more than noise and it simulates better, the one
+    /// that begins with what stands.
     fn of(
         search: &Search<'_>,
         found: &Found,
@@ -817,10 +818,10 @@ impl Closed {
             from.push(&found.improved);
         }
         let gates = Gates::new(search, baseline, judge, false);
-        let mut ways = Ways::default();
+        let mut visited = Visited::default();
         let mut best: Option<Closed> = None;
         for from in from {
-            let Some(closed) = search.closure(found, from, &mut ways) else { continue };
+            let Some(closed) = search.closure(found, from, &mut visited) else { continue };
             let Some(closed) = Closed::defended(search, closed, &gates, judge) else { continue };
             if best.as_ref().is_none_or(|best| closed.misfit.total_cmp(&best.misfit).is_lt()) {
                 best = Some(closed);

@@ -543,7 +543,7 @@ impl Mechanism {
             return Err(Fault::new(
                 "",
                 "named",
-                "a law without a name is a force that is added, with strengths under `linear`, and knows no time `t`",
+                "a law without a name is a force with strengths under `linear`, without `reaction`, `doubts`, `[equals]` and the time `t`",
             ));
         }
         Ok(mechanism)
@@ -565,8 +565,12 @@ impl Mechanism {
         self.states.is_empty() && self.inner.is_empty() && self.first.is_empty() && self.linear.len() == 1
     }
 
-    /// Which of the law's own parameters grow in proportion with its strengths: all that vanish with the force.
-    pub(crate) fn grow_with_strength(&self) -> Vec<bool> {
+    /// Which of the law's own parameters vanish with its force: those that grow in proportion with its strengths, and all of
+    /// a law that has none.
+    pub(crate) fn vanish_with_force(&self) -> Vec<bool> {
+        if self.linear.is_empty() {
+            return vec![true; self.own.len()];
+        }
         let at = |strength: f64| {
             let linear: Vec<f64> = (1..=self.linear.len()).map(|i| strength * i as f64).collect();
             let inner: Vec<f64> = (1..=self.inner.len()).map(|i| 0.7 * i as f64).collect();
@@ -1536,19 +1540,18 @@ mod tests {
     }
 
     #[test]
-    fn a_force_vanishes_with_what_grows_with_its_strengths() {
+    fn constants_of_a_law_do_not_vanish_with_its_force() {
         let library = built_in().unwrap();
-        let grow = |kind: &str| {
-            library.iter().find(|m| m.kind == kind).map(Mechanism::grow_with_strength).unwrap_or_default()
+        let vanish = |kind: &str| {
+            library.iter().find(|m| m.kind == kind).map(Mechanism::vanish_with_force).unwrap_or_default()
         };
-        assert_eq!(grow("presliding_friction"), [true, true]);
-        assert_eq!(grow("bouc_wen_hysteresis"), [true, false, false]);
-        assert_eq!(grow("stribeck_friction"), [true, true, false]);
+        assert_eq!(vanish("presliding_friction"), [true, true]);
+        assert_eq!(vanish("bouc_wen_hysteresis"), [true, false, false]);
+        assert_eq!(vanish("stribeck_friction"), [true, true, false]);
         // (ncg, acg and pcg.)
-        assert_eq!(grow("cogging"), [false, true, false]);
-        assert_eq!(grow("unmodeled_resonance"), [true, true, true]);
-        // A law without strengths has none that its parameters could grow with.
-        assert_eq!(grow("input_saturation"), [false]);
+        assert_eq!(vanish("cogging"), [false, true, false]);
+        assert_eq!(vanish("unmodeled_resonance"), [true, true, true]);
+        assert_eq!(vanish("input_saturation"), [true]);
     }
 
     #[test]

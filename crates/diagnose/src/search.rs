@@ -58,6 +58,8 @@ const PAIR_MISFIT: f64 = 1.1;
 const PAIR_SAMPLES: usize = 500;
 /// Residual over noise from which a fit may be stuck.
 const STUCK: f64 = 1.2;
+/// Fall of the cost from which another hold of an input is considered once more is known of the machine.
+pub(crate) const SAME_HOLD: f64 = 0.002;
 /// Information per sample from which a residual counts as white.
 pub(crate) const WHITE: f64 = 0.8;
 /// Residual over noise from which a model is far from the noise.
@@ -465,9 +467,9 @@ impl<'a> Search<'a> {
                 parameters[f.index] = (parameters[f.index] + shift * d).clamp(f.lower, f.upper);
             }
             for member in &together.members {
-                let grow = self.library[open[member.candidate].mechanism].grow_with_strength();
-                let value = |(v, grows): (&f64, bool)| if grows { values * v } else { *v };
-                parameters.extend(member.values.iter().zip(grow).map(value));
+                let vanish = self.library[open[member.candidate].mechanism].vanish_with_force();
+                let value = |(v, vanishes): (&f64, bool)| if vanishes { values * v } else { *v };
+                parameters.extend(member.values.iter().zip(vanish).map(value));
             }
             Point { parameters, starts: starts.clone() }
         };
@@ -1121,7 +1123,6 @@ impl<'a> Search<'a> {
     pub(crate) fn known(&self, fitted: &Fitted, widths: &[f64]) -> Vec<f64> {
         let known = |part: &Part| -> f64 {
             let mechanism = &self.library[part.candidate.mechanism];
-            let grow = mechanism.grow_with_strength();
             let ratio = |name: &String| {
                 let index = fitted.setup.model.parameter(name)?;
                 let at = fitted.setup.free.iter().position(|f| f.index == index)?;
@@ -1129,9 +1130,8 @@ impl<'a> Search<'a> {
                 let ratio = value / widths[at];
                 Some(if ratio.is_nan() || value == 0.0 { 0.0 } else { ratio })
             };
-            let names = part.instance.names.iter().zip(grow);
-            let known =
-                names.filter(|(_, g)| *g || mechanism.linear.is_empty()).filter_map(|(name, _)| ratio(name));
+            let names = part.instance.names.iter().zip(mechanism.vanish_with_force());
+            let known = names.filter(|(_, vanishes)| *vanishes).filter_map(|(name, _)| ratio(name));
             known.fold(f64::NEG_INFINITY, f64::max)
         };
         fitted.parts.iter().map(known).collect()
@@ -1358,7 +1358,7 @@ impl<'a> Search<'a> {
         };
         state.rescale();
         state.current = self.refit(&state.current, &state.scale, 10);
-        state.current = self.redecide_holds(&state.current, &state.scale, 0.002);
+        state.current = self.redecide_holds(&state.current, &state.scale, SAME_HOLD);
         if !state.current.parts.is_empty() {
             self.prune(state);
         }
@@ -1672,7 +1672,7 @@ impl<'a> Search<'a> {
             self.method(&mut state.current, &state.scale);
             state.current = self.refit(&state.current, &state.scale, 10);
             let holds = state.current.setup.holds.clone();
-            state.current = self.redecide_holds(&state.current, &state.scale, 0.002);
+            state.current = self.redecide_holds(&state.current, &state.scale, SAME_HOLD);
             if state.current.setup.holds != holds {
                 state.rescale();
                 self.method(&mut state.current, &state.scale);

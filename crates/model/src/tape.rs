@@ -388,6 +388,13 @@ impl<'a> Compiler<'a> {
         }
     }
 
+    /// The register of an expression, zero where a switch that is held makes negative what is not so by its form.
+    fn kept_positive(&mut self, e: &Expr, register: Reg) -> Reg {
+        let mut switches = false;
+        e.walk(&mut |e| switches |= matches!(e, Expr::Call(Func::Abs | Func::Max, _)));
+        if switches && is_never_negative(e) { self.smooth(Smooth::Positive, register) } else { register }
+    }
+
     fn switch(&mut self, kind: SwitchKind, a: Reg, b: Reg) -> Reg {
         let next = self.switches.len() as u32;
         let index = *self.switch_index.entry((kind, a, b)).or_insert(next);
@@ -444,7 +451,7 @@ impl<'a> Compiler<'a> {
                         self.push(Op::Powi(ra, y as i32), &[ra])
                     }
                     (BinOp::Pow, ..) => {
-                        let ra = if is_never_negative(a) { self.smooth(Smooth::Positive, ra) } else { ra };
+                        let ra = self.kept_positive(a, ra);
                         self.push(Op::Pow(ra, rb), &[ra, rb])
                     }
                 }
@@ -471,8 +478,7 @@ impl<'a> Compiler<'a> {
                     Func::Exp => self.smooth(Smooth::Exp, a),
                     Func::Ln => self.smooth(Smooth::Ln, a),
                     Func::Sqrt => {
-                        let held = is_never_negative(&args[0]);
-                        let a = if held { self.smooth(Smooth::Positive, a) } else { a };
+                        let a = self.kept_positive(&args[0], a);
                         self.smooth(Smooth::Sqrt, a)
                     }
                     Func::Tanh => self.smooth(Smooth::Tanh, a),

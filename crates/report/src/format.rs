@@ -242,6 +242,7 @@ pub(crate) fn capital(text: &str) -> String {
 pub fn kind_in_sentence(name: &str) -> String {
     let words = name.split('_').map(|word| match word {
         "coulomb" => "Coulomb",
+        "maxwell" => "Maxwell",
         "stribeck" => "Stribeck",
         "unmodeled" => "unmodelled",
         other => other,

@@ -147,14 +147,8 @@ fn laws(candidates: &[Mechanism]) -> String {
     let sums: Vec<String> =
         sums.into_iter().map(|(names, sum)| format!("{sum}{}", equations(names))).collect();
     let memory: Vec<String> = terms.into_iter().flat_map(|term| term.memory).collect();
-    match memory.is_empty() {
-        true => format!("the terms {} (SI units), proposed and not named,", joined(&sums, "and")),
-        false => format!(
-            "the terms {}, with {} (SI units), proposed and not named,",
-            joined(&sums, "and"),
-            joined(&memory, "and")
-        ),
-    }
+    let memory = if memory.is_empty() { String::new() } else { format!(", with {}", joined(&memory, "and")) };
+    format!("the terms {}{memory} (SI units), proposed and not named,", joined(&sums, "and"))
 }
 
 /// A force that is one coefficient times a function.
@@ -168,6 +162,7 @@ struct Term<'a> {
     memory: Vec<String>,
 }
 
+/// A candidate as a term; `None` where its force is none.
 fn term(candidate: &Mechanism) -> Option<Term<'_>> {
     let value = |name: &str| {
         let (_, estimate) = candidate.parameters.iter().find(|(known, _)| *known == name)?;

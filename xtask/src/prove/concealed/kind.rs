@@ -99,7 +99,7 @@ pub(crate) const LIBRARY: [Kind; 30] = [
     SensorDelay,
 ];
 
-/// Effects that no kind of the library describes.
+/// Effects that the library has no name for.
 pub(crate) const OUTSIDE: [Kind; 14] = [
     DisplacementDamping,
     SineOfPower,

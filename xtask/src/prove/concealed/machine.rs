@@ -321,7 +321,7 @@ impl Machine {
             if e.kind == Kind::AgeingFriction {
                 extra[slot] = (r.abs() - y[EXTRA + slot]) / a[2];
             }
-            if let Some(pair) = self.friction_levels(e, d, r, &p, u, elastic, y) {
+            if let Some(pair) = self.friction_levels(index, d, r, &p, u, elastic, y) {
                 levels[contact] = pair;
                 contact += 1;
                 continue;
@@ -454,7 +454,7 @@ impl Machine {
     /// Dry friction forwards and backwards at the rate `r`; `None` for an effect of another nature.
     fn friction_levels(
         &self,
-        e: &Effect,
+        index: usize,
         d: f64,
         r: f64,
         p: &[f64; 8],
@@ -462,6 +462,7 @@ impl Machine {
         elastic: f64,
         y: &State,
     ) -> Option<[f64; 2]> {
+        let e = &self.effects[index];
         let a = &e.p;
         match e.kind {
             Kind::CoulombFriction => Some([a[0]; 2]),
@@ -479,10 +480,7 @@ impl Machine {
                 Some([a[0] * load.abs(); 2])
             }
             Kind::PositionFriction => Some([a[0] * d * d; 2]),
-            Kind::AgeingFriction => {
-                let slot = self.effects.iter().position(|o| std::ptr::eq(o, e)).map_or(0, |i| self.slot(i));
-                Some([a[0] / (1.0 + y[EXTRA + slot] / a[1]); 2])
-            }
+            Kind::AgeingFriction => Some([a[0] / (1.0 + y[EXTRA + self.slot(index)] / a[1]); 2]),
             _ => None,
         }
     }
