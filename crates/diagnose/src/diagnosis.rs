@@ -19,6 +19,7 @@ use crate::evidence::{Evidence, fall, kappa};
 use crate::library::{Mechanism, MechanismError, built_in};
 use crate::locate::{Location, force, locate};
 use crate::place::{Motion, Place};
+use crate::proposal::Proposal;
 use crate::search::{
     Fitted, Found, MOST_WORK, Part, Rival, Search, UNDECIDED, log_likelihood_gain, raw_rms, raw_rss, rms,
 };
@@ -240,6 +241,8 @@ pub struct Finding {
     pub drifting: Option<String>,
     /// The law in the model's names.
     pub expression: String,
+    /// Its own states: name, equation.
+    pub states: Vec<(String, String)>,
     /// Parameters: name in the report, index in the improved model, estimate.
     pub parameters: Vec<(String, usize, Estimate)>,
     /// Further figures that follow from the parameters (a resonance frequency, Hz): name, estimate.
@@ -337,6 +340,8 @@ pub struct Diagnosis {
     pub mechanisms: Vec<Finding>,
     /// What `improved` holds that is not believed to be what is missing, largest share first.
     pub candidates: Vec<Finding>,
+    /// What speaks for the candidates; `None` where there are none.
+    pub proposal: Option<Proposal>,
     /// What fewer of several mechanisms would leave: none, each alone, all but one, all. Empty where there is one, or none.
     pub subsets: Vec<Subset>,
     /// Remainder.
@@ -639,6 +644,14 @@ fn conclude(
             m.alternatives.iter_mut().for_each(|a| a.confidence = a.confidence.min(DOUBTED));
         }
     }
+    let proposal = believed.contains(&false).then(|| {
+        let parameters = &improved.fit.point.parameters;
+        let along = Along::simulated(&improved.setup, &train_role.improved.run.x, parameters);
+        let beyond = Along::simulated(&held, &holdout_role.improved.run.x, parameters);
+        let models = ((&own, &calibrated_scale[..]), (&origin, &scale[..]));
+        let judged_by = (judge.criterion, judge.window);
+        Proposal::of(&improved, library, |i| !believed[i], (&along, &beyond), models, judged_by, &uncertainty)
+    });
     let mut mechanisms: Vec<(Finding, bool)> = mechanisms.into_iter().zip(believed).collect();
     mechanisms.sort_by(|a, b| b.0.share_explained.total_cmp(&a.0.share_explained));
     let unexplained = verdict != Verdict::MissingPhysics && !improved.parts.is_empty();
@@ -685,6 +698,7 @@ fn conclude(
         calibrated: calibrated_model,
         mechanisms,
         candidates,
+        proposal,
         subsets,
         remainder,
         parameters,
@@ -769,7 +783,19 @@ impl Judged {
                 false => search.doubt(&found.improved, i, &found.scale),
             })
             .collect();
-        let beaten = |i: usize| doubts[i].is_some_and(|d| d > UNDECIDED);
+        // Or one without a name that does the work of one part, or of all, with no more parameters.
+        let is_above = |parts: &[usize]| {
+            !found.errs
+                && !found.closed
+                && search
+                    .unnamed_above(&found.improved, parts, &found.scale)
+                    .is_some_and(|above| above > UNDECIDED)
+        };
+        let indices: Vec<usize> = (0..found.improved.parts.len()).collect();
+        let all = indices.len() > 1 && is_above(&indices);
+        let outdone: Vec<bool> =
+            indices.par_iter().map(|i| all || is_above(std::slice::from_ref(i))).collect();
+        let beaten = |i: usize| outdone[i] || doubts[i].is_some_and(|d| d > UNDECIDED);
         let is_imitation = (0..doubts.len()).any(|i| {
             beaten(i) && (lost[i] > CORRECTION || (0..doubts.len()).any(|j| i != j && redundant(i, j)))
         });
@@ -1675,6 +1701,10 @@ fn findings(
                     Some((name.clone(), figure(improved, uncertainty, mechanism, part, e)?))
                 })
                 .collect();
+            let state = |name: &String| {
+                let equation = setup.model.equations.iter().find(|e| e.name == *name)?;
+                Some((name.clone(), format!("{} = {}", equation.lhs, equation.rhs)))
+            };
             // Where the data cannot tell at which of several places it acts, all are named.
             let mut places = site.equations.clone();
             for rival in rivals.iter().filter(|r| r.equivalent) {
@@ -1696,6 +1726,7 @@ fn findings(
                 drifting: site.drifting.clone(),
                 figures,
                 expression: part.instance.expression.to_string(),
+                states: part.instance.states.iter().filter_map(state).collect(),
                 parameters,
                 share_explained: shares[i],
                 confidence,

@@ -14,6 +14,7 @@ mod explore;
 pub mod library;
 pub mod locate;
 pub mod place;
+pub mod proposal;
 pub mod screen;
 pub mod search;
 pub mod shapes;

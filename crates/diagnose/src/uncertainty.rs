@@ -233,6 +233,17 @@ impl Uncertainty {
         }
     }
 
+    /// Correlation of the estimates of two free parameters, by the covariance in stationary noise.
+    pub(crate) fn correlation(&self, a: usize, b: usize) -> f64 {
+        let along = |weights: &[(usize, f64)]| {
+            let mut gradient = vec![0.0; self.np];
+            weights.iter().for_each(|&(i, w)| gradient[i] += w);
+            self.stationary.variance(&gradient)
+        };
+        let [per_a, per_b] = [a, b].map(|i| 1.0 / along(&[(i, 1.0)]).sqrt());
+        ((along(&[(a, per_a), (b, per_b)]) - along(&[(a, per_a), (b, -per_b)])) / 4.0).clamp(-1.0, 1.0)
+    }
+
     /// Half widths of the 95 % intervals of all free parameters.
     pub(crate) fn widths(&self) -> Vec<f64> {
         let unit = |i: usize| (0..self.np).map(|j| if i == j { 1.0 } else { 0.0 }).collect::<Vec<f64>>();

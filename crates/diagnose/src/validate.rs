@@ -23,7 +23,7 @@ const SHORTEST: usize = 8;
 const REFIT: Limits = Limits { iterations: 10, tolerance: 1e-5 };
 
 /// What is left out together: stretches of pieces.
-type Fold = Vec<(usize, Range<usize>)>;
+pub(crate) type Fold = Vec<(usize, Range<usize>)>;
 
 /// The folds of the training data.
 pub(crate) fn folds(data: &Data) -> Vec<Fold> {

@@ -46,9 +46,12 @@ pub struct Report {
     /// `missing_physics`.
     pub mechanisms: Vec<Mechanism>,
     /// What the improved model holds although it is not believed to be what is missing: it predicts recordings that it
-    /// was not fitted to. Sorted by `share_explained`; empty unless `basis` is `proposed`.
+    /// was not fitted to. Sorted by `share_explained`; empty where `basis` is `named` or `calibrated`.
     #[serde(default, skip_serializing_if = "Vec::is_empty")]
     pub candidates: Vec<Mechanism>,
+    /// What speaks for the candidates, and how far. Absent where there are none.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub closure: Option<Closure>,
     /// What fewer of several mechanisms would leave: none, each alone, all but one, all. Empty where there is one, or
     /// none.
     #[serde(default, skip_serializing_if = "Vec::is_empty")]
@@ -251,6 +254,63 @@ impl From<Vec<String>> for Names {
             None => Names::Many(names),
         }
     }
+}
+
+/// What speaks for laws that the improved model holds without a name: where the recordings know them, how they predict what
+/// was left out of their fit, and which parameter of the machine could do their work.
+#[derive(Debug, Clone, PartialEq, Default, Serialize, Deserialize, JsonSchema)]
+pub struct Closure {
+    /// By variable of their forces, an expression of the model, where it was in the training recordings, SI.
+    pub range: Ordered<Range>,
+    /// Share of the held-out samples where a variable is beyond its range, 0 to 1; `null` where nothing is known.
+    #[serde(with = "number")]
+    #[schemars(schema_with = "number_schema")]
+    pub outside: f64,
+    /// How the models predict each part of the training recordings, fitted without it.
+    pub cross_validation: Vec<Fold>,
+    /// By parameter of a candidate, the parameter of the machine whose estimate goes most with its own.
+    pub trades_with: Ordered<Trade>,
+}
+
+/// Where a variable was.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize, JsonSchema)]
+pub struct Range {
+    /// Least and largest value in the training recordings, as the improved model simulates them, SI.
+    pub train: Interval,
+    /// Share of the held-out samples beyond them, 0 to 1; `null` where there are none.
+    #[serde(with = "number")]
+    #[schemars(schema_with = "number_schema")]
+    pub outside: f64,
+}
+
+/// What was left out of a fit, and how it was predicted: RMS error over the RMS of the measurement about its mean, geometric
+/// mean over the channels; `null` where a simulation diverges.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize, JsonSchema)]
+pub struct Fold {
+    /// File names of the recordings.
+    pub recordings: Vec<String>,
+    /// The part that is left out, s from the start, of a single recording.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub window_s: Option<Interval>,
+    /// Of the calibrated model.
+    #[serde(with = "number")]
+    #[schemars(schema_with = "number_schema")]
+    pub calibrated: f64,
+    /// Of the improved model.
+    #[serde(with = "number")]
+    #[schemars(schema_with = "number_schema")]
+    pub improved: f64,
+}
+
+/// A parameter of the machine, and how its estimate goes with another one.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize, JsonSchema)]
+pub struct Trade {
+    /// Its name.
+    pub parameter: String,
+    /// Correlation of the two estimates, −1 to 1.
+    #[serde(with = "number")]
+    #[schemars(schema_with = "number_schema")]
+    pub correlation: f64,
 }
 
 /// An identified number with its uncertainty.

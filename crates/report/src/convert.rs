@@ -9,6 +9,7 @@ use greybox_diagnose::diagnosis::{
     Basis as Ground, Estimate as Estimated, Finding as Found, Role as RoleRuns, Run,
 };
 use greybox_diagnose::locate::{Location as Located, spectrum};
+use greybox_diagnose::proposal::{self, Proposal};
 use greybox_diagnose::{Calibration, Diagnosis, Verdict as Answer};
 use greybox_model::{Dimension, Expr, Func, Model, Unit, WriteOptions};
 use greybox_recording::{Correlation, Recording, Severity as Level, health};
@@ -52,6 +53,7 @@ pub fn report(diagnosis: &Diagnosis, sources: &Sources<'_>) -> Report {
         },
         mechanisms: d.mechanisms.iter().map(|m| mechanism(m, &d.improved, &reach)).collect(),
         candidates: d.candidates.iter().map(|m| mechanism(m, &d.improved, &reach)).collect(),
+        closure: d.proposal.as_ref().map(closure),
         subsets: d
             .subsets
             .iter()
@@ -301,7 +303,7 @@ fn mechanism(found: &Found, improved: &Model, reach: &Reach) -> Mechanism {
         channel: found.channel.clone(),
         expression: found.expression.clone(),
         replaces: found.input.clone(),
-        states: Ordered::new(),
+        states: found.states.iter().cloned().collect(),
         drifting: found.drifting.clone(),
         parameters: found
             .parameters
@@ -335,6 +337,29 @@ fn mechanism(found: &Found, improved: &Model, reach: &Reach) -> Mechanism {
             .collect(),
         experiment: plan(found, improved, reach),
         location: location(&found.location, improved),
+    }
+}
+
+fn closure(of: &Proposal) -> Closure {
+    let range = |r: &proposal::Range| {
+        let train = Interval { low: r.low, high: r.high };
+        (r.variable.clone(), Range { train, outside: r.outside })
+    };
+    let fold = |f: &proposal::Fold| Fold {
+        recordings: f.recordings.clone(),
+        window_s: f.window.map(|(low, high)| Interval { low, high }),
+        calibrated: f.calibrated,
+        improved: f.improved,
+    };
+    let trade = |(law, with): &(String, proposal::Trade)| {
+        let with = Trade { parameter: with.parameter.clone(), correlation: with.correlation };
+        (law.clone(), with)
+    };
+    Closure {
+        range: of.ranges.iter().map(range).collect(),
+        outside: of.outside,
+        cross_validation: of.folds.iter().map(fold).collect(),
+        trades_with: of.trades.iter().map(trade).collect(),
     }
 }
 
@@ -855,6 +880,7 @@ mod tests {
             input: None,
             drifting: Some("g".into()),
             expression: "ka*(z - a)".into(),
+            states: Vec::new(),
             parameters: vec![("g".into(), 0, one(9.81))],
             figures: vec![("f0".into(), one(4.0)), ("zeta".into(), one(0.02))],
             share_explained: 0.5,

@@ -17,8 +17,8 @@ use askama::Template;
 use serde::Serialize;
 
 use crate::contract::{
-    Finding, Fit, FitSet, InputHold, Interval, Location, Mechanism, ModelId, Names, Ordered, Producer,
-    RecordingFit, Report, Score, Severity, Subset, Verdict,
+    Closure, Finding, Fit, FitSet, InputHold, Interval, Location, Mechanism, ModelId, Names, Ordered,
+    Producer, RecordingFit, Report, Score, Severity, Subset, Verdict,
 };
 use crate::decimate::{Buckets, MAX_POINTS, round_to_range};
 use crate::diff::{Edit, diff};
@@ -253,6 +253,7 @@ struct View {
     mechanisms: Vec<MechanismView>,
     /// What the improved model holds without being believed.
     candidates: Vec<CandidateView>,
+    closure: Option<ClosureView>,
     /// Which mechanisms, how many, and what is left with these alone.
     subsets: Vec<[String; 3]>,
     remainder: RemainderView,
@@ -331,7 +332,19 @@ struct CandidateView {
     expression_html: String,
     /// Name, value with its interval, unit.
     parameters: Vec<[String; 3]>,
+    /// What each of them trades with.
+    trades: Vec<String>,
+    states_html: Vec<String>,
     share: String,
+}
+
+/// What speaks for the candidates.
+struct ClosureView {
+    /// Variable, least and largest value, share of the held-out samples beyond them.
+    range: Vec<[String; 3]>,
+    outside: String,
+    /// What is left out, error of the calibrated and of the improved model.
+    folds: Vec<[String; 3]>,
 }
 
 struct MechanismView {
@@ -450,7 +463,12 @@ impl View {
                 .enumerate()
                 .map(|(index, mechanism)| mechanism_view(page, index, mechanism))
                 .collect(),
-            candidates: report.candidates.iter().map(candidate_view).collect(),
+            candidates: report
+                .candidates
+                .iter()
+                .map(|m| candidate_view(m, report.closure.as_ref()))
+                .collect(),
+            closure: report.closure.as_ref().map(closure_view),
             subsets: subsets(report),
             remainder: remainder_view(page),
             parameters: parameters(page),
@@ -1080,17 +1098,42 @@ fn law_html(mechanism: &Mechanism) -> String {
     }
 }
 
-fn candidate_view(candidate: &Mechanism) -> CandidateView {
+fn candidate_view(candidate: &Mechanism, closure: Option<&Closure>) -> CandidateView {
     let parameters = candidate.parameters.iter().map(|(name, estimate)| {
         [expression::html(name), format::cell(estimate.value, estimate.ci95), format::unit(&estimate.unit)]
+    });
+    let trades = candidate.parameters.keys().filter_map(|name| {
+        let trade = closure?.trades_with.get(name)?;
+        Some(format!("{} {}", expression::html(&trade.parameter), format::significant(trade.correlation, 2)))
     });
     CandidateView {
         title: format::kind(&candidate.kind),
         place: placed(candidate),
         expression_html: law_html(candidate),
         parameters: parameters.collect(),
+        trades: trades.collect(),
+        states_html: candidate.states.values().map(|equation| expression::html(equation)).collect(),
         share: format::probability(candidate.share_explained),
     }
+}
+
+fn closure_view(closure: &Closure) -> ClosureView {
+    let share = |of: f64| match of {
+        0.0 => "none".to_owned(),
+        _ if of.is_finite() => format::probability(of),
+        _ => "–".to_owned(),
+    };
+    let range = closure.range.iter().map(|(variable, range)| {
+        [expression::html(variable), format::interval(Some(range.train)), share(range.outside)]
+    });
+    let error = |of: f64| if of.is_finite() { format::percent(of) } else { "diverges".to_owned() };
+    let folds = closure.cross_validation.iter().map(|fold| {
+        let window = fold.window_s.map_or_else(String::new, |w| {
+            format!(", {} to {} s", format::number(w.low), format::number(w.high))
+        });
+        [format!("{}{window}", fold.recordings.join(", ")), error(fold.calibrated), error(fold.improved)]
+    });
+    ClosureView { range: range.collect(), outside: share(closure.outside), folds: folds.collect() }
 }
 
 fn mechanism_view(page: &Page, index: usize, mechanism: &Mechanism) -> MechanismView {

@@ -420,6 +420,7 @@ pub(crate) fn page() -> Page {
         basis: Basis::Named,
         mechanisms: vec![mechanism(windows.clone())],
         candidates: Vec::new(),
+        closure: None,
         subsets: Vec::new(),
         remainder: Remainder {
             significant: false,
