@@ -783,19 +783,15 @@ impl Judged {
                 false => search.doubt(&found.improved, i, &found.scale),
             })
             .collect();
-        // Or one without a name that does the work of one part, or of all, with no more parameters.
-        let is_above = |parts: &[usize]| {
-            !found.errs
-                && !found.closed
-                && search
-                    .unnamed_above(&found.improved, parts, &found.scale)
-                    .is_some_and(|above| above > UNDECIDED)
-        };
+        // Or one without a name that does the work of several with no more parameters. (In the place of one finding a
+        // name is likelier than none.)
         let indices: Vec<usize> = (0..found.improved.parts.len()).collect();
-        let all = indices.len() > 1 && is_above(&indices);
-        let outdone: Vec<bool> =
-            indices.par_iter().map(|i| all || is_above(std::slice::from_ref(i))).collect();
-        let beaten = |i: usize| outdone[i] || doubts[i].is_some_and(|d| d > UNDECIDED);
+        let is_above = || search.unnamed_above(&found.improved, &indices, &found.scale);
+        let outdone = !found.errs
+            && !found.closed
+            && indices.len() > 1
+            && is_above().is_some_and(|above| above > UNDECIDED);
+        let beaten = |i: usize| outdone || doubts[i].is_some_and(|d| d > UNDECIDED);
         let is_imitation = (0..doubts.len()).any(|i| {
             beaten(i) && (lost[i] > CORRECTION || (0..doubts.len()).any(|j| i != j && redundant(i, j)))
         });
