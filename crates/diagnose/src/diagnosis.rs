@@ -783,15 +783,7 @@ impl Judged {
                 false => search.doubt(&found.improved, i, &found.scale),
             })
             .collect();
-        // Or one without a name that does the work of several with no more parameters. (In the place of one finding a
-        // name is likelier than none.)
-        let indices: Vec<usize> = (0..found.improved.parts.len()).collect();
-        let is_above = || search.unnamed_above(&found.improved, &indices, &found.scale);
-        let outdone = !found.errs
-            && !found.closed
-            && indices.len() > 1
-            && is_above().is_some_and(|above| above > UNDECIDED);
-        let beaten = |i: usize| outdone || doubts[i].is_some_and(|d| d > UNDECIDED);
+        let beaten = |i: usize| doubts[i].is_some_and(|d| d > UNDECIDED);
         let is_imitation = (0..doubts.len()).any(|i| {
             beaten(i) && (lost[i] > CORRECTION || (0..doubts.len()).any(|j| i != j && redundant(i, j)))
         });
