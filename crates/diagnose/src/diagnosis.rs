@@ -340,7 +340,7 @@ pub struct Diagnosis {
     pub mechanisms: Vec<Finding>,
     /// What `improved` holds that is not believed to be what is missing, largest share first.
     pub candidates: Vec<Finding>,
-    /// What speaks for the candidates; `None` where there are none.
+    /// How far the candidates can be trusted; `None` where there are none.
     pub proposal: Option<Proposal>,
     /// What fewer of several mechanisms would leave: none, each alone, all but one, all. Empty where there is one, or none.
     pub subsets: Vec<Subset>,
@@ -552,12 +552,12 @@ fn conclude(
         }
         limited |= found.limited;
     }
-    let Polished { fitted: improved, origin } = polished;
-    let scale = residual_scale(&improved, &found.scale);
+    let Polished { fitted: improved, origin } = &polished;
+    let scale = residual_scale(improved, &found.scale);
     let Baseline { polished: Polished { fitted: calibrated, origin: own }, scale: calibrated_scale, .. } =
-        baseline;
-    let calibrated_widths = Uncertainty::of(&own, &calibrated_scale).widths();
-    let uncertainty = Uncertainty::of(&origin, &scale);
+        &baseline;
+    let calibrated_widths = Uncertainty::of(own, calibrated_scale).widths();
+    let uncertainty = Uncertainty::of(origin, &scale);
     let improved_widths = uncertainty.widths();
     let value_of = |f: &Fitted, widths: &[f64], index: usize| {
         let value = f.fit.point.parameters[index];
@@ -573,13 +573,13 @@ fn conclude(
         let _ = model.resolve_units();
         model
     };
-    let (calibrated_model, improved_model) = (final_model(&calibrated), final_model(&improved));
+    let (calibrated_model, improved_model) = (final_model(calibrated), final_model(improved));
     let parameters: Vec<ParameterChange> = (0..nominal.model.parameters.len())
         .map(|i| ParameterChange {
             index: i,
             nominal: nominal.model.parameters[i].value,
-            calibrated: value_of(&calibrated, &calibrated_widths, i),
-            improved: value_of(&improved, &improved_widths, i),
+            calibrated: value_of(calibrated, &calibrated_widths, i),
+            improved: value_of(improved, &improved_widths, i),
         })
         .collect();
 
@@ -604,7 +604,7 @@ fn conclude(
         Role {
             data: data.clone(),
             nominal: run(nominal, &nominal.values(), &nominal_scale),
-            calibrated: run(&calibrated.setup, &calibrated.fit.point.parameters, &calibrated_scale),
+            calibrated: run(&calibrated.setup, &calibrated.fit.point.parameters, calibrated_scale),
             improved: run(&improved.setup, &improved.fit.point.parameters, &scale),
         }
     };
@@ -618,13 +618,13 @@ fn conclude(
     let criterion = if elsewhere == Criterion::Windowed { elsewhere } else { judge.criterion };
 
     // Mechanisms, remainder, verdict.
-    let believed = believed(&judged, &found, &improved);
+    let believed = believed(&judged, &found, improved);
     let verdict = if believed.contains(&true) { Verdict::MissingPhysics } else { judged.verdict };
     let Judged { shares, left, surface, alone, without, full, base, doubts, .. } = judged;
     let share = |rss: f64| (rss / base.max(1e-300)).clamp(0.0, 1.0);
     let significant = found.errs || left.significant(improved.parts.len()) || verdict == Verdict::Unexplained;
     let mut mechanisms =
-        findings(&improved, &found, &nominal.model, library, &scale, &shares, &train_role, &uncertainty);
+        findings(improved, &found, &nominal.model, library, &scale, &shares, &train_role, &uncertainty);
     let mut subsets = Vec::new();
     if verdict == Verdict::MissingPhysics && believed.iter().all(|b| *b) && !found.closed {
         subsets = subsets_of(
@@ -637,8 +637,8 @@ fn conclude(
         // What is still missing may be what was taken for this.
         if significant
             || doubts[i].is_some_and(|d| d > -UNDECIDED)
-            || is_shared(&improved, &shares, i)
-            || is_crowded(&improved, &shares, i, &nominal.model)
+            || is_shared(improved, &shares, i)
+            || is_crowded(improved, &shares, i, &nominal.model)
         {
             m.confidence = m.confidence.min(DOUBTED);
             m.alternatives.iter_mut().for_each(|a| a.confidence = a.confidence.min(DOUBTED));
@@ -647,28 +647,29 @@ fn conclude(
     let proposal = believed.contains(&false).then(|| {
         let parameters = &improved.fit.point.parameters;
         let along = Along::simulated(&improved.setup, &train_role.improved.run.x, parameters);
-        let beyond = Along::simulated(&held, &holdout_role.improved.run.x, parameters);
-        let models = ((&own, &calibrated_scale[..]), (&origin, &scale[..]));
-        let judged_by = (judge.criterion, judge.window);
-        Proposal::of(&improved, library, |i| !believed[i], (&along, &beyond), models, judged_by, &uncertainty)
+        let held_out = Along::simulated(&held, &holdout_role.improved.run.x, parameters);
+        let proposed = improved.parts.iter().zip(&believed).filter(|part| !part.1);
+        let proposed: Vec<&Part> = proposed.map(|(part, _)| part).collect();
+        let errors = (baseline.errors(&judge), &judge.errors(&polished, &scale)[..]);
+        Proposal::of(improved, &proposed, library, (&along, &held_out), errors, &uncertainty)
     });
     let mut mechanisms: Vec<(Finding, bool)> = mechanisms.into_iter().zip(believed).collect();
     mechanisms.sort_by(|a, b| b.0.share_explained.total_cmp(&a.0.share_explained));
     let unexplained = verdict != Verdict::MissingPhysics && !improved.parts.is_empty();
     // What is not believed explains nothing: all that the equations lack is what is missing. (Where too little is
     // known of the noise for that, what those mechanisms leave over shows the place.)
-    let lacks = if unexplained { self::surface(&calibrated, &calibrated_scale) } else { None };
+    let lacks = if unexplained { self::surface(calibrated, calibrated_scale) } else { None };
     let remainder = match lacks {
-        Some(lacks) => remainder(&calibrated, Some(lacks), significant, 1.0),
+        Some(lacks) => remainder(calibrated, Some(lacks), significant, 1.0),
         None => {
             let all = if unexplained { share(base - full) } else { 0.0 };
             // What a closure leaves shows nothing of what it models: that has the closure's own variable.
-            let own = if unexplained && found.closed { only_variable(&improved, library) } else { None };
+            let own = if unexplained && found.closed { only_variable(improved, library) } else { None };
             let surface = surface.map(|left| match own {
                 Some(variable) => Surface { variable: Some((variable, left.gain)), ..left },
                 None => left,
             });
-            let left = remainder(&improved, surface, significant, share(full));
+            let left = remainder(improved, surface, significant, share(full));
             Remainder { share_of_residual: (all + left.share_of_residual).min(1.0), ..left }
         }
     };
@@ -878,8 +879,7 @@ impl Closed {
     /// better: beyond chance where that has names, on the whole where it is a proposal as well.
     fn outdoes(&self, (found, polished): (&Found, &Polished), has_names: bool, judge: &Judge) -> bool {
         let errors = |found: &Found, polished: &Polished| {
-            let scale = residual_scale(&polished.fitted, &found.scale);
-            crate::validate::errors(&polished.origin, &scale, judge.criterion, judge.window)
+            judge.errors(polished, &residual_scale(&polished.fitted, &found.scale))
         };
         let scale = residual_scale(&polished.fitted, &found.scale);
         let (setup, parameters) = (&polished.fitted.setup, &polished.fitted.fit.point.parameters);
@@ -1011,9 +1011,16 @@ struct Baseline {
     scale: Vec<f64>,
     /// How its simulations are judged ([`Criterion::misfit`]).
     misfit: f64,
+    /// Its errors on folds, once somebody asks.
+    errors: OnceCell<Vec<f64>>,
 }
 
 impl Baseline {
+    /// Its errors on what is left out of its fit.
+    fn errors(&self, judge: &Judge) -> &[f64] {
+        self.errors.get_or_init(|| judge.errors(&self.polished, &self.scale))
+    }
+
     /// What a search found without mechanisms, refitted at growing horizons, from its parameters and from the nominal
     /// ones: of all these fits the one that the criterion judges best.
     fn of(found: &Found, nominal: &[f64], judge: &Judge) -> Baseline {
@@ -1034,7 +1041,7 @@ impl Baseline {
         }
         let scale = residual_scale(&polished.fitted, &found.scale);
         let misfit = judge.misfit(setup, &polished.fitted.fit.point.parameters, &scale);
-        Baseline { polished, scale, misfit }
+        Baseline { polished, scale, misfit, errors: OnceCell::new() }
     }
 }
 
@@ -1056,6 +1063,11 @@ impl Judge {
         let window = window_length(&durations, dt);
         let (criterion, predictable) = setup.criterion(&fitted.fit.point.parameters, scale);
         Judge { criterion, window: if predictable < window { window_of(predictable, dt) } else { window } }
+    }
+
+    /// Errors on what is left out of the fit, fold by fold.
+    fn errors(&self, polished: &Polished, scale: &[f64]) -> Vec<f64> {
+        crate::validate::errors(&polished.origin, scale, self.criterion, self.window)
     }
 
     fn misfit(&self, setup: &Setup, parameters: &[f64], scale: &[f64]) -> f64 {
@@ -1177,8 +1189,6 @@ struct Gates<'a> {
     judge: &'a Judge,
     /// A round believed its mechanisms.
     named: bool,
-    /// Errors of the calibrated model on folds.
-    simpler: OnceCell<Vec<f64>>,
 }
 
 /// How a model fares at the gates.
@@ -1199,11 +1209,7 @@ impl Passed {
 
 impl<'a> Gates<'a> {
     fn new(search: &'a Search<'a>, baseline: &'a Baseline, judge: &'a Judge, named: bool) -> Gates<'a> {
-        Gates { search, baseline, judge, named, simpler: OnceCell::new() }
-    }
-
-    fn errors(&self, p: &Polished, scale: &[f64]) -> Vec<f64> {
-        crate::validate::errors(&p.origin, scale, self.judge.criterion, self.judge.window)
+        Gates { search, baseline, judge, named }
     }
 
     fn judge(&self, polished: &Polished, scale: &[f64]) -> Passed {
@@ -1217,9 +1223,7 @@ impl<'a> Gates<'a> {
         let likely = self.named && leaves_noise(&scores, &polished.origin, &own);
         let bound = if likely { Vec::new() } else { search.bound_to_a_clock(fitted) };
         let predicts = || {
-            let simpler =
-                self.simpler.get_or_init(|| self.errors(&self.baseline.polished, &self.baseline.scale));
-            Gain::of(simpler, &self.errors(polished, &own)).is_beyond_chance()
+            Gain::of(self.baseline.errors(self.judge), &self.judge.errors(polished, &own)).is_beyond_chance()
         };
         let otherwise = bound.is_empty()
             && undetermined.is_none()

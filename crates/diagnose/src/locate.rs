@@ -226,7 +226,8 @@ fn shortest(variable: &[Vec<f64>], deviation: &[Vec<f64>]) -> Option<(f64, f64)>
     best.map(|(a, b, _)| (a, b))
 }
 
-fn extent(series: &[Vec<f64>]) -> (f64, f64) {
+/// Least and largest finite value.
+pub(crate) fn extent(series: &[Vec<f64>]) -> (f64, f64) {
     series
         .iter()
         .flatten()
@@ -245,8 +246,13 @@ fn runs(active: &[bool], start: f64, dt: f64) -> Vec<(f64, f64)> {
             }
         }
     }
-    let time = |k: usize| ((start + k as f64 * dt) * 1e6).round() / 1e6;
+    let time = |k: usize| time_of(start, dt, k);
     out.into_iter().map(|(a, b)| (time(a), time(b + 1))).collect()
+}
+
+/// Time of a sample, s, to the microsecond.
+pub(crate) fn time_of(start: f64, dt: f64, sample: usize) -> f64 {
+    ((start + sample as f64 * dt) * 1e6).round() / 1e6
 }
 
 /// Band that holds the middle 90 % of the force's power (mean removed).

@@ -1,26 +1,32 @@
-//! What speaks for laws without a name, and how far: where the recordings know them, how they predict what was left out of
-//! their fit, and which parameter of the machine could do their work.
+//! How far laws without a name can be trusted.
+//!
+//! | what | how |
+//! |---|---|
+//! | range of validity | least and largest value of the variables of their forces in the training recordings, SI, and the share of the held-out samples outside: there the laws are extrapolated |
+//! | cross-validation | error on each part of the training recordings that was left out of the fit (`validate`), of the calibrated and of the improved model |
+//! | correlation | r = C_ij / √(C_ii C_jj) of the estimates, C their covariance, with that parameter of the machine for which it is largest: near ±1 the recordings hardly tell the two apart |
 
-use greybox_calibrate::{Criterion, Data};
+use greybox_calibrate::Data;
 use greybox_model::Expr;
 
 use crate::along::Along;
 use crate::library::Mechanism;
+use crate::locate::{extent, time_of};
 use crate::search::{Fitted, Part};
 use crate::uncertainty::Uncertainty;
 use crate::validate;
 
-/// What speaks for the laws that an improved model holds without a name.
+/// How far the laws that an improved model holds without a name can be trusted.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Proposal {
     /// The variables of their forces.
     pub ranges: Vec<Range>,
-    /// Share of the held-out samples where one of the variables is beyond its range; NaN where nothing can be said.
+    /// Share of the held-out samples where one of the variables is outside its range, 0 to 1; NaN where there is none.
     pub outside: f64,
     /// Cross-validation, fold by fold.
     pub folds: Vec<Fold>,
-    /// By strength or constant of a law: what it trades with.
-    pub trades: Vec<(String, Trade)>,
+    /// By strength or constant of a law, what its estimate is correlated with.
+    pub correlations: Vec<(String, Correlated)>,
 }
 
 /// Where a variable was in the training recordings, as the improved model simulates them.
@@ -28,11 +34,11 @@ pub struct Proposal {
 pub struct Range {
     /// Expression of the model.
     pub variable: String,
-    /// Least and largest value, SI.
+    /// Least value, SI.
     pub low: f64,
-    /// See `low`.
+    /// Largest value, SI.
     pub high: f64,
-    /// Share of the held-out samples beyond them.
+    /// Share of the held-out samples outside, 0 to 1.
     pub outside: f64,
 }
 
@@ -46,56 +52,43 @@ pub struct Fold {
     /// RMS error over the RMS of the measurement about its mean, geometric mean over the channels, of the calibrated model
     /// fitted without the fold; infinite where it diverges.
     pub calibrated: f64,
-    /// Of the improved one.
+    /// The same of the improved model.
     pub improved: f64,
 }
 
-/// The parameter of the machine whose estimate goes most with that of a law.
+/// The parameter of the machine whose estimate is most correlated with that of a law.
 #[derive(Debug, Clone, PartialEq)]
-pub struct Trade {
+pub struct Correlated {
     /// Its name.
     pub parameter: String,
     /// Correlation of the estimates, −1 to 1.
     pub correlation: f64,
 }
 
-/// A fitted model that takes part in a cross-validation, and the size of its residual.
-pub(crate) type Sized<'a> = (&'a Fitted, &'a [f64]);
-
 impl Proposal {
-    /// Of the parts of `improved` that `is_proposed` picks, fitted with `uncertainty`, whose states are those of `train` and
-    /// `held`; `calibrated` and `origin` are the models as they were fitted.
+    /// Of the `proposed` parts of `improved`, whose parameters are as uncertain as said. States are those that it simulates
+    /// of the training and of the held-out recordings; `calibrated` and `own` are the logarithms of the errors on each fold.
     pub(crate) fn of(
         improved: &Fitted,
+        proposed: &[&Part],
         library: &[Mechanism],
-        is_proposed: impl Fn(usize) -> bool,
-        (train, held): (&Along<'_>, &Along<'_>),
-        (calibrated, origin): (Sized<'_>, Sized<'_>),
-        (criterion, window): (Criterion, f64),
+        (train, held_out): (&Along<'_>, &Along<'_>),
+        (calibrated, own): (&[f64], &[f64]),
         uncertainty: &Uncertainty,
     ) -> Proposal {
-        let parts: Vec<&Part> = improved
-            .parts
-            .iter()
-            .enumerate()
-            .filter(|(i, _)| is_proposed(*i))
-            .map(|(_, part)| part)
-            .collect();
         let mut variables: Vec<Expr> = Vec::new();
-        for part in &parts {
-            for variable in variables_of(improved, part, library) {
-                if !variables.contains(&variable) {
-                    variables.push(variable);
-                }
+        for variable in proposed.iter().flat_map(|part| variables_of(improved, part, library)) {
+            if !variables.contains(&variable) {
+                variables.push(variable);
             }
         }
-        let (ranges, outside) = ranges(&variables, train, held);
-        let errors = |(fitted, scale): Sized<'_>| validate::errors(fitted, scale, criterion, window);
-        let data = &origin.0.setup.data;
-        let both = errors(calibrated).into_iter().zip(errors(origin));
-        let folds = validate::folds(data).into_iter().zip(both);
+        let (ranges, outside) = ranges(&variables, train, held_out);
+        let data = &improved.setup.data;
+        let errors = calibrated.iter().copied().zip(own.iter().copied());
+        let folds = validate::folds(data).into_iter().zip(errors);
         let folds = folds.map(|(left_out, errors)| Fold::of(data, &left_out, errors));
-        Proposal { ranges, outside, folds: folds.collect(), trades: trades(improved, &parts, uncertainty) }
+        let correlations = correlations(improved, proposed, uncertainty);
+        Proposal { ranges, outside, folds: folds.collect(), correlations }
     }
 }
 
@@ -111,8 +104,8 @@ impl Fold {
         }
         let ends = left_out.iter().map(|(piece, range)| {
             let piece = &data.pieces[*piece];
-            let at = |k: usize| piece.start + k as f64 * piece.dt;
-            (at(range.start), at(range.end.saturating_sub(1)))
+            let time = |sample| time_of(piece.start, piece.dt, sample);
+            (time(range.start), time(range.end))
         });
         let window = ends.reduce(|a, b| (a.0.min(b.0), a.1.max(b.1)));
         Fold {
@@ -140,44 +133,40 @@ fn variables_of(improved: &Fitted, part: &Part, library: &[Mechanism]) -> Vec<Ex
     ["d", "o"].into_iter().flat_map(|name| [of(name, 0), of(name, 1)]).flatten().collect()
 }
 
-/// Ranges of the variables, and the share of the held-out samples where one of them is beyond its own.
-fn ranges(variables: &[Expr], train: &Along<'_>, held: &Along<'_>) -> (Vec<Range>, f64) {
+/// Ranges of the variables, and the share of the held-out samples where one of them is outside its own.
+fn ranges(variables: &[Expr], train: &Along<'_>, held_out: &Along<'_>) -> (Vec<Range>, f64) {
     let mut ranges = Vec::new();
-    let mut beyond: Vec<bool> = Vec::new();
+    let mut any_outside: Vec<bool> = Vec::new();
     for variable in variables {
-        let one = std::slice::from_ref(variable);
-        let values = |along: &Along<'_>| -> Option<Vec<f64>> { Some(along.eval(one, &[])?.pop()?.concat()) };
-        let (Some(train), Some(held)) = (values(train), values(held)) else { continue };
-        let known = train.into_iter().filter(|v| v.is_finite());
-        let (low, high) =
-            known.fold((f64::INFINITY, f64::NEG_INFINITY), |(low, high), v| (v.min(low), v.max(high)));
-        beyond.resize(held.len(), false);
-        let is_beyond: Vec<bool> = held.iter().map(|v| !(low..=high).contains(v)).collect();
-        beyond.iter_mut().zip(&is_beyond).for_each(|(any, own)| *any |= own);
-        ranges.push(Range { variable: variable.to_string(), low, high, outside: share(&is_beyond) });
+        let values = |along: &Along<'_>| along.eval(std::slice::from_ref(variable), &[])?.pop();
+        let (Some(train), Some(held_out)) = (values(train), values(held_out)) else { continue };
+        let (low, high) = extent(&train);
+        let is_outside: Vec<bool> =
+            held_out.iter().flatten().map(|value| !(low..=high).contains(value)).collect();
+        any_outside.resize(is_outside.len(), false);
+        any_outside.iter_mut().zip(&is_outside).for_each(|(any, own)| *any |= own);
+        ranges.push(Range { variable: variable.to_string(), low, high, outside: share(&is_outside) });
     }
-    (ranges, share(&beyond))
+    (ranges, share(&any_outside))
 }
 
-fn share(of: &[bool]) -> f64 {
-    of.iter().filter(|is| **is).count() as f64 / of.len() as f64
+/// How many are, of all; NaN of none.
+fn share(are: &[bool]) -> f64 {
+    are.iter().filter(|is| **is).count() as f64 / are.len() as f64
 }
 
-/// For each parameter of the parts the parameter of the machine that its estimate goes with most.
-fn trades(improved: &Fitted, parts: &[&Part], uncertainty: &Uncertainty) -> Vec<(String, Trade)> {
+/// For each parameter of the parts the parameter of the machine whose estimate is most correlated with its own.
+fn correlations(improved: &Fitted, parts: &[&Part], uncertainty: &Uncertainty) -> Vec<(String, Correlated)> {
     let setup = &improved.setup;
-    let position = |name: &String| {
-        let index = setup.model.parameter(name)?;
-        setup.free.iter().position(|f| f.index == index)
-    };
-    let laws: Vec<&String> = improved.parts.iter().flat_map(|part| &part.instance.names).collect();
     let name = |free: usize| &setup.model.parameters[setup.free[free].index].name;
-    let own: Vec<usize> = (0..setup.free.len()).filter(|&i| !laws.contains(&name(i))).collect();
+    let laws: Vec<&String> = improved.parts.iter().flat_map(|part| &part.instance.names).collect();
+    let machine: Vec<usize> = (0..setup.free.len()).filter(|&i| !laws.contains(&name(i))).collect();
     let of = |law: &String| {
-        let at = position(law)?;
-        let with = own.iter().map(|&i| (i, uncertainty.correlation(at, i))).filter(|(_, r)| r.is_finite());
+        let at = (0..setup.free.len()).find(|&i| name(i) == law)?;
+        let with =
+            machine.iter().map(|&i| (i, uncertainty.correlation(at, i))).filter(|(_, r)| r.is_finite());
         let (most, correlation) = with.max_by(|a, b| a.1.abs().total_cmp(&b.1.abs()))?;
-        Some((law.clone(), Trade { parameter: name(most).clone(), correlation }))
+        Some((law.clone(), Correlated { parameter: name(most).clone(), correlation }))
     };
     parts.iter().flat_map(|part| &part.instance.names).filter_map(of).collect()
 }

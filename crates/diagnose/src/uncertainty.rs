@@ -346,6 +346,24 @@ y = "b*f"
         (0.3 * f64::from(k)).sin()
     }
 
+    /// A model fitted to one recording of these channels, one sample a second, from these parameters.
+    fn fit(model: &Model, channels: &[(&str, &[f64])], from: &[f64]) -> Fitted {
+        let time = (0..channels[0].1.len()).map(|k| k as f64).collect();
+        let channel = |(name, values): &(&str, &[f64])| Channel {
+            name: (*name).into(),
+            unit: None,
+            values: values.to_vec(),
+        };
+        let channels = channels.iter().map(channel).collect();
+        let recording = Recording::from_columns("line", time, channels).unwrap();
+        let data = Arc::new(Data::new(model, &[recording]).unwrap());
+        let setup = Setup::new(model, data, free_parameters(model)).unwrap();
+        let level = setup.level(1);
+        let start = Point { parameters: from.to_vec(), starts: setup.starts(&level, from) };
+        let fit = setup.fit(&level, &[0.1], &[start], Limits::default());
+        Fitted { setup, parts: Vec::new(), level, fit }
+    }
+
     /// b, half of its interval and its inflation from one recording of the input f(k), in errors made of it and a first-order autoregression.
     fn estimate(
         seed: u64,
@@ -356,7 +374,6 @@ y = "b*f"
         let model = Model::from_toml(LINE, "model.toml").unwrap();
         let n = 1200;
         let f: Vec<f64> = (0..n).map(input).collect();
-        let time: Vec<f64> = (0..n).map(f64::from).collect();
         let mut random = Pcg64Mcg::seed_from_u64(seed);
         let mut state = 0.0;
         let mut noise = || {
@@ -365,17 +382,8 @@ y = "b*f"
             state
         };
         let y: Vec<f64> = f.iter().map(|f| 2.0 * f + 0.1 * error(*f, noise())).collect();
-        let channel =
-            |name: &str, values: &[f64]| Channel { name: name.into(), unit: None, values: values.into() };
-        let channels = vec![channel("f", &f), channel("y", &y)];
-        let recording = Recording::from_columns("line", time.clone(), channels).unwrap();
-        let data = Arc::new(Data::new(&model, &[recording]).unwrap());
-        let setup = Setup::new(&model, data, free_parameters(&model)).unwrap();
-        let level = setup.level(1);
-        let start = Point { parameters: vec![1.9], starts: setup.starts(&level, &[1.9]) };
-        let fit = setup.fit(&level, &[0.1], &[start], Limits::default());
-        let estimate = fit.point.parameters[0];
-        let fitted = Fitted { setup, parts: Vec::new(), level, fit };
+        let fitted = fit(&model, &[("f", &f), ("y", &y)], &[1.9]);
+        let estimate = fitted.fit.point.parameters[0];
         let width = Uncertainty::of(&fitted, &[0.1]).widths()[0];
         (estimate, width, Uncertainty::inflation(&fitted, &[0.1], &[0]))
     }
@@ -401,6 +409,28 @@ y = "b*f"
         assert!((slow - 9.0).abs() < 2.0, "{slow}");
         let fast = mean(|k| if k % 2 == 0 { 1.0 } else { -1.0 }, |_, noise| noise);
         assert!((1.0..1.1).contains(&fast), "{fast}");
+    }
+
+    /// Of y = b f + c g in white noise the correlation of the estimates is −⟨f, g⟩/(‖f‖ ‖g‖), in whatever units: with
+    /// g = 1000 (0.6 f + 0.8 h), h ⟂ f, that is −0.6.
+    #[test]
+    fn estimates_are_correlated_against_their_signals() {
+        let text = LINE
+            .replace("f = {}", "f = {}\ng = {}")
+            .replace("b = { value = 2.0 }", "b = { value = 2.0 }\nc = { value = 0.003 }");
+        let model = Model::from_toml(&text.replace("b*f", "b*f + c*g"), "model.toml").unwrap();
+        let angle = |k: i32| 2.0 * std::f64::consts::PI * 60.0 * f64::from(k) / 1200.0;
+        let f: Vec<f64> = (0..1200).map(|k| angle(k).sin()).collect();
+        let g: Vec<f64> = (0..1200).map(|k| 1e3 * (0.6 * angle(k).sin() + 0.8 * angle(k).cos())).collect();
+        let mut random = Pcg64Mcg::seed_from_u64(7);
+        let mut noise = || -> f64 { StandardNormal.sample(&mut random) };
+        let y: Vec<f64> = f.iter().zip(&g).map(|(f, g)| 2.0 * f + 0.003 * g + 0.1 * noise()).collect();
+        let fitted = fit(&model, &[("f", &f), ("g", &g), ("y", &y)], &[1.9, 0.002]);
+        let uncertainty = Uncertainty::of(&fitted, &[0.1]);
+        for (a, b, expected) in [(0, 1, -0.6), (1, 0, -0.6), (0, 0, 1.0)] {
+            let correlation = uncertainty.correlation(a, b);
+            assert!((correlation - expected).abs() < 0.03, "{a}, {b}: {correlation}");
+        }
     }
 
     /// Where the strength itself comes and goes, the samples agree less about it than their autocorrelation lets them.

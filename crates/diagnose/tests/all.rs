@@ -7,6 +7,7 @@ mod horizons;
 mod inputs;
 mod invariance;
 mod kinds;
+mod proposed;
 mod recovery;
 mod shapes;
 mod twins;

@@ -49,7 +49,7 @@ pub struct Report {
     /// was not fitted to. Sorted by `share_explained`; empty where `basis` is `named` or `calibrated`.
     #[serde(default, skip_serializing_if = "Vec::is_empty")]
     pub candidates: Vec<Mechanism>,
-    /// What speaks for the candidates, and how far. Absent where there are none.
+    /// How far the candidates can be trusted. Absent where there are none.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub closure: Option<Closure>,
     /// What fewer of several mechanisms would leave: none, each alone, all but one, all. Empty where there is one, or
@@ -256,20 +256,20 @@ impl From<Vec<String>> for Names {
     }
 }
 
-/// What speaks for laws that the improved model holds without a name: where the recordings know them, how they predict what
-/// was left out of their fit, and which parameter of the machine could do their work.
+/// How far laws that the improved model holds without a name can be trusted: their range of validity, their
+/// cross-validation, and the parameters of the machine that they are correlated with.
 #[derive(Debug, Clone, PartialEq, Default, Serialize, Deserialize, JsonSchema)]
 pub struct Closure {
     /// By variable of their forces, an expression of the model, where it was in the training recordings, SI.
     pub range: Ordered<Range>,
-    /// Share of the held-out samples where a variable is beyond its range, 0 to 1; `null` where nothing is known.
+    /// Share of the held-out samples where a variable is outside its range, 0 to 1; `null` where there is none.
     #[serde(with = "number")]
     #[schemars(schema_with = "number_schema")]
     pub outside: f64,
     /// How the models predict each part of the training recordings, fitted without it.
     pub cross_validation: Vec<Fold>,
-    /// By parameter of a candidate, the parameter of the machine whose estimate goes most with its own.
-    pub trades_with: Ordered<Trade>,
+    /// By parameter of a candidate, the parameter of the machine whose estimate is most correlated with its own.
+    pub correlated_with: Ordered<Correlated>,
 }
 
 /// Where a variable was.
@@ -277,7 +277,7 @@ pub struct Closure {
 pub struct Range {
     /// Least and largest value in the training recordings, as the improved model simulates them, SI.
     pub train: Interval,
-    /// Share of the held-out samples beyond them, 0 to 1; `null` where there are none.
+    /// Share of the held-out samples outside, 0 to 1; `null` where there are none.
     #[serde(with = "number")]
     #[schemars(schema_with = "number_schema")]
     pub outside: f64,
@@ -302,12 +302,12 @@ pub struct Fold {
     pub improved: f64,
 }
 
-/// A parameter of the machine, and how its estimate goes with another one.
+/// A parameter of the machine whose estimate is correlated with another one.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize, JsonSchema)]
-pub struct Trade {
+pub struct Correlated {
     /// Its name.
     pub parameter: String,
-    /// Correlation of the two estimates, −1 to 1.
+    /// Correlation of the two estimates, −1 to 1: near either end the recordings hardly tell the two apart.
     #[serde(with = "number")]
     #[schemars(schema_with = "number_schema")]
     pub correlation: f64,

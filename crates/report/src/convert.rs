@@ -342,24 +342,23 @@ fn mechanism(found: &Found, improved: &Model, reach: &Reach) -> Mechanism {
 
 fn closure(of: &Proposal) -> Closure {
     let range = |r: &proposal::Range| {
-        let train = Interval { low: r.low, high: r.high };
-        (r.variable.clone(), Range { train, outside: r.outside })
+        (r.variable.clone(), Range { train: Interval::new(r.low, r.high), outside: r.outside })
     };
     let fold = |f: &proposal::Fold| Fold {
         recordings: f.recordings.clone(),
-        window_s: f.window.map(|(low, high)| Interval { low, high }),
+        window_s: interval(f.window, |t| t),
         calibrated: f.calibrated,
         improved: f.improved,
     };
-    let trade = |(law, with): &(String, proposal::Trade)| {
-        let with = Trade { parameter: with.parameter.clone(), correlation: with.correlation };
+    let correlated = |(law, with): &(String, proposal::Correlated)| {
+        let with = Correlated { parameter: with.parameter.clone(), correlation: with.correlation };
         (law.clone(), with)
     };
     Closure {
         range: of.ranges.iter().map(range).collect(),
         outside: of.outside,
         cross_validation: of.folds.iter().map(fold).collect(),
-        trades_with: of.trades.iter().map(trade).collect(),
+        correlated_with: of.correlations.iter().map(correlated).collect(),
     }
 }
 
@@ -880,7 +879,7 @@ mod tests {
             input: None,
             drifting: Some("g".into()),
             expression: "ka*(z - a)".into(),
-            states: Vec::new(),
+            states: vec![("a".into(), "ma*a'' = ka*(z - a)".into())],
             parameters: vec![("g".into(), 0, one(9.81))],
             figures: vec![("f0".into(), one(4.0)), ("zeta".into(), one(0.02))],
             share_explained: 0.5,
@@ -914,6 +913,7 @@ mod tests {
         let reach = Reach { inputs, dt: 0.01, ..Reach::default() };
         let told = mechanism(&found, &model, &reach);
         assert_eq!(told.drifting.as_deref(), Some("g"));
+        assert_eq!(told.states["a"], "ma*a'' = ka*(z - a)");
         let units: Vec<(&str, &str)> =
             told.parameters.iter().map(|(n, e)| (n.as_str(), e.unit.as_str())).collect();
         assert_eq!(units, [("g", "m/s^2"), ("f0", "Hz"), ("zeta", "1")]);

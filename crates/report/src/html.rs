@@ -332,15 +332,16 @@ struct CandidateView {
     expression_html: String,
     /// Name, value with its interval, unit.
     parameters: Vec<[String; 3]>,
-    /// What each of them trades with.
-    trades: Vec<String>,
+    /// Equations of its own states.
     states_html: Vec<String>,
+    /// What each of the parameters is correlated with.
+    correlated: Vec<String>,
     share: String,
 }
 
-/// What speaks for the candidates.
+/// How far the candidates can be trusted.
 struct ClosureView {
-    /// Variable, least and largest value, share of the held-out samples beyond them.
+    /// Variable, least and largest value, share of the held-out samples outside.
     range: Vec<[String; 3]>,
     outside: String,
     /// What is left out, error of the calibrated and of the improved model.
@@ -653,7 +654,7 @@ fn subsets(report: &Report) -> Vec<[String; 3]> {
             n if n == titles.len() => "All".to_owned(),
             _ => s.mechanisms.iter().map(named).collect::<Vec<_>>().join(", "),
         };
-        [what, s.mechanisms.len().to_string(), format::percent(s.left)]
+        [escape(&what), s.mechanisms.len().to_string(), format::percent(s.left)]
     };
     report.subsets.iter().map(row).collect()
 }
@@ -1102,19 +1103,24 @@ fn candidate_view(candidate: &Mechanism, closure: Option<&Closure>) -> Candidate
     let parameters = candidate.parameters.iter().map(|(name, estimate)| {
         [expression::html(name), format::cell(estimate.value, estimate.ci95), format::unit(&estimate.unit)]
     });
-    let trades = candidate.parameters.keys().filter_map(|name| {
-        let trade = closure?.trades_with.get(name)?;
-        Some(format!("{} {}", expression::html(&trade.parameter), format::significant(trade.correlation, 2)))
+    let correlated = candidate.parameters.keys().filter_map(|name| {
+        let with = closure?.correlated_with.get(name)?;
+        Some(format!("{} {}", expression::html(&with.parameter), format::significant(with.correlation, 2)))
     });
     CandidateView {
         title: format::kind(&candidate.kind),
         place: placed(candidate),
         expression_html: law_html(candidate),
         parameters: parameters.collect(),
-        trades: trades.collect(),
-        states_html: candidate.states.values().map(|equation| expression::html(equation)).collect(),
+        states_html: states_html(candidate),
+        correlated: correlated.collect(),
         share: format::probability(candidate.share_explained),
     }
+}
+
+/// Equations of the states that a law remembers by.
+fn states_html(law: &Mechanism) -> Vec<String> {
+    law.states.values().map(|equation| expression::html(equation)).collect()
 }
 
 fn closure_view(closure: &Closure) -> ClosureView {
@@ -1124,14 +1130,22 @@ fn closure_view(closure: &Closure) -> ClosureView {
         _ => "–".to_owned(),
     };
     let range = closure.range.iter().map(|(variable, range)| {
-        [expression::html(variable), format::interval(Some(range.train)), share(range.outside)]
+        [
+            format!("<span class=\"math\">{}</span>", expression::html(variable)),
+            format::interval(Some(range.train)),
+            share(range.outside),
+        ]
     });
     let error = |of: f64| if of.is_finite() { format::percent(of) } else { "diverges".to_owned() };
     let folds = closure.cross_validation.iter().map(|fold| {
         let window = fold.window_s.map_or_else(String::new, |w| {
             format!(", {} to {} s", format::number(w.low), format::number(w.high))
         });
-        [format!("{}{window}", fold.recordings.join(", ")), error(fold.calibrated), error(fold.improved)]
+        [
+            escape(&format!("{}{window}", fold.recordings.join(", "))),
+            error(fold.calibrated),
+            error(fold.improved),
+        ]
     });
     ClosureView { range: range.collect(), outside: share(closure.outside), folds: folds.collect() }
 }
@@ -1156,7 +1170,7 @@ fn mechanism_view(page: &Page, index: usize, mechanism: &Mechanism) -> Mechanism
         title: format::kind(&mechanism.kind),
         place: placed(mechanism),
         expression_html: law_html(mechanism),
-        states_html: mechanism.states.values().map(|equation| expression::html(equation)).collect(),
+        states_html: states_html(mechanism),
         share: format::probability(mechanism.share_explained),
         confidence: format::probability(mechanism.confidence),
         parameters: parameters.collect(),

@@ -2,7 +2,9 @@
 #![allow(clippy::unwrap_used, reason = "helpers of tests panic like the tests themselves")]
 
 use greybox_report::Page;
-use greybox_report::contract::{Closure, Finding, Fold, Interval, Range, Severity, Subset, Trade, Verdict};
+use greybox_report::contract::{
+    Closure, Correlated, Finding, Fold, Interval, Range, Severity, Subset, Verdict,
+};
 use greybox_report::page::{Channel, Recording, Residual, Role};
 
 #[path = "../examples/sample/mod.rs"]
@@ -100,7 +102,7 @@ fn what_is_proposed_stands_in_a_table_and_in_the_bar() {
     page.report.candidates.push(cube);
     let interval = |low, high| Interval { low, high };
     let fold = Fold {
-        recordings: vec!["link.csv".to_owned()],
+        recordings: vec!["<link>.csv".to_owned()],
         window_s: Some(interval(15.0, 20.5)),
         calibrated: f64::INFINITY,
         improved: 0.0123,
@@ -109,15 +111,16 @@ fn what_is_proposed_stands_in_a_table_and_in_the_bar() {
         range: [("theta".to_owned(), Range { train: interval(-0.4, 0.5), outside: 0.07 })].into(),
         outside: 0.07,
         cross_validation: vec![fold],
-        trades_with: [("fc".to_owned(), Trade { parameter: "ks".to_owned(), correlation: -0.93 })].into(),
+        correlated_with: [("fc".to_owned(), Correlated { parameter: "ks".to_owned(), correlation: -0.93 })]
+            .into(),
     });
     let html = page.to_html().unwrap();
     for text in [
         "<h3>Proposed, not named</h3>",
         "<var>z</var>′ = <var>θ</var> − <var>z</var>",
         "</var> −0.93</span>",
-        "7 % of the held-out samples are beyond",
-        "link.csv, 15.0 to 20.5 s</th><td class=\"num\">diverges</td><td class=\"num\">1.23 %</td>",
+        "7 % of the held-out samples are outside",
+        "&lt;link&gt;.csv, 15.0 to 20.5 s</th><td class=\"num\">diverges</td><td class=\"num\">1.23 %</td>",
         "<caption>Range of validity, SI units</caption>",
         "Cubic stiffness<small class=\"math\"><var>fc</var>·<var>θ</var><sup>3</sup>",
         "= 0.0652 ±\u{a0}0.0018 N m",
