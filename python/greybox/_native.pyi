@@ -68,6 +68,7 @@ def diagnose(
     seed: int,
     work: int | None,
     mechanisms: str | PathLike[str] | None,
+    terms_only: bool,
     progress: _Progress,
 ) -> _Studied: ...
 def identify(

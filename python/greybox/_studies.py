@@ -25,6 +25,7 @@ def diagnose(
     seed: int = 0,
     work: int | None = None,
     mechanisms: str | os.PathLike[str] | None = None,
+    terms_only: bool = False,
     progress: Progress | None = None,
 ) -> Diagnosis:
     """Finds what physics a model leaves out: what, where, how sure, and a model that fits.
@@ -38,6 +39,7 @@ def diagnose(
         seed: echoed into the report; the same seed and inputs give the same result.
         work: most work of the search, in billions of operations.
         mechanisms: folder of mechanisms of your own (``*.toml``), tried beside the built-in ones.
+        terms_only: identify the terms that the model lacks and name none of them, as ``greybox identify --model``.
         progress: hears what is being done.
 
     Raises:
@@ -82,6 +84,7 @@ def diagnose(
             seed,
             work,
             mechanisms,
+            terms_only,
             progress,
         )
     )

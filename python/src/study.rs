@@ -32,7 +32,7 @@ fn fitting(sources: Sources, model: &Equations) -> Result<Recordings, Failure> {
 }
 
 #[pyfunction]
-#[pyo3(signature = (model, train, holdout, map, seed, work, mechanisms, progress))]
+#[pyo3(signature = (model, train, holdout, map, seed, work, mechanisms, terms_only, progress))]
 pub(crate) fn diagnose<'py>(
     py: Python<'py>,
     model: &Model,
@@ -42,6 +42,7 @@ pub(crate) fn diagnose<'py>(
     seed: u64,
     work: Option<u64>,
     mechanisms: Option<PathBuf>,
+    terms_only: bool,
     progress: Option<&Bound<'py, PyAny>>,
 ) -> PyResult<Studied<'py>> {
     let loaded = model.loaded();
@@ -54,6 +55,7 @@ pub(crate) fn diagnose<'py>(
             seed,
             library: own.map(|own| own.library.mechanisms),
             work: work.map_or(usual.work, |work| work.saturating_mul(BILLION)),
+            terms_only,
         };
         let found = greybox_diagnose::diagnose(&loaded.model, &train, &holdout, &options, watch)
             .map_err(|e| Failure::diagnosis(&loaded.path, e))?;

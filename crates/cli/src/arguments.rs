@@ -1,7 +1,7 @@
 //! The command line.
 
 use std::ffi::OsString;
-use std::path::PathBuf;
+use std::path::{Path, PathBuf};
 
 use clap::error::ErrorKind;
 use clap::{Args, Parser, Subcommand};
@@ -122,6 +122,18 @@ impl Study {
         Ok(Recordings { train, holdout })
     }
 
+    /// Reads a model and the recordings, and sees that they fit each other.
+    ///
+    /// # Errors
+    /// Bad input: a file that cannot be read, or a recording that lacks what the model needs.
+    pub(crate) fn read(&self, model: &Path) -> Result<(LoadedModel, Recordings), Failure> {
+        let loaded = loading::model(model)?;
+        let recordings = self.recordings()?;
+        Data::new(&loaded.model, &recordings.train)?;
+        Data::new(&loaded.model, &recordings.holdout)?;
+        Ok((loaded, recordings))
+    }
+
     /// What a case of it holds: its files, and the names of its results.
     pub(crate) fn subject<'a>(&'a self, files: &'a [&'a str]) -> Subject<'a> {
         Subject {
@@ -163,16 +175,12 @@ pub(crate) struct ModelStudy {
 }
 
 impl ModelStudy {
-    /// Reads the model and the recordings, and sees that they fit each other.
+    /// As [`Study::read`].
     ///
     /// # Errors
-    /// Bad input: a file that cannot be read, or a recording that lacks what the model needs.
+    /// As [`Study::read`].
     pub(crate) fn read(&self) -> Result<(LoadedModel, Recordings), Failure> {
-        let loaded = loading::model(&self.model)?;
-        let recordings = self.study.recordings()?;
-        Data::new(&loaded.model, &recordings.train)?;
-        Data::new(&loaded.model, &recordings.holdout)?;
-        Ok((loaded, recordings))
+        self.study.read(&self.model)
     }
 
     /// As [`Study::folder`]; the model is an input too.

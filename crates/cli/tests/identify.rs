@@ -72,6 +72,58 @@ fn bench() -> Bench {
 const DUFFING: [&str; 10] =
     ["identify", "train.csv", "--states", "x", "--inputs", "f", "--library", "total", "--order", "3"];
 
+/// The linear oscillator, its parameters off.
+const NOMINAL: &str = r#"
+[inputs]
+f = { unit = "N", hold = "linear" }
+[states]
+x = { unit = "m" }
+[parameters]
+m = { value = 2.0, unit = "kg", fixed = true }
+c = { value = 2.0, unit = "N s/m" }
+k = { value = 5.0, unit = "N/m" }
+[equations]
+mass = "m*x'' + c*x' + k*x = f"
+"#;
+
+/// The three terms that it lacks, with their coefficients and without names.
+#[test]
+fn a_nominal_model_is_given_the_terms_that_it_lacks() {
+    let bench = bench();
+    bench.write("nominal.toml", NOMINAL);
+    let request = ["identify", "train.csv", "--model", "nominal.toml", "--holdout", "test.csv", "--out", "o"];
+    let outcome = bench.greybox(&request);
+    assert_eq!(outcome.code, 0, "{}", outcome.stderr);
+    let told = outcome.stdout;
+    assert!(told.starts_with("Terms are missing from the model: "), "{told}");
+    assert!(told.ends_with("Written: o/report.html, o/report.json, o/model.toml\n"), "{told}");
+    let report: Value = serde_json::from_str(&bench.read("o/report.json")).unwrap();
+    assert_eq!((&report["terms_only"], &report["basis"]), (&Value::Bool(true), &"proposed".into()));
+    assert_eq!(report["mechanisms"].as_array().unwrap().len(), 0);
+    let mut found: Vec<(String, f64)> =
+        report["candidates"].as_array().unwrap().iter().map(coefficient).collect();
+    found.sort_by(|a, b| a.0.cmp(&b.0));
+    let truth = [("cubic_damping", 1.0), ("cubic_stiffness", 0.1), ("position_dependent_damping", 0.2)];
+    assert_eq!(found.iter().map(|f| &*f.0).collect::<Vec<_>>(), truth.map(|t| t.0));
+    assert!(found.iter().zip(truth).all(|(f, t)| (f.1 / t.1 - 1.0).abs() < 0.1), "{found:?}");
+    let model = bench.read("o/model.toml");
+    assert_eq!(model.matches("proposed by greybox, not named").count(), 3, "{model}");
+    // What it wrote is a model again.
+    assert_eq!(bench.greybox(&["simulate", "o/model.toml", "test.csv", "--out", "again.csv"]).code, 0);
+    // Equations and their channels cannot both be given.
+    let both = [&request[..], &["--states", "x"]].concat();
+    bench.refuses(&both, &["--model", "--states"]);
+    bench.refuses(&["identify", "train.csv", "--out", "p"], &["--states"]);
+}
+
+/// Kind and only coefficient of a candidate.
+fn coefficient(candidate: &Value) -> (String, f64) {
+    let values = candidate["parameters"].as_object().unwrap();
+    assert_eq!(values.len(), 1, "{candidate}");
+    let value = values.values().next().unwrap()["value"].as_f64().unwrap();
+    (candidate["kind"].as_str().unwrap().to_owned(), value)
+}
+
 /// The terms of the only equation.
 fn terms(report: &Value) -> &Vec<Value> {
     report["equations"]["x"]["terms"].as_array().unwrap()

@@ -42,11 +42,13 @@ pub struct Options {
     pub library: Option<Vec<Mechanism>>,
     /// Work of the search ([`greybox_calibrate::Work`]) after which it looks for nothing more.
     pub work: u64,
+    /// Identify what is missing as a sum of terms and name nothing: a law with a name is a term like the others.
+    pub terms_only: bool,
 }
 
 impl Default for Options {
     fn default() -> Options {
-        Options { seed: 0, library: None, work: MOST_WORK }
+        Options { seed: 0, library: None, work: MOST_WORK, terms_only: false }
     }
 }
 
@@ -325,6 +327,8 @@ pub struct Subset {
 pub struct Diagnosis {
     /// Verdict.
     pub verdict: Verdict,
+    /// What is missing was identified as terms ([`Options::terms_only`]).
+    pub terms_only: bool,
     /// As given.
     pub nominal: Model,
     /// Refitted.
@@ -391,7 +395,10 @@ pub fn diagnose(
     observer.begins(&nominal.work);
     let mut search = Search::new(nominal.clone(), &library, observer);
     search.most_work = options.work;
-    let found = search.run();
+    let found = match options.terms_only {
+        true => alone(&nominal, false, options.work, observer),
+        false => search.run(),
+    };
     conclude(&nominal, holdout, source, &library, &search, found, options, observer)
 }
 
@@ -529,7 +536,7 @@ fn conclude(
     if errs || judged.verdict == Verdict::Unexplained {
         let closed = Closed::of(search, &found, &polished, &baseline, &judge);
         // What reaches the noise leaves no error of the model to be believed beside.
-        if errs && !closed.as_ref().is_some_and(|closed| closed.leaves_noise) {
+        if errs && !options.terms_only && !closed.as_ref().is_some_and(|closed| closed.leaves_noise) {
             let in_both = |part: &Part| agreed.contains(&named_as(part, library, &nominal.model));
             let standing = (&found, &polished);
             let explored = explored(search, standing, in_both, names, &baseline, &judge);
@@ -692,6 +699,7 @@ fn conclude(
     };
     Ok(Diagnosis {
         verdict,
+        terms_only: options.terms_only,
         basis,
         criterion,
         nominal: nominal.model.clone(),
@@ -1575,7 +1583,7 @@ const DOUBTED: f64 = 0.8;
 
 /// Residual over noise from which a residual is a misfit, whatever its colour; and from which it is one where
 /// samples hold so little information each that it must be slow.
-const MISFIT: f64 = 1.5;
+pub(crate) const MISFIT: f64 = 1.5;
 /// Residual over the estimated noise below which the estimate was not of noise alone.
 const BELOW_NOISE: f64 = 0.8;
 const SLOW_MISFIT: f64 = 1.2;

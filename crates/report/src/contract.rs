@@ -39,6 +39,9 @@ pub struct Report {
     /// The conclusion in plain language, one sentence per entry, most important first.
     #[serde(default)]
     pub summary: Vec<String>,
+    /// What is missing was identified as terms and not looked for by name (`greybox identify --model`).
+    #[serde(default, skip_serializing_if = "std::ops::Not::not")]
+    pub terms_only: bool,
     /// What the improved model rests on.
     #[serde(default)]
     pub basis: Basis,

@@ -45,6 +45,7 @@ pub fn report(diagnosis: &Diagnosis, sources: &Sources<'_>) -> Report {
             Answer::Unexplained => Verdict::Unexplained,
         },
         summary: Vec::new(),
+        terms_only: d.terms_only,
         basis: match d.basis {
             Ground::Named => Basis::Named,
             Ground::NamedAndProposed => Basis::NamedAndProposed,

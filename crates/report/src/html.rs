@@ -246,6 +246,7 @@ struct View {
     common: Common,
     verdict: &'static str,
     verdict_class: &'static str,
+    terms_only: bool,
     headline: String,
     sentences: Vec<String>,
     equations: Vec<EquationView>,
@@ -427,6 +428,7 @@ impl View {
         }
         let headline = if sentences.is_empty() { String::new() } else { sentences.remove(0) };
         let (verdict, verdict_class) = match report.verdict {
+            _ if report.terms_only && !report.candidates.is_empty() => ("Terms are missing", "missing"),
             Verdict::Consistent => ("The model agrees with the data", "consistent"),
             Verdict::MissingPhysics => ("Physics is missing", "missing"),
             Verdict::Unexplained => ("Something is missing, unexplained", "unexplained"),
@@ -439,7 +441,7 @@ impl View {
             residuals: &page.residuals,
         };
         let common = Common {
-            product: "greybox diagnosis",
+            product: if report.terms_only { "greybox identification" } else { "greybox diagnosis" },
             title: page.title.clone(),
             meta: meta(&report.model, &scene),
             fit_title: "Before and after",
@@ -454,6 +456,7 @@ impl View {
             common,
             verdict,
             verdict_class,
+            terms_only: report.terms_only,
             headline,
             sentences,
             equations: equations(page),

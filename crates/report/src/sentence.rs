@@ -37,30 +37,7 @@ pub fn summary(report: &Report) -> Vec<String> {
                 )
             }));
         }
-        Verdict::Unexplained => {
-            let place = place(&report.remainder.location);
-            let share = format::probability(report.remainder.share_of_residual);
-            out.push(if report.remainder.share_of_residual < SHAPELESS {
-                format!(
-                    "Something is missing from the model{place}, and neither a mechanism of the library nor a force of \
-                     any other shape explains it ({share} of the residual). Look at the model before its physics: \
-                     the signs, the units, and what each channel measures (`greybox check --model` tells)."
-                )
-            } else {
-                format!(
-                    "Something is missing from the model{place}, and no mechanism in the library explains it; it \
-                     makes up {share} of the residual."
-                )
-            });
-            out.extend(proposed(report));
-            out.extend(
-                report
-                    .remainder
-                    .experiment
-                    .as_deref()
-                    .map(|e| format!("To find out what it is: {}.", e.trim_end_matches('.'))),
-            );
-        }
+        Verdict::Unexplained => unexplained(report, &mut out),
         Verdict::MissingPhysics => {
             missing(report, &mut out);
             out.extend(beside(report));
@@ -93,14 +70,48 @@ pub fn summary(report: &Report) -> Vec<String> {
     out
 }
 
+/// What is told where no name is believed, or none was looked for.
+fn unexplained(report: &Report, out: &mut Vec<String>) {
+    if report.terms_only && !report.candidates.is_empty() {
+        let terms = sums(&report.candidates).unwrap_or_else(|| joined_laws(&report.candidates));
+        out.push(format!("Terms are missing from the model: {terms}{}.", change(&report.fit)));
+        out.extend(losses(&report.fit));
+        out.push("The terms have no names: `greybox diagnose` looks for mechanisms.".to_owned());
+        return;
+    }
+    let place = place(&report.remainder.location);
+    let share = format::probability(report.remainder.share_of_residual);
+    let what = if report.terms_only { "term" } else { "mechanism" };
+    out.push(if report.remainder.share_of_residual < SHAPELESS {
+        format!(
+            "Something is missing from the model{place}, and neither a {what} of the library nor a force of any other \
+             shape explains it ({share} of the residual). Look at the model before its physics: the signs, the units, \
+             and what each channel measures (`greybox check --model` tells)."
+        )
+    } else {
+        format!(
+            "Something is missing from the model{place}, and no {what} in the library explains it; it makes up {share} of \
+             the residual."
+        )
+    });
+    out.extend(proposed(report));
+    let experiment = report.remainder.experiment.as_deref();
+    out.extend(experiment.map(|e| format!("To find out what it is: {}.", e.trim_end_matches('.'))));
+}
+
+/// How the held-out error changes from the calibrated to the improved model, to end a sentence with.
+fn change(fit: &Fit) -> String {
+    error_change(fit, Baseline::Calibrated)
+        .map(|c| format!(": the held-out error{} falls from {} to {}", c.of, c.from, c.to))
+        .unwrap_or_default()
+}
+
 /// What the improved model holds where no name is believed.
 fn proposed(report: &Report) -> Vec<String> {
     if report.candidates.is_empty() {
         return Vec::new();
     }
-    let change = error_change(&report.fit, Baseline::Calibrated)
-        .map(|c| format!(": the held-out error{} falls from {} to {}", c.of, c.from, c.to))
-        .unwrap_or_default();
+    let change = change(&report.fit);
     let mut out = vec![format!(
         "The improved model has in its stead {} and predicts what it was not fitted to better than the calibrated \
          one{change}. What is missing may be something else.",
@@ -112,9 +123,7 @@ fn proposed(report: &Report) -> Vec<String> {
 
 /// What the improved model holds beside the mechanisms that are believed.
 fn beside(report: &Report) -> Option<String> {
-    let change = error_change(&report.fit, Baseline::Calibrated)
-        .map(|c| format!(": the held-out error{} falls from {} to {}", c.of, c.from, c.to))
-        .unwrap_or_default();
+    let change = change(&report.fit);
     (!report.candidates.is_empty()).then(|| {
         format!(
             "The improved model also has {} and predicts what it was not fitted to better than the calibrated \
@@ -124,13 +133,23 @@ fn beside(report: &Report) -> Option<String> {
     })
 }
 
-/// What is proposed: each candidate with its law, or, of several forces times one coefficient each, one sum for each
-/// equation: `0.0533·θ − 0.197·θ³ in the hub equation`.
+/// What is proposed: each candidate with its law, or the sums of several forces.
 fn laws(candidates: &[Mechanism]) -> String {
-    let terms: Vec<Term<'_>> = candidates.iter().filter_map(term).collect();
-    if terms.len() < 2 || terms.len() < candidates.len() {
-        return joined(&candidates.iter().map(law).collect::<Vec<_>>(), "and");
+    match sums(candidates) {
+        Some(sums) if candidates.len() > 1 => format!("the terms {sums}, proposed and not named,"),
+        _ => joined_laws(candidates),
     }
+}
+
+/// Each candidate with its law.
+fn joined_laws(candidates: &[Mechanism]) -> String {
+    joined(&candidates.iter().map(law).collect::<Vec<_>>(), "and")
+}
+
+/// Forces times one coefficient each, one sum for each equation: `0.0533·θ − 0.197·θ³ in the hub equation`; `None` where
+/// a candidate is none.
+fn sums(candidates: &[Mechanism]) -> Option<String> {
+    let terms: Vec<Term<'_>> = candidates.iter().map(term).collect::<Option<_>>()?;
     let mut sums: Vec<(&Names, String)> = Vec::new();
     for term in &terms {
         let known = sums.iter().position(|s| s.0.as_slice() == term.equations.as_slice());
@@ -148,7 +167,7 @@ fn laws(candidates: &[Mechanism]) -> String {
         sums.into_iter().map(|(names, sum)| format!("{sum}{}", equations(names))).collect();
     let memory: Vec<String> = terms.into_iter().flat_map(|term| term.memory).collect();
     let memory = if memory.is_empty() { String::new() } else { format!(", with {}", joined(&memory, "and")) };
-    format!("the terms {}{memory} (SI units), proposed and not named,", joined(&sums, "and"))
+    Some(format!("{}{memory} (SI units)", joined(&sums, "and")))
 }
 
 /// A force that is one coefficient times a function.
@@ -607,6 +626,33 @@ mod tests {
         two.parameters.extend(term("hub", "k5", "", 2.0).parameters);
         assert_eq!(super::term(&two), None);
         assert_eq!(laws(&[two, cube]), "cubic stiffness (k₃·θ³ + k₅·θ⁵) and cubic stiffness (k₃·θ³)");
+    }
+
+    #[test]
+    fn terms_that_nobody_looked_a_name_up_for_are_told_as_such() {
+        let json = r#"{
+          "verdict": "unexplained", "terms_only": true, "basis": "proposed", "mechanisms": [],
+          "candidates": [{"kind": "cubic_stiffness", "equation": "hub", "expression": "k3*theta^3",
+            "parameters": {"k3": {"value": -0.197, "ci95": [-0.2, -0.194], "unit": "N m"}},
+            "share_explained": 0.9, "confidence": 0.5, "location": {}}],
+          "remainder": {"significant": true, "location": {}, "share_of_residual": 0.9},
+          "parameters": {},
+          "fit": {"train": {"nominal": {}, "calibrated": {}, "improved": {}},
+                  "holdout": {"nominal": {}, "calibrated": {"theta": {"nrmse": 0.63}},
+                              "improved": {"theta": {"nrmse": 0.0019}}},
+                  "holdout_source": "b.csv"},
+          "noise_floor": {}}"#;
+        let mut report = Report::from_json(json).unwrap();
+        let told = super::summary(&report);
+        assert_eq!(
+            told[0],
+            "Terms are missing from the model: −0.197·θ³ in the hub equation (SI units): the held-out error falls from \
+             63 % to 0.19 %."
+        );
+        assert_eq!(told[1], "The terms have no names: `greybox diagnose` looks for mechanisms.");
+        report.candidates.clear();
+        let told = super::summary(&report);
+        assert!(told[0].contains("no term in the library explains it"), "{told:?}");
     }
 
     #[test]

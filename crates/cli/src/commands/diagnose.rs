@@ -57,6 +57,7 @@ impl Arguments {
             seed: self.seed,
             library: own.map(|o| o.library.mechanisms.clone()),
             work: self.work.saturating_mul(BILLION),
+            terms_only: false,
         }
     }
 }
@@ -93,7 +94,7 @@ fn work(arguments: &Arguments) -> Result<Answer, Failure> {
 }
 
 /// Which mechanisms beside the built-in ones were tried.
-fn tried(own: &Mechanisms) -> String {
+pub(crate) fn tried(own: &Mechanisms) -> String {
     let mut text = String::new();
     for (files, what) in [
         (&own.library.added, "tried beside the built-in mechanisms"),

@@ -1,14 +1,17 @@
 //! `greybox identify`: the governing equations, from recordings alone.
 
+use std::path::{Path, PathBuf};
+
 use clap::{Args, ValueEnum};
 use greybox_commands::identify::{FILES, Results};
-use greybox_identify::{DelayedState, Library, MOST_WORK, Monomials, Options, Streamed};
+use greybox_identify::{DelayedState, Library, Monomials, Options, Streamed};
 use greybox_model::Hold;
 use greybox_report::convert::identification::{MODEL_FILE, Sources};
 
 use crate::answer::Answer;
 use crate::arguments::{BILLION, Recordings, Study, whole};
 use crate::case::Subject;
+use crate::commands::diagnose::{diagnose, tried};
 use crate::failure::Failure;
 use crate::loading;
 use crate::progress::Progress;
@@ -21,6 +24,10 @@ use crate::progress::Progress;
   greybox identify run1.mat --states x --inputs f --map x=encoder --out found
   greybox identify run1.csv --states x --inputs f --delay x --longest 0.5 --out found
   greybox identify a_week.csv --states x --inputs f --block 20000 --out found
+  greybox identify run1.csv --model link.toml --holdout run2.csv --out found
+
+With --model, its equations are kept: what they lack is identified as a sum of terms (`greybox mechanisms` lists them), of
+which none is believed to have its name, and refitted with its parameters.
 
 DIR receives model.toml (runs in `greybox simulate` and `greybox diagnose`), report.json and report.html
 (self-contained, with plots). With no --holdout, the last fifth of each recording is held out. The same seed and
@@ -29,8 +36,19 @@ pub(crate) struct Arguments {
     #[command(flatten)]
     study: Study,
 
+    /// Nominal model (TOML): identify the terms that its equations lack
+    #[arg(long, value_name = "MODEL.toml", conflicts_with_all = [
+        "states", "inputs", "order", "library", "terms", "derivatives", "hold", "delay", "gain", "longest", "block",
+        "replicates",
+    ])]
+    model: Option<PathBuf>,
+
+    /// With --model: folder of terms of your own (*.toml), tried beside the built-in ones
+    #[arg(long, value_name = "DIR", requires = "model")]
+    mechanisms: Option<PathBuf>,
+
     /// Channels that are the coordinates of the machine, one equation each
-    #[arg(long, value_name = "X,…", value_delimiter = ',', num_args = 1, required = true)]
+    #[arg(long, value_name = "X,…", value_delimiter = ',', num_args = 1, required_unless_present = "model")]
     states: Vec<String>,
 
     /// Channels that drive it; the first one sets the scale of the equations
@@ -89,10 +107,17 @@ pub(crate) struct Arguments {
     #[arg(long, value_name = "N", value_parser = whole, default_value_t = 0, allow_negative_numbers = true)]
     seed: u64,
 
-    /// Most work of the fits, in billions of operations; the report says when it was not enough
-    #[arg(long, value_name = "N", value_parser = whole, default_value_t = MOST_WORK / BILLION, allow_negative_numbers = true)]
-    work: u64,
+    /// Most work of the fits, in billions of operations; the report says when it was not enough [default: 80, with
+    /// --model 120]
+    #[arg(long, value_name = "N", value_parser = whole, allow_negative_numbers = true)]
+    work: Option<u64>,
 }
+
+/// What the help says of `--work`.
+const _: () = {
+    assert!(greybox_identify::MOST_WORK == 80 * BILLION);
+    assert!(greybox_diagnose::search::MOST_WORK == 120 * BILLION);
+};
 
 /// A part of the library.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, ValueEnum)]
@@ -146,8 +171,41 @@ impl From<Between> for Hold {
 
 pub(crate) fn run(arguments: &Arguments) -> Result<Answer, Failure> {
     let study = &arguments.study;
-    let subject = Subject { channels: (&arguments.inputs, &arguments.states), ..study.subject(&FILES) };
-    study.case.around(&subject, || work(arguments))
+    let subject = Subject {
+        model: arguments.model.as_deref(),
+        mechanisms: arguments.mechanisms.as_deref(),
+        channels: (&arguments.inputs, &arguments.states),
+        ..study.subject(&FILES)
+    };
+    study.case.around(&subject, || match &arguments.model {
+        Some(model) => terms(arguments, model),
+        None => work(arguments),
+    })
+}
+
+/// The terms that a nominal model lacks.
+fn terms(arguments: &Arguments, model: &PathBuf) -> Result<Answer, Failure> {
+    let study = &arguments.study;
+    let own = arguments.mechanisms.as_deref().map(loading::mechanisms).transpose()?;
+    let (loaded, recordings) = study.read(model)?;
+    let out = study.folder(&FILES, [model].into_iter().chain(own.iter().flat_map(|own| &own.files)))?;
+    let usual = greybox_diagnose::Options::default();
+    let options = greybox_diagnose::Options {
+        seed: arguments.seed,
+        library: own.as_ref().map(|own| own.library.mechanisms.clone()),
+        work: arguments.work.map_or(usual.work, |work| work.saturating_mul(BILLION)),
+        terms_only: true,
+    };
+    let results = diagnose(&loaded, &recordings.train, &recordings.holdout, &options)?;
+    let [json, html, (_, improved)] = results.files();
+    out.write(&[json, html, (MODEL_FILE, improved)])?;
+    let tried = own.as_ref().map(tried).unwrap_or_default();
+    Ok(Answer::new(format!("{}{tried}\n{}", results.story, written(&study.out)), results.json))
+}
+
+/// Where the results are.
+fn written(out: &Path) -> String {
+    format!("Written: {0}/report.html, {0}/report.json, {0}/{MODEL_FILE}\n", out.display())
 }
 
 fn work(arguments: &Arguments) -> Result<Answer, Failure> {
@@ -180,10 +238,7 @@ fn work(arguments: &Arguments) -> Result<Answer, Failure> {
     let results = Results::of(&found, &sources)?;
     drop(progress);
     out.write(&results.files())?;
-    let told = arguments.study.out.display();
-    let text =
-        format!("{}\nWritten: {told}/report.html, {told}/report.json, {told}/{MODEL_FILE}\n", results.story);
-    Ok(Answer::new(text, results.json))
+    Ok(Answer::new(format!("{}\n{}", results.story, written(&arguments.study.out)), results.json))
 }
 
 /// The request in the words of the library.
@@ -205,7 +260,7 @@ fn options(arguments: &Arguments) -> Result<Options, Failure> {
         delay,
         replicates: usize::from(arguments.replicates),
         seed: arguments.seed,
-        work: arguments.work.saturating_mul(BILLION),
+        work: arguments.work.map_or(usual.work, |work| work.saturating_mul(BILLION)),
         ..usual
     })
 }

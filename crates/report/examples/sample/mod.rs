@@ -417,6 +417,7 @@ pub(crate) fn page() -> Page {
         samples: Samples { train: train.recording.t.len(), holdout: test.recording.t.len() },
         verdict: Verdict::MissingPhysics,
         summary: Vec::new(),
+        terms_only: false,
         basis: Basis::Named,
         mechanisms: vec![mechanism(windows.clone())],
         candidates: Vec::new(),
