@@ -11,8 +11,9 @@
 //! PNAS 113, 2016), on the simulated motion in place of differentiated measurements. A round adds up to three terms of one
 //! coefficient that explain most together, or one law with constants or a memory, whichever is worth more, and takes away,
 //! one after the other, the term that the recordings determine least, for as long as what is known of it
-//! ([`robust`](crate::evidence::robust)) is below the odds against one among those that the round chose from. Rounds go on until none changes
-//! anything, on short segments first, where first order is good, on longer ones later, where small forces are seen.
+//! ([`robust`](crate::evidence::robust)) is below the odds against one among those that the round chose from. Where a round changes
+//! nothing, all terms of one coefficient are chosen anew together, to first order: others may do their work for less. Rounds go on
+//! until none changes anything, on short segments first, where first order is good, on longer ones later, where small forces are seen.
 
 use std::sync::Arc;
 
@@ -20,12 +21,13 @@ use greybox_calibrate::{Point, Setup, Work};
 use rayon::prelude::*;
 
 use crate::candidate::Candidate;
-use crate::evidence::{Evidence, least_kappa};
+use crate::diagnosis::MISFIT;
+use crate::evidence::{Evidence, least_kappa, price};
 use crate::place::own_coordinates;
-use crate::screen::{Scored, Together, screen, screen_set, shift_without};
+use crate::screen::{Held, Scored, Together, reselect, screen, screen_set, shift_without};
 use crate::search::{
-    Accepted, Fitted, Found, MOST_SAMPLES, SAME_HOLD, Search, UNDECIDED, WHITE, limits, next_scale, odds,
-    same_level, whole,
+    Accepted, Fitted, Found, MOST_SAMPLES, Part, SAME_HOLD, Search, UNDECIDED, WHITE, laws, limits,
+    next_scale, odds, same_level, whole,
 };
 use crate::turns::Turns;
 use crate::uncertainty::Uncertainty;
@@ -93,21 +95,26 @@ impl Search<'_> {
                 self.method(&mut current, &scale);
                 current = self.refit(&current, &scale, 10);
                 seen.push(candidates(&current));
-                if is_spent() || !leaves_something(&current, &scale) {
-                    break;
-                }
+                let is_new = |model: &Fitted| !seen.iter().any(|s| is_same(s, &candidates(model)));
                 let settled = |more: Option<Fitted>, terms: &[Candidate]| {
-                    let settled = self.settled(&current, more?, odds(terms.len()), &scale)?;
-                    let is_new = !seen.iter().any(|s| is_same(s, &candidates(&settled)));
-                    is_new.then_some(settled)
+                    self.settled(&current, more?, odds(terms.len()), &scale).filter(is_new)
                 };
-                let plain = settled(self.larger(&current, &plain, AT_ONCE, &scale), &plain);
-                // A law with more to fit is tried where it promises more than they keep.
-                let kept = plain.as_ref().map_or(0.0, |plain| 1.0 - plain.rss() / current.rss());
-                let rich = settled(self.with_one(&current, &rich, kept, &scale), &rich);
-                let told = |model: &Fitted| self.robust(&current, model, &scale);
-                let both = [plain, rich].into_iter().flatten();
-                let Some(next) = both.max_by(|a, b| told(a).total_cmp(&told(b))) else { break };
+                let more = (!is_spent() && leaves_something(&current, &scale))
+                    .then(|| {
+                        let plain = settled(self.larger(&current, &plain, AT_ONCE, &scale), &plain);
+                        // A law with more to fit is tried where it promises more than they keep.
+                        let kept = plain.as_ref().map_or(0.0, |plain| 1.0 - plain.rss() / current.rss());
+                        let rich = settled(self.with_one(&current, &rich, kept, &scale), &rich);
+                        let told = |model: &Fitted| self.robust(&current, model, &scale);
+                        let both = [plain, rich].into_iter().flatten();
+                        both.max_by(|a, b| told(a).total_cmp(&told(b)))
+                    })
+                    .flatten();
+                // (What leaves more than noise tells no two choices of terms apart.)
+                let reaches = current.misfit(&scale) <= MISFIT;
+                let other =
+                    || reaches.then(|| self.reselected(&current, &plain, &scale)).flatten().filter(is_new);
+                let Some(next) = more.or_else(other) else { break };
                 // (Another hold may have stood in for what has a term now.)
                 current = self.redecide_holds(&next, &scale, SAME_HOLD);
             }
@@ -116,7 +123,6 @@ impl Search<'_> {
                 return None;
             }
         }
-        current = self.plainer(current, &plain, &scale);
         // What is left is work of the search again.
         self.observer.begins(&nominal.work);
         if current.parts.is_empty() || is_same(&candidates(&current), &candidates(from)) {
@@ -202,31 +208,54 @@ impl Search<'_> {
         self.extend_by(base, &open, &together, &STARTS, scale, STEPS)
     }
 
-    /// The model with laws of lower rank in the place of its terms, where they do as well: a linear spring for a sine, a
-    /// named law for a term without a name.
-    fn plainer(&self, model: Fitted, terms: &[Candidate], scale: &[f64]) -> Fitted {
-        let rank = |c: &Candidate| self.library[c.mechanism].rank;
-        let mut model = model;
-        let mut index = 0;
-        while index < model.parts.len() {
-            let own = &model.parts[index].candidate;
-            let plain = |c: &&Candidate| c.place == own.place && rank(c) < rank(own);
-            let plain: Vec<Candidate> = terms.iter().filter(plain).cloned().collect();
-            let other = (!plain.is_empty())
-                .then(|| {
-                    let less = self.less(&model, index, scale)?;
-                    let other = self.larger(&less, &plain, 1, scale)?;
-                    let lost = self.robust(&less, &model, scale) - self.robust(&less, &other, scale);
-                    (lost < UNDECIDED).then_some(other)
-                })
-                .flatten();
-            match other {
-                // (A part of lower rank stands at the end now.)
-                Some(other) => model = other,
-                None => index += 1,
-            }
+    /// The model with other terms for those that it holds, where they do the same work for less: fewer coefficients, or laws
+    /// of lower rank, a linear spring for a sine, a named law for a term without a name.
+    fn reselected(&self, model: &Fitted, terms: &[Candidate], scale: &[f64]) -> Option<Fitted> {
+        let (setup, point) = (&model.setup, &model.fit.point);
+        let held: Vec<Held> = model
+            .parts
+            .iter()
+            .filter_map(|part| {
+                let candidate = terms.iter().position(|c| *c == part.candidate)?;
+                let index = setup.model.parameter(&part.instance.names[0])?;
+                let position = setup.free.iter().position(|f| f.index == index)?;
+                Some(Held { candidate, position, value: point.parameters[index] })
+            })
+            .collect();
+        if held.is_empty() {
+            return None;
         }
-        model
+        let positions: Vec<usize> = held.iter().map(|h| h.position).collect();
+        let inflation = Uncertainty::inflation(model, scale, &positions).factor;
+        let information = model.fit.count.iter().sum::<usize>() as f64 / inflation;
+        let price = |c: &Candidate| {
+            let law = &self.library[c.mechanism];
+            let parameters = law.parameters().count() as f64;
+            let ranked = UNDECIDED * f64::from(law.rank);
+            inflation * (price(parameters, information) + 2.0 * law.surcharge + ranked)
+        };
+        let together = reselect(setup, self.library, terms, &model.level, scale, point, &held, &price)?;
+        let mut shifted = point.parameters.clone();
+        let others = (0..setup.free.len()).filter(|i| !positions.contains(i)).map(|i| &setup.free[i]);
+        for (f, d) in others.zip(&together.shift) {
+            shifted[f.index] = (shifted[f.index] + d).clamp(f.lower, f.upper);
+        }
+        let is_rich = |part: &&Part| !terms.contains(&part.candidate);
+        let rich: Vec<Part> = model.parts.iter().filter(is_rich).cloned().collect();
+        let mut laws = laws(&rich, &setup.model, &point.parameters);
+        let mut start = shifted[..self.nominal().model.parameters.len()].to_vec();
+        let own = rich.iter().flat_map(|p| &p.instance.names).filter_map(|n| setup.model.parameter(n));
+        start.extend(own.map(|i| shifted[i]));
+        for member in &together.members {
+            laws.push((terms[member.candidate].clone(), member.values.clone(), member.scales.clone()));
+            start.extend(&member.values);
+        }
+        let other = self.reassembled_from(model, &laws, vec![start], scale, STEPS)?;
+        // (First order may have promised too much.)
+        let cost =
+            |model: &Fitted| model.rss() + model.parts.iter().map(|p| price(&p.candidate)).sum::<f64>();
+        (cost(&other) < cost(model) && self.admissible(&other, scale))
+            .then(|| self.known_alone(other, odds(terms.len()), scale))
     }
 
     /// The model without what the recordings do not tell: as long as the term that they determine least is not worth the
@@ -277,10 +306,8 @@ impl Search<'_> {
         // (Of two laws that do as well the plainer one has the name.)
         let complexity = |c: &Candidate| self.library[c.mechanism].complexity();
         rich.retain(|c| complexity(c) <= complexity(candidate));
-        let does_as_well = |other: Option<Fitted>| {
-            let lost = |other| self.robust(&less, model, scale) - self.robust(&less, &other, scale);
-            other.is_some_and(|other| lost(other) < UNDECIDED)
-        };
+        let does_as_well =
+            |other: Option<Fitted>| other.is_some_and(|other| self.robust(&other, model, scale) < UNDECIDED);
         does_as_well(self.larger(&less, &plain, AT_ONCE, scale))
             || does_as_well(self.with_one(&less, &rich, 0.0, scale))
     }
@@ -496,6 +523,44 @@ second = "n*y'' + c*y' + l*(y - x) = 0"
             assert!(near(&brake, "eddy_current_damping", "first", [3.0, 0.4]), "{brake:?}");
             let spring = told(&|[_, y, _, _, z]| [0.0, 6.0 * (y - z), 2.0 * (y - z)], seed);
             assert!(near(&spring, "maxwell_element", "second", [6.0, 2.0]), "{spring:?}");
+        }
+    }
+
+    /// x², told as |x| and a constant, is told as it is; what is right stays.
+    #[test]
+    fn terms_that_do_the_same_work_for_less_take_the_place_of_more() {
+        let library = crate::built_in().unwrap();
+        for seed in 50..52 {
+            let search =
+                Search::new(bodies(&|[x, ..]| [9.0 * x * x, 0.0, 0.0], seed), &library, &crate::Quiet);
+            let scale = search.nominal().data.sigma.clone();
+            let calibrated = nothing(&search).calibrated;
+            let plain: Vec<Candidate> =
+                search.closing().into_iter().filter(|c| library[c.mechanism].is_plain()).collect();
+            let with = |kinds: &[&str]| {
+                let is = |c: &Candidate, kind: &str| {
+                    library[c.mechanism].kind == kind
+                        && c.place.equations(&search.nominal().model) == ["first"]
+                };
+                let law = |kind: &&str| {
+                    let candidate = plain.iter().find(|c| is(c, kind)).unwrap().clone();
+                    (candidate, vec![0.1], Vec::new())
+                };
+                let laws: Vec<_> = kinds.iter().map(law).collect();
+                let start = calibrated.fit.point.parameters.iter().copied().chain(kinds.iter().map(|_| 0.1));
+                search.reassembled_from(&calibrated, &laws, vec![start.collect()], &scale, STEPS).unwrap()
+            };
+            let told = |model: Fitted| {
+                terms(&Found { improved: model, ..nothing(&search) }, &library, &search.nominal().model)
+            };
+            let other =
+                search.reselected(&with(&["asymmetric_stiffness", "constant_offset"]), &plain, &scale);
+            let other = told(other.expect("there is a plainer one"));
+            let [(kind, place, value)] = &other[..] else { panic!("{other:?}") };
+            assert_eq!((&**kind, &**place), ("quadratic_stiffness", "first"));
+            assert!((value / 9.0 - 1.0).abs() < 0.01, "{value}");
+            let right = search.reselected(&with(&["quadratic_stiffness"]), &plain, &scale).map(told);
+            assert_eq!(right, None);
         }
     }
 

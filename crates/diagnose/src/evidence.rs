@@ -214,7 +214,7 @@ pub struct Side {
 
 /// Price of `k` parameters: BIC's ln N for each, no less than AIC's 2, and on little information more, by the
 /// small-sample factor N/(N − k − 1) (Hurvich and Tsai 1989), three at most.
-fn price(k: f64, information: f64) -> f64 {
+pub(crate) fn price(k: f64, information: f64) -> f64 {
     let n = information.max(2.0);
     k * n.ln().max(2.0) * n / (n - k - 1.0).max(n / 3.0)
 }

@@ -875,6 +875,23 @@ impl Gram {
         out
     }
 
+    /// The same with what some columns do, by so much each, in the residual. Of one block.
+    #[must_use]
+    fn with_columns(&self, did: &[(usize, f64)]) -> Gram {
+        let (np, lanes) = (self.np, self.lanes);
+        let mut out = self.clone();
+        for (i, by) in did {
+            out.rr += 2.0 * by * out.gr[*i] + by * by * self.gg[0][i * lanes + i];
+            for a in 0..np {
+                out.jr[a] += by * self.jg[a * lanes + i];
+            }
+            for l in 0..lanes {
+                out.gr[l] += by * self.gg[0][l * lanes + i];
+            }
+        }
+        out
+    }
+
     /// GᵀG and Gᵀr of block `index` with the parameters projected off.
     pub fn projected(&self, index: usize) -> (Vec<f64>, Vec<f64>) {
         let Projection { gg, gr, .. } = self.projection(index);
@@ -961,8 +978,28 @@ pub struct Together {
     pub shift: Vec<f64>,
 }
 
+/// What is added to the size of each column of a set, that of two alike neither grows beyond all bounds.
+const RIDGE: f64 = 1e-6;
+
 /// Least share that a pair must explain, and least surplus over its members alone.
 const PAIR_GAIN: f64 = 0.05;
+
+/// The responses of all candidates and their products with each other.
+fn responses(
+    setup: &Setup,
+    library: &[Mechanism],
+    candidates: &[Candidate],
+    level: &Level,
+    scale: &[f64],
+    point: &Point,
+) -> (Lanes, Gram) {
+    let (along, forces) = Along::observed(setup, level, scale, point);
+    let spectra = Spectra::new(setup, level, scale, point, &along, &forces);
+    let lanes = lanes(setup, library, candidates, &along, &spectra);
+    let whole = 0..lanes.columns.len();
+    let gram = gram(setup, level, scale, point, &lanes.signals, &lanes.columns, vec![whole]);
+    (lanes, gram)
+}
 
 /// All candidates in one Gram matrix, the parameters projected out: a regression on a few of its columns costs
 /// next to nothing.
@@ -992,12 +1029,17 @@ impl<'a> Regressions<'a> {
         scale: &[f64],
         point: &Point,
     ) -> Regressions<'a> {
-        let (along, forces) = Along::observed(setup, level, scale, point);
-        let spectra = Spectra::new(setup, level, scale, point, &along, &forces);
-        let lanes = lanes(setup, library, candidates, &along, &spectra);
+        let (lanes, gram) = responses(setup, library, candidates, level, scale, point);
+        Regressions::of(library, candidates, lanes, &gram)
+    }
+
+    fn of(
+        library: &'a [Mechanism],
+        candidates: &'a [Candidate],
+        lanes: Lanes,
+        gram: &Gram,
+    ) -> Regressions<'a> {
         let n = lanes.columns.len();
-        let whole = 0..n;
-        let gram = gram(setup, level, scale, point, &lanes.signals, &lanes.columns, vec![whole]);
         let Projection { gg, gr, columns: solved, base } = gram.projection(0);
         let independent =
             |a: usize| gg[a * n + a] > 0.0 && gram.independence(a, gram.gg[0][a * n + a]) > INDEPENDENT;
@@ -1015,8 +1057,9 @@ impl<'a> Regressions<'a> {
         }
     }
 
-    /// Coefficients of a few columns and the share that they explain; `None` where a sign is impossible.
-    fn regress(&self, columns: &[usize], positive: &[bool]) -> Option<(Vec<f64>, f64)> {
+    /// Coefficients of a few columns and the share that they explain, each column with so much of its own size more;
+    /// `None` where a sign is impossible.
+    fn regress(&self, columns: &[usize], positive: &[bool], ridge: f64) -> Option<(Vec<f64>, f64)> {
         if columns.iter().any(|&c| !self.independent[c]) {
             return None;
         }
@@ -1028,7 +1071,7 @@ impl<'a> Regressions<'a> {
             for j in 0..m {
                 a[i * m + j] = projected(i, j) / (d[i] * d[j]);
             }
-            a[i * m + i] += 1e-6;
+            a[i * m + i] += ridge;
         }
         let b: Vec<f64> = (0..m).map(|i| self.gr[columns[i]] / d[i]).collect();
         let x = qr::solve_spd(&a, m, &b);
@@ -1093,7 +1136,7 @@ pub fn screen_pairs(
         .enumerate()
         .map(|(i, v)| {
             let (columns, positive): (Vec<usize>, Vec<bool>) = (v.columns.clone().collect(), all.positive(v));
-            let alone = all.regress(&columns, &positive).map_or(0.0, |r| r.1.max(0.0));
+            let alone = all.regress(&columns, &positive, RIDGE).map_or(0.0, |r| r.1.max(0.0));
             (i, columns, positive, alone)
         })
         .filter(|v| v.1.len() <= 2 && v.1.iter().all(|&c| all.independent[c]))
@@ -1109,7 +1152,7 @@ pub fn screen_pairs(
                 }
                 let columns: Vec<usize> = cv.iter().chain(cw).copied().collect();
                 let signs: Vec<bool> = pv.iter().chain(pw).copied().collect();
-                let (c, gain) = all.regress(&columns, &signs)?;
+                let (c, gain) = all.regress(&columns, &signs, RIDGE)?;
                 (gain > gv + gw + PAIR_GAIN).then_some((gain, i, j, c))
             })
         })
@@ -1156,7 +1199,7 @@ pub fn screen_set(
         let tried = open.filter_map(|v| {
             let with: Vec<usize> = chosen.iter().copied().chain([v]).collect();
             let (columns, positive) = columns(&with);
-            Some((v, all.regress(&columns, &positive)?))
+            Some((v, all.regress(&columns, &positive, RIDGE)?))
         });
         let least = best.as_ref().map_or(0.0, |b| b.1);
         let next = tried.filter(|t| t.1.1 > least).max_by(|a, b| a.1.1.total_cmp(&b.1.1).then(b.0.cmp(&a.0)));
@@ -1166,6 +1209,82 @@ pub fn screen_set(
     }
     let (coefficients, gain) = best?;
     all.together(&chosen, &coefficients, gain)
+}
+
+/// A term that a model holds, of one coefficient.
+#[derive(Debug, Clone, Copy)]
+pub(crate) struct Held {
+    /// Which of the candidates it is.
+    pub(crate) candidate: usize,
+    /// Position of its coefficient among the free parameters, and its value.
+    pub(crate) position: usize,
+    pub(crate) value: f64,
+}
+
+/// Of all candidates of one column those that do the work of what is `held` for the least Σ price + RSS, the other free
+/// parameters refitted: each time the best of taking one more, one less, or another for one of them, for as long as that
+/// pays (stepwise selection with exchanges: Miller, *Subset Selection in Regression*, 2002, §3.6). To first order, which is good
+/// where the forces of either choice add up to the same. Prices are in units of the residual's scale. `None`
+/// where what is held is the best, or has no column.
+pub(crate) fn reselect(
+    setup: &Setup,
+    library: &[Mechanism],
+    candidates: &[Candidate],
+    level: &Level,
+    scale: &[f64],
+    point: &Point,
+    held: &[Held],
+    price: &(dyn Fn(&Candidate) -> f64 + Sync),
+) -> Option<Together> {
+    struct Told {
+        cost: f64,
+        coefficients: Vec<f64>,
+        gain: f64,
+    }
+    let (lanes, gram) = responses(setup, library, candidates, level, scale, point);
+    let single = |candidate: usize| {
+        lanes
+            .variants
+            .iter()
+            .position(|v| v.candidate == candidate && v.columns.len() == 1 && v.secant.is_none())
+    };
+    let chosen: Vec<usize> = held.iter().map(|h| single(h.candidate)).collect::<Option<_>>()?;
+    let did: Vec<(usize, f64)> =
+        chosen.iter().zip(held).map(|(&v, h)| (lanes.variants[v].columns.start, h.value)).collect();
+    let gone: Vec<(usize, f64)> = held.iter().map(|h| (h.position, 0.0)).collect();
+    let open: Vec<usize> = (0..candidates.len()).filter_map(single).collect();
+    let all = Regressions::of(library, candidates, lanes, &gram.without(&gone).with_columns(&did));
+    let variants = &all.lanes.variants;
+    let told = |chosen: &[usize]| -> Option<Told> {
+        let columns: Vec<usize> = chosen.iter().map(|&v| variants[v].columns.start).collect();
+        let positive: Vec<bool> = chosen.iter().flat_map(|&v| all.positive(&variants[v])).collect();
+        let (coefficients, gain) = all.regress(&columns, &positive, 1e-12)?;
+        let paid: f64 = chosen.iter().map(|&v| price(&candidates[variants[v].candidate])).sum();
+        Some(Told { cost: paid - gain * all.rr, coefficients, gain })
+    };
+    let mut best = (told(&chosen)?, chosen.clone());
+    loop {
+        let (own, current) = &best;
+        let with = |set: &[usize]| -> Vec<Vec<usize>> {
+            let others = open.iter().filter(|v| !current.contains(v));
+            others.map(|&v| [set, &[v]].concat()).collect()
+        };
+        let mut moves = with(current);
+        for i in 0..current.len() {
+            let less = [&current[..i], &current[i + 1..]].concat();
+            moves.extend(with(&less));
+            moves.push(less);
+        }
+        let tried = moves.into_par_iter().filter_map(|set| Some((told(&set)?, set)));
+        let next = tried.min_by(|a, b| a.0.cost.total_cmp(&b.0.cost).then_with(|| a.1.cmp(&b.1)));
+        match next {
+            Some(next) if next.0.cost < own.cost - 1e-6 => best = next,
+            _ => break,
+        }
+    }
+    let (told, set) = best;
+    let is_same = set.len() == chosen.len() && set.iter().all(|v| chosen.contains(v));
+    if is_same { None } else { all.together(&set, &told.coefficients, told.gain) }
 }
 
 /// First-order shift of the other free parameters when those at these positions go to zero from `values`.
