@@ -6,7 +6,7 @@
 //! stands in the piece, and its bounds in the file. Nothing is random but for fixed seeds.
 
 mod algorithm2;
-mod chapter2;
+pub(crate) mod chapter2;
 mod chapter3;
 mod chapter4;
 mod delayed;
@@ -16,7 +16,7 @@ pub(crate) mod figure;
 mod fixture;
 mod index;
 mod joint;
-mod link;
+pub(crate) mod link;
 mod optimal;
 mod sliding;
 mod story;

@@ -3,6 +3,8 @@
 //! Every case makes recordings from a seed, identifies, and compares with the equation that made them. The
 //! rigs integrate on their own and know nothing of the model language.
 
+mod nominal;
+
 use anyhow::{Context, Result};
 use greybox_identify::{
     DelayedState, FoundEquation, Identification, Library, Monomials, Options, Quiet, identify,
@@ -311,7 +313,7 @@ fn doubt_figure(trials: &[Trial]) -> Figure {
 type CaseFn = fn(&[u64]) -> Result<Vec<Figure>>;
 
 /// Name, seeds of the full proof, what to do.
-const CASES: [(&str, usize, CaseFn); 14] = [
+const CASES: [(&str, usize, CaseFn); 15] = [
     ("duffing, thesis set-up, 60 s", 100, thesis_case),
     ("peers' protocol, 1 ms, 0.01", 100, |s| peers_case(s, 0.001, 0.01, 99)),
     ("peers' protocol, 1 ms, 0.05", 100, |s| peers_case(s, 0.001, 0.05, 97)),
@@ -321,6 +323,7 @@ const CASES: [(&str, usize, CaseFn); 14] = [
     ("peers' protocol, 10 ms, no noise", 20, |s| peers_case(s, 0.01, 0.0, 20)),
     ("intervals, 10 ms, 0.01", 400, interval_case),
     ("flexible link, dithered", 20, link_case),
+    ("flexible link, from its nominal model", 20, nominal::case),
     ("delayed duffing, 20 s, kp known", 30, |s| delayed_case(s, 20.0, Some(2.0), Some((0.7, 2.2)))),
     ("delayed duffing, 60 s, kp known", 30, |s| delayed_case(s, 60.0, Some(2.0), Some((0.35, 1.2)))),
     ("delayed duffing, 20 s, kp free", 30, |s| delayed_case(s, 20.0, None, None)),
