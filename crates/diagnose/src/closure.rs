@@ -21,12 +21,11 @@ use greybox_calibrate::{Point, Setup, Work};
 use rayon::prelude::*;
 
 use crate::candidate::Candidate;
-use crate::diagnosis::MISFIT;
 use crate::evidence::{Evidence, least_kappa, price};
 use crate::place::own_coordinates;
 use crate::screen::{Held, Scored, Together, reselect, screen, screen_set, shift_without};
 use crate::search::{
-    Accepted, Fitted, Found, MOST_SAMPLES, Part, SAME_HOLD, Search, UNDECIDED, WHITE, laws, limits,
+    Accepted, Fitted, Found, Law, MISFIT, MOST_SAMPLES, SAME_HOLD, Search, UNDECIDED, WHITE, laws, limits,
     next_scale, odds, same_level, whole,
 };
 use crate::turns::Turns;
@@ -99,21 +98,22 @@ impl Search<'_> {
                 let settled = |more: Option<Fitted>, terms: &[Candidate]| {
                     self.settled(&current, more?, odds(terms.len()), &scale).filter(is_new)
                 };
-                let more = (!is_spent() && leaves_something(&current, &scale))
-                    .then(|| {
-                        let plain = settled(self.larger(&current, &plain, AT_ONCE, &scale), &plain);
-                        // A law with more to fit is tried where it promises more than they keep.
-                        let kept = plain.as_ref().map_or(0.0, |plain| 1.0 - plain.rss() / current.rss());
-                        let rich = settled(self.with_one(&current, &rich, kept, &scale), &rich);
-                        let told = |model: &Fitted| self.robust(&current, model, &scale);
-                        let both = [plain, rich].into_iter().flatten();
-                        both.max_by(|a, b| told(a).total_cmp(&told(b)))
-                    })
-                    .flatten();
-                // (What leaves more than noise tells no two choices of terms apart.)
-                let reaches = current.misfit(&scale) <= MISFIT;
-                let other =
-                    || reaches.then(|| self.reselected(&current, &plain, &scale)).flatten().filter(is_new);
+                let more = if is_spent() || !leaves_something(&current, &scale) {
+                    None
+                } else {
+                    let plain = settled(self.larger(&current, &plain, AT_ONCE, &scale), &plain);
+                    // A law with more to fit is tried where it promises more than they keep.
+                    let kept = plain.as_ref().map_or(0.0, |plain| 1.0 - plain.rss() / current.rss());
+                    let rich = settled(self.with_one(&current, &rich, kept, &scale), &rich);
+                    let told = |model: &Fitted| self.robust(&current, model, &scale);
+                    let both = [plain, rich].into_iter().flatten();
+                    both.max_by(|a, b| told(a).total_cmp(&told(b)))
+                };
+                // (Where the terms leave a misfit, others do not do their work for less.)
+                let other = || match current.misfit(&scale) <= MISFIT {
+                    true => self.reselected(&current, &plain, &scale).filter(is_new),
+                    false => None,
+                };
                 let Some(next) = more.or_else(other) else { break };
                 // (Another hold may have stood in for what has a term now.)
                 current = self.redecide_holds(&next, &scale, SAME_HOLD);
@@ -235,27 +235,41 @@ impl Search<'_> {
             inflation * (price(parameters, information) + 2.0 * law.surcharge + ranked)
         };
         let together = reselect(setup, self.library, terms, &model.level, scale, point, &held, &price)?;
-        let mut shifted = point.parameters.clone();
-        let others = (0..setup.free.len()).filter(|i| !positions.contains(i)).map(|i| &setup.free[i]);
-        for (f, d) in others.zip(&together.shift) {
-            shifted[f.index] = (shifted[f.index] + d).clamp(f.lower, f.upper);
-        }
-        let is_rich = |part: &&Part| !terms.contains(&part.candidate);
-        let rich: Vec<Part> = model.parts.iter().filter(is_rich).cloned().collect();
-        let mut laws = laws(&rich, &setup.model, &point.parameters);
-        let mut start = shifted[..self.nominal().model.parameters.len()].to_vec();
-        let own = rich.iter().flat_map(|p| &p.instance.names).filter_map(|n| setup.model.parameter(n));
-        start.extend(own.map(|i| shifted[i]));
-        for member in &together.members {
-            laws.push((terms[member.candidate].clone(), member.values.clone(), member.scales.clone()));
-            start.extend(&member.values);
-        }
-        let other = self.reassembled_from(model, &laws, vec![start], scale, STEPS)?;
+        let other = self.exchanged(model, terms, &positions, &together, scale)?;
         // (First order may have promised too much.)
         let cost =
             |model: &Fitted| model.rss() + model.parts.iter().map(|p| price(&p.candidate)).sum::<f64>();
         (cost(&other) < cost(model) && self.admissible(&other, scale))
             .then(|| self.known_alone(other, odds(terms.len()), scale))
+    }
+
+    /// The model with these `terms` in the place of those that it holds of them, whose coefficients have these positions among
+    /// its free parameters, and everything else where it goes with them.
+    fn exchanged(
+        &self,
+        model: &Fitted,
+        terms: &[Candidate],
+        positions: &[usize],
+        together: &Together,
+        scale: &[f64],
+    ) -> Option<Fitted> {
+        let (setup, point) = (&model.setup, &model.fit.point);
+        let mut shifted = point.parameters.clone();
+        let others = (0..setup.free.len()).filter(|i| !positions.contains(i)).map(|i| &setup.free[i]);
+        for (f, d) in others.zip(&together.shift) {
+            shifted[f.index] = (shifted[f.index] + d).clamp(f.lower, f.upper);
+        }
+        let mut kept = model.parts.clone();
+        kept.retain(|part| !terms.contains(&part.candidate));
+        let own = laws(&kept, &setup.model, &shifted);
+        let fresh = together
+            .members
+            .iter()
+            .map(|member| (terms[member.candidate].clone(), member.values.clone(), member.scales.clone()));
+        let parts: Vec<Law> = own.into_iter().chain(fresh).collect();
+        let mut start = shifted[..self.nominal().model.parameters.len()].to_vec();
+        start.extend(parts.iter().flat_map(|law| &law.1));
+        self.reassembled_from(model, &parts, vec![start], scale, STEPS)
     }
 
     /// The model without what the recordings do not tell: as long as the term that they determine least is not worth the

@@ -21,7 +21,8 @@ use crate::locate::{Location, force, locate};
 use crate::place::{Motion, Place};
 use crate::proposal::Proposal;
 use crate::search::{
-    Fitted, Found, MOST_WORK, Part, Rival, Search, UNDECIDED, log_likelihood_gain, raw_rms, raw_rss, rms,
+    Fitted, Found, MISFIT, MOST_WORK, Part, Rival, Search, UNDECIDED, log_likelihood_gain, raw_rms, raw_rss,
+    rms,
 };
 use crate::shapes::Variable;
 use crate::surface::{Surface, held_out};
@@ -1581,11 +1582,10 @@ const EXPLAINED: f64 = 0.5;
 /// Most confidence in a mechanism beside which something unexplained remains, or that may be part of another law.
 const DOUBTED: f64 = 0.8;
 
-/// Residual over noise from which a residual is a misfit, whatever its colour; and from which it is one where
-/// samples hold so little information each that it must be slow.
-pub(crate) const MISFIT: f64 = 1.5;
 /// Residual over the estimated noise below which the estimate was not of noise alone.
 const BELOW_NOISE: f64 = 0.8;
+/// Residual over noise from which a residual is a misfit where samples hold so little information each that it must be
+/// slow.
 const SLOW_MISFIT: f64 = 1.2;
 const SLOW: f64 = 0.05;
 

@@ -978,13 +978,29 @@ pub struct Together {
     pub shift: Vec<f64>,
 }
 
-/// What is added to the size of each column of a set, that of two alike neither grows beyond all bounds.
+/// What is added to the size of each column of a set, that of two alike neither grows beyond all bounds; and where the
+/// columns explain a hundred million times what is left, so that any more would be seen in that.
 const RIDGE: f64 = 1e-6;
+const LEAST_RIDGE: f64 = 1e-12;
 
 /// Least share that a pair must explain, and least surplus over its members alone.
 const PAIR_GAIN: f64 = 0.05;
 
-/// The responses of all candidates and their products with each other.
+/// The columns of all candidates around a fit.
+fn lanes_at(
+    setup: &Setup,
+    library: &[Mechanism],
+    candidates: &[Candidate],
+    level: &Level,
+    scale: &[f64],
+    point: &Point,
+) -> Lanes {
+    let (along, forces) = Along::observed(setup, level, scale, point);
+    let spectra = Spectra::new(setup, level, scale, point, &along, &forces);
+    lanes(setup, library, candidates, &along, &spectra)
+}
+
+/// The same with the products of all responses with each other.
 fn responses(
     setup: &Setup,
     library: &[Mechanism],
@@ -993,9 +1009,7 @@ fn responses(
     scale: &[f64],
     point: &Point,
 ) -> (Lanes, Gram) {
-    let (along, forces) = Along::observed(setup, level, scale, point);
-    let spectra = Spectra::new(setup, level, scale, point, &along, &forces);
-    let lanes = lanes(setup, library, candidates, &along, &spectra);
+    let lanes = lanes_at(setup, library, candidates, level, scale, point);
     let whole = 0..lanes.columns.len();
     let gram = gram(setup, level, scale, point, &lanes.signals, &lanes.columns, vec![whole]);
     (lanes, gram)
@@ -1221,11 +1235,17 @@ pub(crate) struct Held {
     pub(crate) value: f64,
 }
 
-/// Of all candidates of one column those that do the work of what is `held` for the least Σ price + RSS, the other free
-/// parameters refitted: each time the best of taking one more, one less, or another for one of them, for as long as that
-/// pays (stepwise selection with exchanges: Miller, *Subset Selection in Regression*, 2002, §3.6). To first order, which is good
-/// where the forces of either choice add up to the same. Prices are in units of the residual's scale. `None`
-/// where what is held is the best, or has no column.
+/// Which terms do the work of those that are `held` at the least cost:
+///
+/// ```text
+/// min over S of  Σ_{i ∈ S} price(i) + min over c, δ of ‖r + Σ_{held} vⱼ gⱼ − Σ_{i ∈ S} cᵢ gᵢ − J δ‖²
+/// ```
+///
+/// with the residual r over its scale, the responses g of all candidates of one column, the held values v, and the
+/// sensitivities J to all other free parameters. From what is held, each step takes the best of one term more, one less, or
+/// another for one of them, for as long as the cost falls (stepwise selection with exchanges: Miller, *Subset Selection in
+/// Regression*, 2002, §3.6). First order is good here because the forces of either choice add up to about the same.
+/// `None` where what is held costs least, or one of its terms has no column of its own.
 pub(crate) fn reselect(
     setup: &Setup,
     library: &[Mechanism],
@@ -1258,7 +1278,7 @@ pub(crate) fn reselect(
     let told = |chosen: &[usize]| -> Option<Told> {
         let columns: Vec<usize> = chosen.iter().map(|&v| variants[v].columns.start).collect();
         let positive: Vec<bool> = chosen.iter().flat_map(|&v| all.positive(&variants[v])).collect();
-        let (coefficients, gain) = all.regress(&columns, &positive, 1e-12)?;
+        let (coefficients, gain) = all.regress(&columns, &positive, LEAST_RIDGE)?;
         let paid: f64 = chosen.iter().map(|&v| price(&candidates[variants[v].candidate])).sum();
         Some(Told { cost: paid - gain * all.rr, coefficients, gain })
     };
@@ -1278,6 +1298,7 @@ pub(crate) fn reselect(
         let tried = moves.into_par_iter().filter_map(|set| Some((told(&set)?, set)));
         let next = tried.min_by(|a, b| a.0.cost.total_cmp(&b.0.cost).then_with(|| a.1.cmp(&b.1)));
         match next {
+            // (Less is rounding.)
             Some(next) if next.0.cost < own.cost - 1e-6 => best = next,
             _ => break,
         }
@@ -1308,9 +1329,7 @@ pub fn screen(
     scale: &[f64],
     point: &Point,
 ) -> Vec<Scored> {
-    let (along, forces) = Along::observed(setup, level, scale, point);
-    let spectra = Spectra::new(setup, level, scale, point, &along, &forces);
-    let lanes = lanes(setup, library, candidates, &along, &spectra);
+    let lanes = lanes_at(setup, library, candidates, level, scale, point);
     let blocks: Vec<Range<usize>> = lanes.variants.iter().map(|v| v.columns.clone()).collect();
     let gram = gram(setup, level, scale, point, &lanes.signals, &lanes.columns, blocks);
     scored(library, candidates, &lanes, &gram)

@@ -74,6 +74,8 @@ const SHARE_PER_PARAMETER: f64 = 0.05;
 const STEADY: f64 = 2.5;
 /// Fewest samples from which a mechanism with states of its own is looked for.
 const MEMORY_SAMPLES: usize = 200;
+/// Residual over noise from which a residual is a misfit, whatever its colour.
+pub(crate) const MISFIT: f64 = 1.5;
 /// Two explanations whose scores differ by less stay undecided.
 pub const UNDECIDED: f64 = 3.0;
 /// Whitened scores that differ by less are the same.

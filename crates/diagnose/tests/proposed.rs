@@ -1,6 +1,6 @@
 //! What is proposed without a name, and how far it can be trusted.
 
-use greybox_diagnose::diagnosis::Basis;
+use greybox_diagnose::diagnosis::{Basis, Finding};
 use greybox_diagnose::{Options, Quiet, Verdict, diagnose};
 use greybox_model::{Hold, Model, System};
 use greybox_recording::{Channel, Recording};
@@ -108,7 +108,33 @@ fn a_memory_is_told_with_its_equation() {
 fn nothing_is_proposed_where_nothing_is_missing() {
     let model = Model::from_toml(NOMINAL, "nominal.toml").unwrap();
     let (train, held) = ([record(("", ""), [0.0; 2], 1.0, 6)], [record(("", ""), [0.0; 2], 1.0, 7)]);
-    let found = diagnose(&model, &train, &held, &Options::default(), &Quiet).unwrap();
-    assert_eq!(found.verdict, Verdict::Consistent);
-    assert!(found.proposal.is_none() && found.candidates.is_empty());
+    for terms_only in [false, true] {
+        let options = Options { terms_only, ..Options::default() };
+        let found = diagnose(&model, &train, &held, &options, &Quiet).unwrap();
+        assert_eq!((found.verdict, found.terms_only), (Verdict::Consistent, terms_only));
+        assert!(found.proposal.is_none() && found.candidates.is_empty());
+    }
+}
+
+/// What has a name is a term like any other where no name is asked for.
+#[test]
+fn terms_alone_are_never_named() {
+    let model = Model::from_toml(NOMINAL, "nominal.toml").unwrap();
+    let spring = |size, seed| record((" + p*x^3", ""), [300.0, 0.0], size, seed);
+    let (train, held) = ([spring(1.0, 8)], [spring(1.0, 9)]);
+    let found = |terms_only| {
+        diagnose(&model, &train, &held, &Options { terms_only, ..Options::default() }, &Quiet).unwrap()
+    };
+    let named = found(false);
+    assert_eq!((named.verdict, named.basis), (Verdict::MissingPhysics, Basis::Named));
+    let terms = found(true);
+    assert_eq!((terms.verdict, terms.basis), (Verdict::Unexplained, Basis::Proposed));
+    assert!(terms.mechanisms.is_empty());
+    let of = |found: &[Finding]| {
+        let [one] = found else { panic!("{} terms", found.len()) };
+        (one.kind.clone(), one.parameters[0].2.value)
+    };
+    let (told, term) = (of(&named.mechanisms), of(&terms.candidates));
+    assert_eq!((&*told.0, &*term.0), ("cubic_stiffness", "cubic_stiffness"));
+    assert!((term.1 / 300.0 - 1.0).abs() < 0.02 && (told.1 / term.1 - 1.0).abs() < 0.01, "{told:?} {term:?}");
 }

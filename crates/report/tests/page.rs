@@ -128,6 +128,15 @@ fn what_is_proposed_stands_in_a_table_and_in_the_bar() {
     ] {
         assert!(html.contains(text), "the page lacks {text:?}");
     }
+    // Where nobody looked for names.
+    page.report.mechanisms.clear();
+    (page.report.terms_only, page.report.verdict) = (true, Verdict::Unexplained);
+    let html = page.to_html().unwrap();
+    for text in
+        ["greybox identification", "Terms are missing", "no mechanism was looked for", "holds these terms"]
+    {
+        assert!(html.contains(text), "the page lacks {text:?}");
+    }
 }
 
 #[test]

@@ -3,6 +3,7 @@
 use std::path::{Path, PathBuf};
 
 use clap::Args;
+use greybox_commands::diagnose::FILES;
 use greybox_diagnose::Options;
 use greybox_recording::parse_csv;
 
@@ -55,7 +56,8 @@ pub(crate) fn run(arguments: &Arguments) -> Result<Answer, Failure> {
         (Some(folder), Some(path)) => {
             folder.write(&[&results.files(), &embedded[..]].concat())?;
             text.push('\n');
-            text.push_str(&written(path));
+            let [.., improved] = FILES;
+            text.push_str(&written(path, improved));
         }
         _ => text
             .push_str("\nWith `--out DIR` the report, the improved model and the recordings are written.\n"),

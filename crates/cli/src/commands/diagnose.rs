@@ -10,7 +10,7 @@ use greybox_diagnose::Options;
 use greybox_recording::Recording;
 
 use crate::answer::Answer;
-use crate::arguments::{BILLION, ModelStudy, whole};
+use crate::arguments::{BILLION, ModelStudy, Study, whole};
 use crate::case::Subject;
 use crate::failure::Failure;
 use crate::loading::{self, LoadedModel, Mechanisms};
@@ -82,19 +82,37 @@ fn work(arguments: &Arguments) -> Result<Answer, Failure> {
         }
         (_, None) => {}
     }
-    let (loaded, recordings) = arguments.inputs.read()?;
-    let out = arguments.inputs.folder(&FILES)?;
-    out.spares(&FILES, own.iter().flat_map(|own| &own.files))?;
-    let options = arguments.options(own.as_ref());
-    let results = diagnose(&loaded, &recordings.train, &recordings.holdout, &options)?;
-    out.write(&results.files())?;
-    let tried = own.as_ref().map(tried).unwrap_or_default();
-    let text = format!("{}{tried}\n{}", results.story, written(&arguments.inputs.study.out));
-    Ok(Answer::new(text, results.json))
+    let ModelStudy { model, study } = &arguments.inputs;
+    let [.., improved] = FILES;
+    answer(study, model, own.as_ref(), &arguments.options(own.as_ref()), improved)
+}
+
+/// Diagnoses a model on the recordings of a study, with these mechanisms beside the built-in ones, and writes the results,
+/// the improved model under this name.
+///
+/// # Errors
+/// Bad input, of whatever file, and a folder that cannot be written.
+pub(crate) fn answer(
+    study: &Study,
+    model: &PathBuf,
+    own: Option<&Mechanisms>,
+    options: &Options,
+    improved: &'static str,
+) -> Result<Answer, Failure> {
+    let (loaded, recordings) = study.read(model)?;
+    let [json, html, _] = FILES;
+    let inputs = std::iter::once(model).chain(own.iter().flat_map(|own| &own.files));
+    let out = study.folder(&[json, html, improved], inputs)?;
+    let results = diagnose(&loaded, &recordings.train, &recordings.holdout, options)?;
+    let [json, html, (_, text)] = results.files();
+    out.write(&[json, html, (improved, text)])?;
+    let tried = own.map(tried).unwrap_or_default();
+    let told = format!("{}{tried}\n{}", results.story, written(&study.out, improved));
+    Ok(Answer::new(told, results.json))
 }
 
 /// Which mechanisms beside the built-in ones were tried.
-pub(crate) fn tried(own: &Mechanisms) -> String {
+fn tried(own: &Mechanisms) -> String {
     let mut text = String::new();
     for (files, what) in [
         (&own.library.added, "tried beside the built-in mechanisms"),
@@ -107,9 +125,9 @@ pub(crate) fn tried(own: &Mechanisms) -> String {
     text
 }
 
-/// Where the results are.
-pub(crate) fn written(out: &Path) -> String {
-    format!("Written: {0}/report.html, {0}/report.json, {0}/improved.toml\n", out.display())
+/// Where the results are, the model under this name.
+pub(crate) fn written(out: &Path, model: &str) -> String {
+    format!("Written: {0}/report.html, {0}/report.json, {0}/{model}\n", out.display())
 }
 
 /// Diagnoses a model, with a progress bar for those who wait.

@@ -1,6 +1,6 @@
 //! `greybox identify`: the governing equations, from recordings alone.
 
-use std::path::{Path, PathBuf};
+use std::path::PathBuf;
 
 use clap::{Args, ValueEnum};
 use greybox_commands::identify::{FILES, Results};
@@ -11,7 +11,7 @@ use greybox_report::convert::identification::{MODEL_FILE, Sources};
 use crate::answer::Answer;
 use crate::arguments::{BILLION, Recordings, Study, whole};
 use crate::case::Subject;
-use crate::commands::diagnose::{diagnose, tried};
+use crate::commands::diagnose::{self, written};
 use crate::failure::Failure;
 use crate::loading;
 use crate::progress::Progress;
@@ -26,8 +26,8 @@ use crate::progress::Progress;
   greybox identify a_week.csv --states x --inputs f --block 20000 --out found
   greybox identify run1.csv --model link.toml --holdout run2.csv --out found
 
-With --model, its equations are kept: what they lack is identified as a sum of terms (`greybox mechanisms` lists them), of
-which none is believed to have its name, and refitted with its parameters.
+With --model, the equations are kept: the terms that they lack are identified (`greybox mechanisms` lists what is tried)
+and fitted together with the parameters. No mechanism is named.
 
 DIR receives model.toml (runs in `greybox simulate` and `greybox diagnose`), report.json and report.html
 (self-contained, with plots). With no --holdout, the last fifth of each recording is held out. The same seed and
@@ -185,10 +185,7 @@ pub(crate) fn run(arguments: &Arguments) -> Result<Answer, Failure> {
 
 /// The terms that a nominal model lacks.
 fn terms(arguments: &Arguments, model: &PathBuf) -> Result<Answer, Failure> {
-    let study = &arguments.study;
     let own = arguments.mechanisms.as_deref().map(loading::mechanisms).transpose()?;
-    let (loaded, recordings) = study.read(model)?;
-    let out = study.folder(&FILES, [model].into_iter().chain(own.iter().flat_map(|own| &own.files)))?;
     let usual = greybox_diagnose::Options::default();
     let options = greybox_diagnose::Options {
         seed: arguments.seed,
@@ -196,16 +193,7 @@ fn terms(arguments: &Arguments, model: &PathBuf) -> Result<Answer, Failure> {
         work: arguments.work.map_or(usual.work, |work| work.saturating_mul(BILLION)),
         terms_only: true,
     };
-    let results = diagnose(&loaded, &recordings.train, &recordings.holdout, &options)?;
-    let [json, html, (_, improved)] = results.files();
-    out.write(&[json, html, (MODEL_FILE, improved)])?;
-    let tried = own.as_ref().map(tried).unwrap_or_default();
-    Ok(Answer::new(format!("{}{tried}\n{}", results.story, written(&study.out)), results.json))
-}
-
-/// Where the results are.
-fn written(out: &Path) -> String {
-    format!("Written: {0}/report.html, {0}/report.json, {0}/{MODEL_FILE}\n", out.display())
+    diagnose::answer(&arguments.study, model, own.as_ref(), &options, MODEL_FILE)
 }
 
 fn work(arguments: &Arguments) -> Result<Answer, Failure> {
@@ -238,7 +226,7 @@ fn work(arguments: &Arguments) -> Result<Answer, Failure> {
     let results = Results::of(&found, &sources)?;
     drop(progress);
     out.write(&results.files())?;
-    Ok(Answer::new(format!("{}\n{}", results.story, written(&arguments.study.out)), results.json))
+    Ok(Answer::new(format!("{}\n{}", results.story, written(&arguments.study.out, MODEL_FILE)), results.json))
 }
 
 /// The request in the words of the library.

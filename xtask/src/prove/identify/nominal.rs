@@ -3,7 +3,7 @@
 
 use anyhow::{Context, Result, ensure};
 use greybox_diagnose::{Options, Quiet, diagnose};
-use greybox_model::{BinOp, Expr, Func, Model};
+use greybox_model::Model;
 use greybox_simulate::rigs::{LinkRun, RotaryFlexibleLink};
 use nalgebra::{DMatrix, DVector};
 use rand::{RngExt, SeedableRng};
@@ -47,39 +47,17 @@ fn coefficients(model: &Model, equation: &str) -> Option<DVector<f64>> {
     let points: Vec<[f64; 7]> =
         (0..60).map(|_| std::array::from_fn(|_| random.random_range(-1.0..1.0))).collect();
     let design = DMatrix::from_fn(points.len(), MONOMIALS.len(), |i, j| MONOMIALS[j].1(points[i]));
-    let values: Vec<f64> = points.iter().map(|z| value(&residual, model, z)).collect::<Option<_>>()?;
+    let value = |z: &[f64; 7]| {
+        residual.eval(&|name, primes| {
+            let primed = format!("{name}{}", "'".repeat(usize::from(primes)));
+            let parameter = || Some(model.parameters[model.parameter(name)?].value);
+            NAMES.iter().position(|n| *n == primed).map(|at| z[at]).or_else(parameter)
+        })
+    };
+    let values: Vec<f64> = points.iter().map(value).collect::<Option<_>>()?;
     let values = DVector::from(values);
     let found = design.clone().svd(true, true).solve(&values, 0.0).ok()?;
     ((&design * &found - &values).norm() < 1e-9 * values.norm()).then_some(found)
-}
-
-/// The value of an expression at a point; `None` of a name or a function that the link does not have.
-fn value(expr: &Expr, model: &Model, z: &[f64; 7]) -> Option<f64> {
-    let of = |e: &Expr| value(e, model, z);
-    Some(match expr {
-        Expr::Num(number) => *number,
-        Expr::Var { name, primes } => {
-            let primed = format!("{name}{}", "'".repeat(usize::from(*primes)));
-            match (NAMES.iter().position(|n| *n == primed), model.parameter(name)) {
-                (Some(at), _) => z[at],
-                (None, Some(parameter)) => model.parameters[parameter].value,
-                (None, None) => return None,
-            }
-        }
-        Expr::Neg(a) => -of(a)?,
-        Expr::Bin(operator, a, b) => {
-            let (a, b) = (of(a)?, of(b)?);
-            match operator {
-                BinOp::Add => a + b,
-                BinOp::Sub => a - b,
-                BinOp::Mul => a * b,
-                BinOp::Div => a / b,
-                BinOp::Pow => a.powf(b),
-            }
-        }
-        Expr::Call(Func::Sign, arguments) => of(arguments.first()?)?.signum(),
-        Expr::Call(..) => return None,
-    })
 }
 
 /// One seed's result.
@@ -115,13 +93,14 @@ impl Trial {
 
 /// The errors of the closed loop, of equations in the form of the thesis: θ″ eliminated from the second.
 fn closed_loop(hub: &DVector<f64>, link: &DVector<f64>, truth: &LinkRun) -> Result<Option<[f64; 2]>> {
-    let volts = -hub[MONOMIALS.len() - 1];
-    let balances = [hub / volts, (hub - link * (hub[0] / link[0])) / volts];
-    if balances[0][1].abs() > 1e-9 * balances[0].norm() {
+    let [theta_accelerates, alpha_accelerates, volts] = [0, 1, MONOMIALS.len() - 1];
+    let eliminated = hub - link * (hub[theta_accelerates] / link[theta_accelerates]);
+    let balances = [hub / -hub[volts], eliminated / -hub[volts]];
+    if balances[0][alpha_accelerates].abs() > 1e-9 * balances[0].norm() {
         return Ok(None);
     }
     let terms = balances.map(|balance| -> Terms {
-        let named = MONOMIALS.iter().zip(balance.iter()).take(MONOMIALS.len() - 1);
+        let named = MONOMIALS.iter().zip(balance.iter()).take(volts);
         let own = named.filter(|(_, value)| value.abs() > 1e-12);
         own.map(|(monomial, value)| (monomial.0.to_owned(), *value)).collect()
     });
