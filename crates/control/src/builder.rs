@@ -193,7 +193,7 @@ impl<'a> Builder<'a> {
                         !known || *primes > 0
                     }
                 },
-                Expr::Call(f, args) => args.len() != f.arity(),
+                Expr::Call(f, args) => !f.takes(args),
                 _ => false,
             };
             if fault && wrong.is_none() {

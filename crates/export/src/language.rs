@@ -115,6 +115,7 @@ const TAKEN: &[&str] = &[
     "sign",
     "deadzone",
     "saturate",
+    "table",
     "smaller",
     "larger",
     "j0",
@@ -240,6 +241,11 @@ impl Writer<'_> {
                 "static double saturate(double x, double limit) { return x > limit ? limit : x < -limit ? -limit : x; }",
                 "fn saturate(x: f64, limit: f64) -> f64 {\n    if x > limit { limit } else if x < -limit { -limit } else { x }\n}",
             ),
+            (
+                Func::Table,
+                "static double table(int n, double x, const double knots[], const double values[]) {\n    int i = 1;\n    if (x <= knots[0]) return values[0];\n    if (x >= knots[n - 1]) return values[n - 1];\n    while (i < n - 1 && x >= knots[i]) i++;\n    return values[i - 1] + (values[i] - values[i - 1]) / (knots[i] - knots[i - 1]) * (x - knots[i - 1]);\n}",
+                "fn table<const N: usize>(x: f64, knots: [f64; N], values: [f64; N]) -> f64 {\n    if x <= knots[0] {\n        return values[0];\n    }\n    if x >= knots[N - 1] {\n        return values[N - 1];\n    }\n    let mut i = 1;\n    while i < N - 1 && x >= knots[i] {\n        i += 1;\n    }\n    values[i - 1] + (values[i] - values[i - 1]) / (knots[i] - knots[i - 1]) * (x - knots[i - 1])\n}",
+            ),
         ];
         for (_, c, rust) in helpers.iter().filter(|h| self.graph.calls(h.0)) {
             let text = if self.language == Language::C99 { c } else { rust };
@@ -357,8 +363,23 @@ impl Writer<'_> {
             },
             Node::Call(f, args) => {
                 let args: Vec<String> = args.iter().map(|a| self.text(*a, 0)).collect();
+                if *f == Func::Table {
+                    return self.table(&args);
+                }
                 format!("{}({})", self.call(*f), args.join(", "))
             }
+        }
+    }
+
+    /// The argument, the knots and the values of a table.
+    fn table(&self, args: &[String]) -> String {
+        let n = args.len() / 2;
+        let (knots, values) = (args[1..=n].join(", "), args[n + 1..].join(", "));
+        match self.language {
+            Language::C99 => {
+                format!("table({n}, {}, (const double[]){{{knots}}}, (const double[]){{{values}}})", args[0])
+            }
+            Language::Rust => format!("table({}, [{knots}], [{values}])", args[0]),
         }
     }
 
@@ -378,6 +399,7 @@ impl Writer<'_> {
             Func::Max => ("larger", "larger"),
             Func::Deadzone => ("deadzone", "deadzone"),
             Func::Saturate => ("saturate", "saturate"),
+            Func::Table => ("table", "table"),
             // Refused before.
             Func::Delay => ("delay", "delay"),
             Func::Step => ("step", "step"),

@@ -195,6 +195,10 @@ fn meanings(model: &Model) -> Vec<String> {
             Func::Step,
             r"\operatorname{step}(t, t_0) &= \begin{cases} 0 & t < t_0 \\ 1 & t \ge t_0 \end{cases}",
         ),
+        (
+            Func::Table,
+            r"\operatorname{table}(x; k\; v) &: \text{ linear between the values } v \text{ at the knots } k, \text{ held beyond them}",
+        ),
     ];
     known.into_iter().filter(|(f, _)| uses(*f)).map(|(_, text)| text.to_owned()).collect()
 }
@@ -284,6 +288,16 @@ fn call(f: Func, arguments: &[Expr]) -> String {
         Func::Deadzone => "\\operatorname{deadzone}",
         Func::Saturate => "\\operatorname{sat}",
         Func::Step => "\\operatorname{step}",
+        Func::Table => {
+            let (knots, values) = inner[1..].split_at(inner.len() / 2);
+            let pair = |(k, v): (&String, &String)| format!("{k} & {v}");
+            let rows: Vec<String> = knots.iter().zip(values).map(pair).collect();
+            let rows = rows.join(" \\\\ ");
+            return format!(
+                "\\operatorname{{table}}\\left({};\\; \\begin{{smallmatrix}} {rows} \\end{{smallmatrix}}\\right)",
+                inner[0]
+            );
+        }
     };
     format!("{name}\\left({}\\right)", inner.join(", "))
 }

@@ -186,7 +186,7 @@ pub fn modelica(model: &Model) -> Result<String, ExportError> {
     }
     let outputs: Vec<String> =
         model.measurements.iter().map(|m| names.fresh(&format!("y_{}", ascii(&m.channel)))).collect();
-    let mut writer = Text { names: &names, model, signs: false };
+    let mut writer = Text { names: &names, model, signs: false, tables: false };
     let mut equations = String::new();
     for s in &model.states {
         for primes in 1..s.order as u8 {
@@ -236,15 +236,38 @@ pub fn modelica(model: &Model) -> Result<String, ExportError> {
         let _ =
             writeln!(out, "  output Real {own}{} {};", attributes(unit(&m.unit), &[]), string(&m.channel));
     }
+    if writer.tables {
+        out.push_str(TABLE);
+    }
     let _ = write!(out, "equation\n{equations}end {class};\n");
     Ok(out)
 }
+
+/// The function that stands for a `table` of the model language.
+const TABLE: &str = r#"protected
+  function table "Linear between the knots, held beyond the first and the last"
+    input Real x;
+    input Real knots[:];
+    input Real values[size(knots, 1)];
+    output Real y;
+  protected
+    Integer i = 1;
+  algorithm
+    while i < size(knots, 1) - 1 and x >= knots[i + 1] loop
+      i := i + 1;
+    end while;
+    y := values[i] + (values[i + 1] - values[i])/(knots[i + 1] - knots[i])
+      *(max(knots[1], min(knots[end], x)) - knots[i]);
+  end table;
+"#;
 
 struct Text<'a> {
     names: &'a Names,
     model: &'a Model,
     /// Whether a `sign` was written.
     signs: bool,
+    /// Whether a `table` was written.
+    tables: bool,
 }
 
 impl Dialect for Text<'_> {
@@ -279,6 +302,12 @@ impl Dialect for Text<'_> {
             }
             Func::Saturate => return format!("(if {a} > {b} then {b} elseif {a} < -{b} then -{b} else {a})"),
             Func::Step => return format!("(if {a} < {b} then 0 else 1)"),
+            Func::Table => {
+                self.tables = true;
+                let n = written.len() / 2;
+                let (knots, values) = (written[1..=n].join(", "), written[n + 1..].join(", "));
+                return format!("table({a}, {{{knots}}}, {{{values}}})");
+            }
             Func::Ln => "log",
             // Modelica's own, with its events.
             _ => function.name(),

@@ -134,6 +134,12 @@ impl Dialect for Text<'_> {
             Func::Sign => "_sign",
             Func::Deadzone => "_deadzone",
             Func::Saturate => "_saturate",
+            Func::Table => {
+                let written: Vec<String> = arguments.iter().map(|a| text(a, self)).collect();
+                let n = written.len() / 2;
+                let (knots, values) = (written[1..=n].join(", "), written[n + 1..].join(", "));
+                return format!("_table({}, ({knots}), ({values}))", written[0]);
+            }
             Func::Step | Func::Delay => "_step",
         };
         format!("{name}({written})")

@@ -40,7 +40,7 @@ fn function(outputs: &[&str]) -> Function {
 const OUTPUTS: [&str; 9] = [
     "saturate(k*(target - q) - q'/(1 + q^2) - (q - (z - q')), 4)",
     "sin(q)*cos(q') + tan(0.1*z) - exp(-q^2)*ln(2 + z^2)/sqrt(1 + q'^2)",
-    "tanh(q'/0.05) + atan(3*q) + abs(q) + sign(q') + min(q, z) - max(q', z) + deadzone(q, 0.2)",
+    "tanh(q'/0.05) + atan(3*q) + abs(q) + sign(q') + min(q, z) - max(q', z) + deadzone(q, 0.2) + table(q, [-1, 0.2, 1.5], [2, z, -k*q'])",
     "q - (q' - (z - target)) - q/((q' + 5)/(2 + z^2))",
     "-q^2 + (-q)^2 + (-q)^3 - 2^q + (3 + q)^-2 + (5 + q)^0.5 + q^0",
     "φ*double + x*t0 + pi",

@@ -1,6 +1,7 @@
 //! Symbolic algebra: simplify, differentiate, substitute, evaluate, split off linear unknowns.
 
 use crate::expr::{BinOp, Expr, Func};
+use crate::table::{Table, interpolate};
 use std::f64::consts::PI;
 use std::sync::Arc;
 
@@ -18,7 +19,7 @@ impl Expr {
     /// simplified; every other symbol (so also `theta'` for `theta`) counts as constant.
     ///
     /// It is the derivative of what [`Expr::eval`] computes, wherever that has one: `abs` gives
-    /// `sign`; `min`, `max`, `deadzone` and `saturate` give switches made of `sign`, with the mean of
+    /// `sign`; `min`, `max`, `deadzone`, `saturate` and `table` give switches made of `sign`, with the mean of
     /// both sides on the kink; `sign` and `step` give zero. `delay(x, tau)` gives
     /// `delay(∂x, tau)`: the delay is linear in its argument; the dependence on a symbol inside
     /// `tau` is *not* part of it (that needs the history of x).
@@ -70,6 +71,11 @@ impl Expr {
             Expr::Var { name, primes } => value_of(name, *primes)?,
             Expr::Neg(a) => -a.eval(value_of)?,
             Expr::Bin(op, a, b) => apply(*op, a.eval(value_of)?, b.eval(value_of)?),
+            Expr::Call(Func::Table, args) => {
+                let table = Table::of(args)?;
+                let values: Option<Vec<f64>> = table.values.iter().map(|v| v.eval(value_of)).collect();
+                interpolate(&table.knots, &values?, table.x.eval(value_of)?)
+            }
             Expr::Call(f, args) => match args.as_slice() {
                 [a] => call(*f, a.eval(value_of)?, 0.0),
                 [a, b] => call(*f, a.eval(value_of)?, b.eval(value_of)?),
@@ -150,7 +156,7 @@ fn apply(op: BinOp, a: f64, b: f64) -> f64 {
     }
 }
 
-/// `b` is ignored by functions of one argument.
+/// `b` is ignored by functions of one argument; a table has more than two.
 fn call(f: Func, a: f64, b: f64) -> f64 {
     match f {
         Func::Sin => a.sin(),
@@ -172,6 +178,7 @@ fn call(f: Func, a: f64, b: f64) -> f64 {
         Func::Deadzone => 0.0,
         Func::Saturate => a.max(-b).min(b),
         Func::Step => f64::from(u8::from(a >= b)),
+        Func::Table => f64::NAN,
     }
 }
 
@@ -234,6 +241,13 @@ fn simplify_binary(op: BinOp, a: Expr, b: Expr) -> Expr {
 }
 
 fn simplify_call(f: Func, args: Vec<Expr>) -> Expr {
+    if f == Func::Table {
+        let call = Expr::Call(f, args);
+        return match call.constant() {
+            Some(value) if value.is_finite() && !has_variables(&call) => Expr::Num(value),
+            _ => call,
+        };
+    }
     let numbers: Option<Vec<f64>> =
         args.iter().map(|a| if let Expr::Num(v) = a { Some(*v) } else { None }).collect();
     if let Some(v) = numbers
@@ -253,6 +267,10 @@ fn simplify_call(f: Func, args: Vec<Expr>) -> Expr {
         (Func::Abs, [Expr::Neg(a)]) => Expr::Call(f, vec![(**a).clone()]),
         _ => Expr::Call(f, args),
     }
+}
+
+fn has_variables(e: &Expr) -> bool {
+    !e.variables().is_empty()
 }
 
 fn add(a: Expr, b: Expr) -> Expr {
@@ -317,7 +335,40 @@ fn differentiate(e: &Expr, seed: &dyn Fn(&str, u8) -> Option<Expr>) -> Option<Ex
     result.filter(|e| !is(e, 0.0))
 }
 
+/// Of a table: its slope at x times dx, and the table of the derivatives of its values.
+fn differentiate_table(args: &[Expr], d: &dyn Fn(&Expr) -> Option<Expr>) -> Option<Expr> {
+    let Table { x, knots, values } = Table::of(args)?;
+    let x = x.simplify();
+    let by_x = d(&x).map(|dx| {
+        let n = knots.len();
+        let simple: Vec<Expr> = values.iter().map(Expr::simplify).collect();
+        let slope = |i: usize| {
+            let rise = sub(simple[i + 1].clone(), simple[i].clone());
+            div(rise, Expr::Num(knots[i + 1] - knots[i]))
+        };
+        let mut sum = ZERO;
+        for (i, knot) in knots.iter().enumerate() {
+            let before = if i > 0 { slope(i - 1) } else { ZERO };
+            let after = if i + 1 < n { slope(i) } else { ZERO };
+            sum = add(sum, mul(sub(after, before), switch(sub(x.clone(), Expr::Num(*knot)))));
+        }
+        mul(sum, dx)
+    });
+    let slopes: Vec<Option<Expr>> = values.iter().map(d).collect();
+    let by_values = slopes.iter().any(Option::is_some).then(|| {
+        let slopes = slopes.into_iter().map(|s| s.unwrap_or(ZERO)).collect();
+        simplify_node(Table::call(x, &knots, slopes))
+    });
+    match (by_x, by_values) {
+        (Some(a), Some(b)) => Some(add(a, b)),
+        (a, b) => a.or(b),
+    }
+}
+
 fn differentiate_call(f: Func, args: &[Expr], d: &dyn Fn(&Expr) -> Option<Expr>) -> Option<Expr> {
+    if f == Func::Table {
+        return differentiate_table(args, d);
+    }
     let (a, b) = match args {
         [a] => (a, None),
         [a, b] => (a, Some(b)),

@@ -260,6 +260,11 @@ impl<'a> Checker<'a> {
                 self.need(e, t0, Dimension::TIME, "the second argument of `step`", place)?;
                 Ok(none)
             }
+            (Func::Table, [x, rest @ ..]) => {
+                self.need(e, x, Dimension::NONE, "the first argument of `table`", place)?;
+                let values: Vec<&Expr> = rest[rest.len() / 2..].iter().collect();
+                self.shared(&values, place)
+            }
             // The parser lets no other number of arguments through.
             _ => Ok(none),
         }

@@ -1,6 +1,6 @@
 //! Printing expressions in the model language, with the fewest parentheses that keep the tree.
 
-use crate::expr::{BinOp, Expr};
+use crate::expr::{BinOp, Expr, Func};
 use crate::model::Equation;
 use std::fmt;
 
@@ -91,13 +91,29 @@ fn write(e: &Expr, needed: Tightness, f: &mut fmt::Formatter<'_>) -> fmt::Result
         Expr::Call(function, args) => {
             f.write_str(function.name())?;
             f.write_str("(")?;
-            for (i, a) in args.iter().enumerate() {
-                f.write_str(if i > 0 { ", " } else { "" })?;
-                write(a, Loose, f)?;
+            match (function, args.split_first()) {
+                (Func::Table, Some((x, rest))) => {
+                    write(x, Loose, f)?;
+                    let (knots, values) = rest.split_at(rest.len() / 2);
+                    for list in [knots, values] {
+                        f.write_str(", [")?;
+                        separated(list, f)?;
+                        f.write_str("]")?;
+                    }
+                }
+                _ => separated(args, f)?,
             }
             f.write_str(")")
         }
     }
+}
+
+fn separated(all: &[Expr], f: &mut fmt::Formatter<'_>) -> fmt::Result {
+    for (i, e) in all.iter().enumerate() {
+        f.write_str(if i > 0 { ", " } else { "" })?;
+        write(e, Tightness::Loose, f)?;
+    }
+    Ok(())
 }
 
 /// The shortest decimal that reads back as the same number.

@@ -22,7 +22,7 @@ pub enum Expr {
     Neg(Box<Expr>),
     /// `a op b`
     Bin(BinOp, Box<Expr>, Box<Expr>),
-    /// `f(a, …)` with [`Func::arity`] arguments.
+    /// `f(a, …)` with as many arguments as [`Func::takes`].
     Call(Func, Vec<Expr>),
 }
 
@@ -76,13 +76,16 @@ pub enum Func {
     Saturate,
     /// `step(t, t0)`: 0 for t < t0, 1 for t ≥ t0.
     Step,
+    /// `table(x, [k1, …, kn], [v1, …, vn])`: linear between the knots, held beyond the first and the last; its arguments are
+    /// x, the knots (increasing numbers) and the values, in this order. See [`Table`](crate::Table).
+    Table,
 }
 
 impl Func {
     /// Every function of the language.
-    pub const ALL: [Func; 16] = {
+    pub const ALL: [Func; 17] = {
         use Func::*;
-        [Sin, Cos, Tan, Exp, Ln, Sqrt, Tanh, Atan, Abs, Sign, Min, Max, Delay, Deadzone, Saturate, Step]
+        [Sin, Cos, Tan, Exp, Ln, Sqrt, Tanh, Atan, Abs, Sign, Min, Max, Delay, Deadzone, Saturate, Step, Table]
     };
 
     /// The function of this name in the model language.
@@ -105,6 +108,7 @@ impl Func {
             "deadzone" => Deadzone,
             "saturate" => Saturate,
             "step" => Step,
+            "table" => Table,
             _ => return None,
         })
     }
@@ -129,15 +133,25 @@ impl Func {
             Deadzone => "deadzone",
             Saturate => "saturate",
             Step => "step",
+            Table => "table",
         }
     }
 
-    /// Number of arguments.
-    pub fn arity(self) -> usize {
+    /// Number of arguments; `None` where it varies (a table of n knots has 1 + 2n).
+    pub fn arity(self) -> Option<usize> {
         use Func::*;
         match self {
-            Sin | Cos | Tan | Exp | Ln | Sqrt | Tanh | Atan | Abs | Sign => 1,
-            Min | Max | Delay | Deadzone | Saturate | Step => 2,
+            Sin | Cos | Tan | Exp | Ln | Sqrt | Tanh | Atan | Abs | Sign => Some(1),
+            Min | Max | Delay | Deadzone | Saturate | Step => Some(2),
+            Table => None,
+        }
+    }
+
+    /// Whether these may be its arguments: as many as it takes, and knots that are increasing numbers.
+    pub fn takes(self, args: &[Expr]) -> bool {
+        match self.arity() {
+            Some(arity) => args.len() == arity,
+            None => crate::Table::of(args).is_some(),
         }
     }
 }

@@ -7,6 +7,7 @@
 //!            | "-" expression | "+" expression
 //!            | expression "^" expression              right associative
 //!            | number | name primes | function "(" expression {"," expression} ")"
+//!            | "table" "(" expression "," "[" number {"," number} "]" "," "[" expression {"," expression} "]" ")"
 //!            | "(" expression ")"
 //! number     = digits ["." digits] [("e" | "E") ["+" | "-"] digits] | "." digits …
 //! name       = letter {letter | digit | "_"}          letters of any alphabet
@@ -18,6 +19,7 @@
 
 use crate::expr::{BinOp, Expr, Func};
 use crate::nearest::nearest;
+use crate::table::MAX_KNOTS;
 use std::ops::Range;
 use std::sync::Arc;
 
@@ -170,6 +172,8 @@ enum Kind {
     Op(BinOp),
     Open,
     Close,
+    OpenList,
+    CloseList,
     Comma,
     Equals,
     End,
@@ -206,6 +210,8 @@ fn lex(text: &str) -> Result<Vec<Token>, SyntaxError> {
             '^' => (Kind::Op(BinOp::Pow), 1),
             '(' => (Kind::Open, 1),
             ')' => (Kind::Close, 1),
+            '[' => (Kind::OpenList, 1),
+            ']' => (Kind::CloseList, 1),
             ',' => (Kind::Comma, 1),
             '=' => (Kind::Equals, 1),
             '0'..='9' | '.' => {
@@ -307,8 +313,8 @@ fn stray(c: char, start: usize, rest: &str, text: &str, last: Option<&Token>) ->
         '\u{2033}' | '"' => "write two primes as `''`",
         '\u{b2}' => "write `^2`",
         '\u{b3}' => "write `^3`",
-        '[' | '{' => "write `(`",
-        ']' | '}' => "write `)`",
+        '{' => "write `(`",
+        '}' => "write `)`",
         ';' => "arguments are separated by `,`; equations stand one per key",
         '<' | '>' | '!' | '&' | '?' => {
             "the language has no conditions; use `max`, `min`, `sign`, `deadzone` or `step`"
@@ -470,10 +476,14 @@ impl<'a> Parser<'a> {
             ),
             _ => {
                 let found = self.shown(token);
+                let help = match token.kind {
+                    Kind::OpenList => NO_LIST,
+                    _ => "write what is missing here, or remove the operator before it",
+                };
                 Err(error(
                     token.span.clone(),
                     format!("found {found}, expected a number, a name or `(`"),
-                    Some("write what is missing here, or remove the operator before it".into()),
+                    Some(help.into()),
                 ))
             }
         }
@@ -518,6 +528,9 @@ impl<'a> Parser<'a> {
 
     fn call(&mut self, f: Func, token: &Token) -> Result<Node, SyntaxError> {
         let open = self.advance();
+        if f == Func::Table {
+            return self.table(token, open);
+        }
         let (mut args, mut depth) = (Vec::new(), 0);
         let close = if self.peek().kind == Kind::Close {
             self.advance()
@@ -536,15 +549,101 @@ impl<'a> Parser<'a> {
             }
         };
         let span = token.span.start..close.span.end;
-        if args.len() != f.arity() {
-            let plural = if f.arity() == 1 { "argument" } else { "arguments" };
+        if let Some(arity) = f.arity()
+            && arity != args.len()
+        {
+            let plural = if arity == 1 { "argument" } else { "arguments" };
             return Err(error(
                 span,
-                format!("`{}` takes {} {plural}, found {}", f.name(), f.arity(), args.len()),
+                format!("`{}` takes {arity} {plural}, found {}", f.name(), args.len()),
                 Some(format!("write `{}`", usage(f))),
             ));
         }
         self.node(Expr::Call(f, args), span, depth + 1)
+    }
+
+    /// `x, [knots], [values])` of a table, after its `(`.
+    fn table(&mut self, token: &Token, open: &Token) -> Result<Node, SyntaxError> {
+        let x = self.expression(0)?;
+        let after = self.advance();
+        if after.kind != Kind::Comma {
+            return Err(self.no_table(open, after));
+        }
+        let (first, knots) = self.list()?;
+        let after = self.advance();
+        if after.kind != Kind::Comma {
+            return Err(self.no_table(open, after));
+        }
+        let (second, values) = self.list()?;
+        let close = self.advance();
+        if close.kind != Kind::Close {
+            return Err(self.no_table(open, close));
+        }
+        let fault = |span: Range<usize>, message: String, help: &str| Err(error(span, message, Some(help.into())));
+        if let Some(knot) = knots.iter().find(|k| !matches!(k.expr, Expr::Num(_))) {
+            let found = &self.text[knot.span.clone()];
+            let help = "divide the first argument by a parameter of its unit, and write the knots as fractions of it";
+            return fault(knot.span.clone(), format!("found `{found}`, expected a knot: a number"), help);
+        }
+        let number = |k: &Node| if let Expr::Num(v) = k.expr { v } else { f64::NAN };
+        if let Some(pair) = knots.windows(2).find(|pair| number(&pair[0]) >= number(&pair[1])) {
+            let found = &self.text[pair[1].span.clone()];
+            let message = format!("the knot `{found}` is not larger than the one before it");
+            return fault(pair[1].span.clone(), message, "knots stand in increasing order, each once");
+        }
+        let n = knots.len();
+        if !(2..=MAX_KNOTS).contains(&n) {
+            let message = format!("a table has 2 to {MAX_KNOTS} knots, found {n}");
+            return fault(first, message, "write the knots as `[k1, k2, …]`");
+        }
+        if n != values.len() {
+            let message = format!("{n} knots, but {} values", values.len());
+            return fault(second, message, "write one value for each knot");
+        }
+        let depth = knots.iter().chain(&values).fold(x.depth, |depth, e| depth.max(e.depth));
+        let args: Vec<Expr> = std::iter::once(x).chain(knots).chain(values).map(|node| node.expr).collect();
+        let span = token.span.start..close.span.end;
+        if !Func::Table.takes(&args) {
+            return fault(span, "the knots reach too far".into(), "their range has to stay below 1.7e308");
+        }
+        self.node(Expr::Call(Func::Table, args), span, depth + 1)
+    }
+
+    /// `[a, b, …]`, with the range of its text.
+    fn list(&mut self) -> Result<(Range<usize>, Vec<Node>), SyntaxError> {
+        let open = self.advance();
+        if open.kind != Kind::OpenList {
+            return Err(self.no_table(open, open));
+        }
+        let mut all = Vec::new();
+        loop {
+            let item = self.expression(0)?;
+            let after = self.advance();
+            match after.kind {
+                Kind::Comma => all.push(item),
+                Kind::CloseList => {
+                    all.push(item);
+                    return Ok((open.span.start..after.span.end, all));
+                }
+                Kind::End => {
+                    let help = Some("add the missing `]`".into());
+                    return Err(error(open.span.clone(), "this `[` is never closed", help));
+                }
+                _ => {
+                    self.position -= 1;
+                    return Err(self.unexpected_after(&item));
+                }
+            }
+        }
+    }
+
+    /// The error for a `found` that is not what a table has there.
+    fn no_table(&self, open: &Token, found: &Token) -> SyntaxError {
+        if found.kind == Kind::End {
+            return error(open.span.clone(), "this `(` is never closed", Some("add the missing `)`".into()));
+        }
+        let message = format!("found {}, which is not what a table has there", self.shown(found));
+        error(found.span.clone(), message, Some(format!("write `{}`", usage(Func::Table))))
     }
 
     /// The error for `next` where the parenthesis `open` should close after `inner`.
@@ -582,6 +681,8 @@ impl<'a> Parser<'a> {
                 Some(format!("write `{left}*{}`", &self.text[token.span.clone()]))
             }
             Kind::Close => Some("remove it, or add the missing `(`".into()),
+            Kind::OpenList => Some(NO_LIST.into()),
+            Kind::CloseList => Some("remove it, or add the missing `[`".into()),
             Kind::Comma => Some("decimals are written with `.`".into()),
             _ => None,
         };
@@ -591,6 +692,8 @@ impl<'a> Parser<'a> {
     }
 }
 
+const NO_LIST: &str = "write `(`; only a `table` has lists";
+
 /// How a call of `f` is written.
 fn usage(f: Func) -> String {
     let args = match f {
@@ -599,6 +702,7 @@ fn usage(f: Func) -> String {
         Func::Saturate => "x, limit",
         Func::Step => "t, t0",
         Func::Min | Func::Max => "a, b",
+        Func::Table => "x, [k1, k2], [v1, v2]",
         _ => "x",
     };
     format!("{}({args})", f.name())

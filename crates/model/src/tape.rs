@@ -19,6 +19,7 @@ use code::Code;
 pub use tangents::Tangents;
 
 use crate::expr::{BinOp, Expr, Func};
+use crate::table::Table;
 
 mod code;
 mod tangents;
@@ -469,6 +470,7 @@ impl<'a> Compiler<'a> {
                 self.delay_exprs.push((arg, tau));
                 leaf
             }
+            Expr::Call(Func::Table, args) => self.table(args)?,
             Expr::Call(f, args) => {
                 let a = self.add(&args[0])?;
                 match f {
@@ -496,10 +498,39 @@ impl<'a> Compiler<'a> {
                         };
                         self.switch(kind, a, b)
                     }
-                    Func::Delay => unreachable!("handled above"),
+                    Func::Delay | Func::Table => unreachable!("handled above"),
                 }
             }
         })
+    }
+
+    /// A table by its kinks (see [`Table`]); what depends on its values alone is done once per simulation.
+    fn table(&mut self, args: &[Expr]) -> Result<Reg, UnknownName> {
+        let Some(Table { x, knots, values }) = Table::of(args) else { return Ok(self.constant(f64::NAN)) };
+        let x = self.add(x)?;
+        let values = values.iter().map(|v| self.add(v)).collect::<Result<Vec<_>, _>>()?;
+        let knot: Vec<Reg> = knots.iter().map(|k| self.constant(*k)).collect();
+        let from_first = self.switch(SwitchKind::Max, x, knot[0]);
+        let held = self.switch(SwitchKind::Min, from_first, knot[knot.len() - 1]);
+        let zero = self.constant(0.0);
+        let (mut sum, mut before) = (values[0], None);
+        for i in 0..knots.len() - 1 {
+            let rise = self.push(Op::Sub(values[i + 1], values[i]), &[values[i + 1], values[i]]);
+            let run = self.constant(knots[i + 1] - knots[i]);
+            let slope = self.push(Op::Div(rise, run), &[rise, run]);
+            let beyond = self.push(Op::Sub(held, knot[i]), &[held, knot[i]]);
+            let (weight, part) = match before {
+                None => (slope, beyond),
+                Some(before) => (
+                    self.push(Op::Sub(slope, before), &[slope, before]),
+                    self.switch(SwitchKind::Max, beyond, zero),
+                ),
+            };
+            let term = self.push(Op::Mul(weight, part), &[weight, part]);
+            sum = self.push(Op::Add(sum, term), &[sum, term]);
+            before = Some(slope);
+        }
+        Ok(sum)
     }
 
     /// Lays out the registers: leaves (with the delays' leaves behind the caller's), constants, the
@@ -762,14 +793,22 @@ mod tests {
         let cube = x.clone().pow(Expr::Num(3.0));
         k.clone() * cube * Expr::call(Func::Sin, vec![v.clone()])
             + Expr::call(Func::Deadzone, vec![x.clone(), k.clone() / Expr::Num(8.0)])
-            + Expr::call(Func::Abs, vec![v]) * (k.clone() * k)
-            - Expr::call(Func::Saturate, vec![x, Expr::Num(0.5)])
+            + Expr::call(Func::Abs, vec![v.clone()]) * (k.clone() * k.clone())
+            - Expr::call(Func::Saturate, vec![x.clone(), Expr::Num(0.5)])
+            + Table::call(x, &[-0.8, 0.05, 0.6], vec![k.clone(), Expr::Num(0.3), v * k])
     }
 
     fn by_hand(x: f64, v: f64, k: f64) -> f64 {
         let gap = k / 8.0;
         let dz = if x.abs() <= gap { 0.0 } else { x - gap * x.signum() };
-        k * x.powi(3) * v.sin() + dz + v.abs() * k * k - x.clamp(-0.5, 0.5)
+        let (left, middle, right) = (k, 0.3, v * k);
+        let table = match x {
+            x if x < -0.8 => left,
+            x if x < 0.05 => left + (middle - left) * (x + 0.8) / 0.85,
+            x if x < 0.6 => middle + (right - middle) * (x - 0.05) / 0.55,
+            _ => right,
+        };
+        k * x.powi(3) * v.sin() + dz + v.abs() * k * k - x.clamp(-0.5, 0.5) + table
     }
 
     #[test]

@@ -1,6 +1,6 @@
 //! Properties of parsing, printing and symbolic algebra over random expressions.
 
-use greybox_model::{BinOp, Expr, Func, parse, parse_equation};
+use greybox_model::{BinOp, Expr, Func, Table, parse, parse_equation};
 use proptest::prelude::*;
 
 /// Any tree of the language with finite numbers and no sign directly over a number.
@@ -12,18 +12,24 @@ fn any_expr() -> impl Strategy<Value = Expr> {
     ];
     leaf.prop_recursive(6, 40, 2, |inner| {
         let op = prop::sample::select(vec![BinOp::Add, BinOp::Sub, BinOp::Mul, BinOp::Div, BinOp::Pow]);
-        let function = prop::sample::select(Func::ALL.to_vec());
+        let fixed: Vec<Func> = Func::ALL.into_iter().filter(|f| f.arity().is_some()).collect();
+        let function = prop::sample::select(fixed);
         prop_oneof![
             inner.clone().prop_map(|a| match a {
                 Expr::Num(v) => Expr::Num(-v),
                 a => -a,
             }),
             (op, inner.clone(), inner.clone()).prop_map(|(op, a, b)| Expr::Bin(op, Box::new(a), Box::new(b))),
-            (function, inner.clone(), inner)
-                .prop_map(|(f, a, b)| { Expr::call(f, if f.arity() == 1 { vec![a] } else { vec![a, b] }) }),
+            (function, inner.clone(), inner.clone())
+                .prop_map(|(f, a, b)| Expr::call(f, if f.arity() == Some(1) { vec![a] } else { vec![a, b] })),
+            (-5.0..5.0f64, 1e-3..1e3f64, inner.clone(), inner.clone(), inner)
+                .prop_map(|(k, step, x, v, w)| Table::call(x, &[k, k + step], vec![v, w])),
         ]
     })
 }
+
+/// Of the tables in the trees below.
+const KNOTS: [f64; 4] = [-1.5, -0.2, 0.9, 1.1];
 
 /// Trees whose value stays moderate, so that finite differences mean something.
 fn smooth_expr() -> impl Strategy<Value = Expr> {
@@ -64,6 +70,9 @@ fn smooth_expr() -> impl Strategy<Value = Expr> {
             }),
             (prop::sample::select(vec![Func::Min, Func::Max, Func::Delay]), inner.clone(), inner.clone())
                 .prop_map(|(f, a, b)| Expr::call(f, vec![a, b])),
+            (inner.clone(), inner.clone(), -3.0..3.0f64).prop_map(|(x, v, w)| {
+                Table::call(x, &KNOTS, vec![v.clone(), Expr::Num(w), v, Expr::Num(1.0)])
+            }),
             (prop::sample::select(vec![Func::Deadzone, Func::Saturate]), inner.clone(), inner).prop_map(
                 |(f, a, b)| {
                     let width = Expr::Num(0.3) + Expr::call(Func::Abs, vec![Expr::call(Func::Sin, vec![b])]);
@@ -103,6 +112,18 @@ fn dual(e: &Expr, of: &dyn Fn(&str, u8) -> (f64, f64), near: &mut f64) -> (f64, 
                 BinOp::Pow => (a.powf(b), a.powf(b) * (db * a.ln() + b * da / a)),
             }
         }
+        Expr::Call(Func::Table, args) => {
+            let (x, dx) = dual(&args[0], of, near);
+            let v: Vec<(f64, f64)> = args[5..].iter().map(|v| dual(v, of, near)).collect();
+            KNOTS.iter().for_each(|k| *near = near.min((x - k).abs()));
+            let Some(i) = KNOTS.windows(2).position(|k| (k[0]..k[1]).contains(&x)) else {
+                return if x < KNOTS[0] { v[0] } else { v[3] };
+            };
+            let width = KNOTS[i + 1] - KNOTS[i];
+            let w = (x - KNOTS[i]) / width;
+            let slope = (v[i + 1].0 - v[i].0) / width * dx + (1.0 - w) * v[i].1 + w * v[i + 1].1;
+            ((1.0 - w) * v[i].0 + w * v[i + 1].0, slope)
+        }
         Expr::Call(f, args) => {
             let (a, da) = dual(&args[0], of, near);
             let (b, db) = args.get(1).map_or((0.0, 0.0), |b| dual(b, of, near));
@@ -139,6 +160,7 @@ fn dual(e: &Expr, of: &dyn Fn(&str, u8) -> (f64, f64), near: &mut f64) -> (f64, 
                     kink(a - b);
                     (f64::from(u8::from(a >= b)), 0.0)
                 }
+                Func::Table => unreachable!("handled above"),
             }
         }
     }
@@ -377,7 +399,23 @@ fn syntax_errors_name_the_mend() {
         ("1.2.3", 3..5, &["found `.3` after `1.2`"]),
         (".", 0..1, &["expected a number"]),
         ("a & b", 2..3, &["no conditions"]),
-        ("[a]", 0..1, &["write `(`"]),
+        ("[a]", 0..1, &["write `(`", "only a `table` has lists"]),
+        ("a[1]", 1..2, &["found `[` after `a`", "only a `table` has lists"]),
+        ("a]", 1..2, &["found `]`", "remove it"]),
+        ("table(x)", 7..8, &["found `)`", "write `table(x, [k1, k2], [v1, v2])`"]),
+        ("table(x, 1, 2)", 9..10, &["found `1`", "write `table("]),
+        ("table(x, [0, 1])", 15..16, &["found `)`", "write `table("]),
+        ("table(x, [0, 1], [a, b], c)", 23..24, &["found `,`", "write `table("]),
+        ("table(x, [0, 1], [a, b]", 5..6, &["never closed"]),
+        ("table(x, [0, 1", 9..10, &["never closed", "missing `]`"]),
+        ("table(x, [0, 1), [a, b])", 14..15, &["found `)` after `1`"]),
+        ("table(x, [], [])", 10..11, &["found `]`"]),
+        ("table(x, [0, k], [a, b])", 13..14, &["found `k`, expected a knot: a number", "divide the first argument"]),
+        ("table(x, [0, 2, -1], [a, b, c])", 16..18, &["`-1` is not larger", "increasing order"]),
+        ("table(x, [0], [a])", 9..12, &["2 to 200 knots, found 1"]),
+        ("table(x, [0, 1], [a, b, c])", 17..26, &["2 knots, but 3 values", "one value for each knot"]),
+        ("table(x, [-1e308, 1e308], [a, b])", 0..33, &["reach too far"]),
+        ("table + 1", 0..5, &["`table` is a function"]),
     ] {
         let error = parse(text).expect_err(text);
         for fragment in fragments {

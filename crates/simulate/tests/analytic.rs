@@ -131,6 +131,30 @@ fn bouncing_end_stop() {
     }
 }
 
+/// A spring given by its values: half a sine where it is a straight line, held beyond its ends.
+#[test]
+fn a_spring_given_by_a_table() {
+    let (dt, n) = (0.01, 400);
+    let parameters = [("fa", -9.0), ("fb", 0.0), ("fc", 4.0), ("x0", 0.1)];
+    let table = ["x'' + table(x/x0, [-2, 0, 1], [fa, fb, fc]) = 0"];
+    let table = model(&[], &[("x", 2)], &parameters, &table, &["x"]);
+    let sums = ["x'' + 4*max(min(x/x0, 1), 0) + 4.5*min(max(x/x0, -2), 0) = 0"];
+    let sums = model(&[], &[("x", 2)], &parameters, &sums, &["x"]);
+    let from = |m: &greybox_model::Model, start: [f64; 2]| run(m, &free(n, dt), &start, FINE);
+    // Inside of its ends: a quarter of a period on the stiffer side is π/2/√45 s.
+    let small = from(&table, [-0.1, 0.0]);
+    let quarter = (std::f64::consts::FRAC_PI_2 / 45f64.sqrt() / dt) as usize;
+    for k in 0..quarter {
+        let exact = -0.1 * (45f64.sqrt() * dt * k as f64).cos();
+        assert!((small.y[k] - exact).abs() < 1e-10, "{k}: {} {exact}", small.y[k]);
+    }
+    let (a, b) = (from(&table, [0.3, 1.0]), from(&sums, [0.3, 1.0]));
+    assert!(a.events > 4);
+    for k in 0..n {
+        assert!((a.y[k] - b.y[k]).abs() < 1e-9, "{k}: {} {}", a.y[k], b.y[k]);
+    }
+}
+
 /// A late sensor on an oscillator in the middle of its motion: before the start the state goes straight back
 /// along its rate (error at most ẍ τ²/2, in the first sample alone), between samples it is a cubic.
 #[test]

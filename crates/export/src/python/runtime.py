@@ -169,6 +169,18 @@ def _saturate(a, limit):
     return limit if a > limit else -limit if a < -limit else a
 
 
+def _table(a, knots, values):
+    if a <= knots[0]:
+        return values[0]
+    if a >= knots[-1]:
+        return values[-1]
+    i = 1
+    while i < len(knots) - 1 and a >= knots[i]:
+        i += 1
+    slope = (values[i] - values[i - 1]) / (knots[i] - knots[i - 1])
+    return values[i - 1] + slope * (a - knots[i - 1])
+
+
 def _step(a, b):
     return 0.0 if a < b else 1.0
 
