@@ -367,7 +367,7 @@ fn leaves_something(fitted: &Fitted, scale: &[f64]) -> bool {
 }
 
 #[cfg(test)]
-mod tests {
+pub(crate) mod tests {
     use super::*;
     use crate::Mechanism;
     use greybox_calibrate::{Data, free_parameters};
@@ -396,7 +396,7 @@ second = "n*y'' + c*y' + l*(y - x) = 0"
 "#;
 
     /// 30 s of the bodies with more forces on each and a memory, of the state (x, y, x', y', z): force, force, z'.
-    fn bodies(more: &dyn Fn([f64; 5]) -> [f64; 3], seed: u64) -> Setup {
+    pub(crate) fn bodies(more: &dyn Fn([f64; 5]) -> [f64; 3], seed: u64) -> Setup {
         let mut rng = rand_pcg::Pcg64::seed_from_u64(seed);
         let mut normal = || -> f64 { StandardNormal.sample(&mut rng) };
         let (dt, n, fine) = (0.02, 1500usize, 20usize);
@@ -442,7 +442,7 @@ second = "n*y'' + c*y' + l*(y - x) = 0"
     }
 
     /// What a search is that has found nothing.
-    fn nothing(search: &Search<'_>) -> Found {
+    pub(crate) fn nothing(search: &Search<'_>) -> Found {
         let setup = search.nominal().clone();
         let level = setup.windows(search.lengths()[0], MOST_SAMPLES);
         let start = Point { parameters: setup.values(), starts: setup.starts(&level, &setup.values()) };

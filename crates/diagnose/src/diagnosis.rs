@@ -19,7 +19,7 @@ use crate::evidence::{Evidence, fall, kappa};
 use crate::library::{Mechanism, MechanismError, built_in};
 use crate::locate::{Location, force, locate};
 use crate::place::{Motion, Place};
-use crate::proposal::Proposal;
+use crate::proposal::{Gate, Proposal, Rejected};
 use crate::search::{
     Fitted, Found, MISFIT, MOST_WORK, Part, Rival, Search, UNDECIDED, log_likelihood_gain, raw_rms, raw_rss,
     rms,
@@ -347,6 +347,8 @@ pub struct Diagnosis {
     pub candidates: Vec<Finding>,
     /// How far the candidates can be trusted; `None` where there are none.
     pub proposal: Option<Proposal>,
+    /// The closure that was tried and is not handed back; `None` where none was found, or it is.
+    pub rejected: Option<Rejected>,
     /// What fewer of several mechanisms would leave: none, each alone, all but one, all. Empty where there is one, or none.
     pub subsets: Vec<Subset>,
     /// Remainder.
@@ -533,11 +535,12 @@ fn conclude(
         let parts = fitted.parts.iter().zip(&judged.named);
         parts.map(|(part, named)| (all && *named) || stands(part)).collect()
     };
+    let mut rejected = None;
     // (What passes for coloured noise may hold what no name explains.)
     if errs || judged.verdict == Verdict::Unexplained {
         let closed = Closed::of(search, &found, &polished, &baseline, &judge);
         // What reaches the noise leaves no error of the model to be believed beside.
-        if errs && !options.terms_only && !closed.as_ref().is_some_and(|closed| closed.leaves_noise) {
+        if errs && !options.terms_only && !closed.as_ref().is_ok_and(|closed| closed.leaves_noise) {
             let in_both = |part: &Part| agreed.contains(&named_as(part, library, &nominal.model));
             let standing = (&found, &polished);
             let explored = explored(search, standing, in_both, names, &baseline, &judge);
@@ -546,18 +549,24 @@ fn conclude(
                 (found, polished) = (other, simulates);
             }
         }
-        if let Some(closed) = closed {
-            let standing = believed(&judged, &found, &polished.fitted);
-            let standing = polished.fitted.parts.iter().zip(standing).filter(|part| part.1);
-            let standing: Vec<&Candidate> = standing.map(|(part, _)| &part.candidate).collect();
-            if closed.outdoes((&found, &polished), !standing.is_empty(), &judge)
-                && let Some(named) = closed.names(search, &standing)
-            {
-                let Closed { found: other, polished: simulates, .. } = closed;
-                judged = judged_of(&other, &simulates, &|part| named.contains(&part.candidate));
-                (found, polished) = (other, simulates);
+        rejected = match closed {
+            Err(failed) => failed,
+            Ok(closed) => {
+                let standing = believed(&judged, &found, &polished.fitted);
+                let standing = polished.fitted.parts.iter().zip(standing).filter(|part| part.1);
+                let standing: Vec<&Candidate> = standing.map(|(part, _)| &part.candidate).collect();
+                if !closed.outdoes((&found, &polished), !standing.is_empty(), &judge) {
+                    Some(Rejected::at(Gate::Comparison, search, &closed.polished.fitted))
+                } else if let Some(named) = closed.names(search, &standing) {
+                    let Closed { found: other, polished: simulates, .. } = closed;
+                    judged = judged_of(&other, &simulates, &|part| named.contains(&part.candidate));
+                    (found, polished) = (other, simulates);
+                    None
+                } else {
+                    Some(Rejected::at(Gate::Names, search, &closed.polished.fitted))
+                }
             }
-        }
+        };
         limited |= found.limited;
     }
     let Polished { fitted: improved, origin } = &polished;
@@ -709,6 +718,7 @@ fn conclude(
         mechanisms,
         candidates,
         proposal,
+        rejected,
         subsets,
         remainder,
         parameters,
@@ -829,24 +839,30 @@ struct Closed {
 
 impl Closed {
     /// The closure that begins with the calibrated model or, where that leaves more than noise and it simulates better, the one
-    /// that begins with what stands.
+    /// that begins with what stands. Where none passes the gates, the last that failed, if there was one at all.
     fn of(
         search: &Search<'_>,
         found: &Found,
         polished: &Polished,
         baseline: &Baseline,
         judge: &Judge,
-    ) -> Option<Closed> {
+    ) -> Result<Closed, Option<Rejected>> {
         let mut from = vec![&found.calibrated];
         if !polished.fitted.parts.is_empty() {
             from.push(&found.improved);
         }
         let gates = Gates::new(search, baseline, judge, false);
         let mut visited = Visited::default();
-        let mut best: Option<Closed> = None;
+        let (mut best, mut rejected): (Option<Closed>, _) = (None, None);
         for from in from {
             let Some(closed) = search.closure(found, from, &mut visited) else { continue };
-            let Some(closed) = Closed::defended(search, closed, &gates, judge) else { continue };
+            let closed = match Closed::defended(search, closed, &gates, judge) {
+                Ok(closed) => closed,
+                Err(failed) => {
+                    rejected = Some(failed);
+                    continue;
+                }
+            };
             if best.as_ref().is_none_or(|best| closed.misfit.total_cmp(&best.misfit).is_lt()) {
                 best = Some(closed);
             }
@@ -855,22 +871,30 @@ impl Closed {
                 break;
             }
         }
-        best
+        best.ok_or(rejected)
     }
 
-    /// A closure that passes all gates, without what whole recordings do not determine, if it does.
-    fn defended(search: &Search<'_>, found: Found, gates: &Gates<'_>, judge: &Judge) -> Option<Closed> {
+    /// A closure that passes all gates, without what whole recordings do not determine; else what fails, and where.
+    fn defended(
+        search: &Search<'_>,
+        found: Found,
+        gates: &Gates<'_>,
+        judge: &Judge,
+    ) -> Result<Closed, Rejected> {
         let mut found = found;
         loop {
             let polished = polish(&found.improved, &found.scale, judge);
-            let passed = gates.judge(&polished, &found.scale);
-            if passed.all() {
-                return Some(Closed::new(found, polished, judge));
-            }
+            let Some(failure) = gates.failure(&polished, &found.scale) else {
+                return Ok(Closed::new(found, polished, judge));
+            };
             // Whole recordings may not tell what segments with free starts told.
-            found.improved = search.smaller(&found.improved, passed.undetermined?, &found.scale)?;
-            if found.improved.parts.is_empty() {
-                return None;
+            let smaller = match failure {
+                Failure::Undetermined(part) => search.smaller(&found.improved, part, &found.scale),
+                _ => None,
+            };
+            match smaller {
+                Some(smaller) if !smaller.parts.is_empty() => found.improved = smaller,
+                _ => return Err(Rejected::at(failure.gate(), search, &polished.fitted)),
             }
         }
     }
@@ -1155,14 +1179,13 @@ fn defend(
             found.accepted.clear();
             return baseline.polished.clone();
         }
-        let passed = gates.judge(&polished, &found.scale);
-        if passed.all() {
-            return polished;
-        }
-        let bound = passed.bound;
+        let Some(failure) = gates.failure(&polished, &found.scale) else { return polished };
         // Without the part that is missed least. (That would be one that is not determined, unless it is so only beside
         // another that does the same.)
-        let open = if bound.is_empty() { (0..fitted.parts.len()).collect() } else { bound };
+        let open = match failure {
+            Failure::Clock(bound) => bound,
+            _ => (0..fitted.parts.len()).collect(),
+        };
         let smaller = open
             .into_par_iter()
             .filter_map(|i| {
@@ -1200,19 +1223,29 @@ struct Gates<'a> {
     named: bool,
 }
 
-/// How a model fares at the gates.
-struct Passed {
-    /// Parts that act at certain times of a single recording and cannot be defended.
-    bound: Vec<usize>,
-    /// The part whose strengths the recordings determine least, if they do not determine them.
-    undetermined: Option<usize>,
-    /// All else.
-    otherwise: bool,
+/// Where a model fails that cannot be handed back.
+enum Failure {
+    /// These parts act at certain times of a single recording.
+    Clock(Vec<usize>),
+    /// The recordings do not determine the strengths of this part, and of no other less.
+    Undetermined(usize),
+    /// It simulates the training recordings worse than the calibrated model.
+    Worse,
+    /// An inertia of it is negative.
+    Inertia,
+    /// It does not predict what is left out of its fit better than the calibrated model, beyond chance.
+    CrossValidation,
 }
 
-impl Passed {
-    fn all(&self) -> bool {
-        self.bound.is_empty() && self.undetermined.is_none() && self.otherwise
+impl Failure {
+    fn gate(&self) -> Gate {
+        match self {
+            Failure::Clock(_) => Gate::Clock,
+            Failure::Undetermined(_) => Gate::Determined,
+            Failure::Worse => Gate::Training,
+            Failure::Inertia => Gate::Inertia,
+            Failure::CrossValidation => Gate::CrossValidation,
+        }
     }
 }
 
@@ -1221,25 +1254,31 @@ impl<'a> Gates<'a> {
         Gates { search, baseline, judge, named }
     }
 
-    fn judge(&self, polished: &Polished, scale: &[f64]) -> Passed {
+    /// The first gate that the model fails at, if it does.
+    fn failure(&self, polished: &Polished, scale: &[f64]) -> Option<Failure> {
         let (search, fitted) = (self.search, &polished.fitted);
         let own = residual_scale(fitted, scale);
-        let undetermined =
-            search.undetermined(&polished.origin, &Uncertainty::of(&polished.origin, &own).widths());
         let scores = self.judge.scores(&fitted.setup, &fitted.fit.point.parameters, &own);
-        let worse = self.judge.criterion.misfit(&scores).total_cmp(&self.baseline.misfit).is_gt();
         // (By the free run: starts that are free absorb what a model leaves, of segments as of windows.)
         let likely = self.named && leaves_noise(&scores, &polished.origin, &own);
         let bound = if likely { Vec::new() } else { search.bound_to_a_clock(fitted) };
+        if !bound.is_empty() {
+            return Some(Failure::Clock(bound));
+        }
+        let widths = Uncertainty::of(&polished.origin, &own).widths();
+        if let Some(part) = search.undetermined(&polished.origin, &widths) {
+            return Some(Failure::Undetermined(part));
+        }
+        if self.judge.criterion.misfit(&scores).total_cmp(&self.baseline.misfit).is_gt() {
+            return Some(Failure::Worse);
+        }
+        if search.has_negative_inertia(&fitted.setup, &fitted.level, &fitted.fit.point, scale) {
+            return Some(Failure::Inertia);
+        }
         let predicts = || {
             Gain::of(self.baseline.errors(self.judge), &self.judge.errors(polished, &own)).is_beyond_chance()
         };
-        let otherwise = bound.is_empty()
-            && undetermined.is_none()
-            && !worse
-            && !search.has_negative_inertia(&fitted.setup, &fitted.level, &fitted.fit.point, scale)
-            && (likely || predicts());
-        Passed { bound, undetermined, otherwise }
+        (!likely && !predicts()).then_some(Failure::CrossValidation)
     }
 }
 
@@ -1984,6 +2023,50 @@ pub fn calibrate(
 #[cfg(test)]
 mod tests {
     use super::*;
+
+    /// Each gate stops what it is there for, and a right law passes all of them.
+    #[test]
+    fn every_gate_stops_what_it_is_there_for() {
+        use crate::closure::tests::{bodies, nothing};
+        let library = built_in().unwrap();
+        let search = Search::new(bodies(&|[x, ..]| [9.0 * x * x, 0.0, 0.0], 60), &library, &crate::Quiet);
+        let found = nothing(&search);
+        let (scale, calibrated) = (&found.scale, &found.calibrated);
+        let own = residual_scale(calibrated, scale);
+        let judge = Judge::of(calibrated, &own);
+        let baseline = || Baseline::of(&found, &search.nominal().values(), &judge);
+        let with = |kind: &str, values: &[f64], steps: usize| {
+            let is_there = |c: &&Candidate| {
+                library[c.mechanism].kind == kind && c.place.equations(&search.nominal().model) == ["first"]
+            };
+            let candidate = search.candidates().iter().chain(search.terms()).find(is_there).unwrap().clone();
+            let parameters = calibrated.fit.point.parameters.iter().chain(values).copied().collect();
+            let laws = [(candidate, values.to_vec(), vec![1.0; values.len()])];
+            search.reassembled_from(calibrated, &laws, vec![parameters], scale, steps).unwrap()
+        };
+        let gate = |model: Fitted, baseline: &Baseline| {
+            let gates = Gates::new(&search, baseline, &judge, false);
+            gates.failure(&polish(&model, scale, &judge), scale).map(|failure| failure.gate())
+        };
+        let as_it_is = |model: Fitted, baseline: &Baseline| {
+            let gates = Gates::new(&search, baseline, &judge, false);
+            gates.failure(&Polished::kept(model), scale).map(|failure| failure.gate())
+        };
+        let law = with("quadratic_stiffness", &[9.0], 20);
+        assert_eq!(gate(law.clone(), &baseline()), None);
+        assert_eq!(gate(with("step_disturbance", &[0.5, 10.0], 20), &baseline()), Some(Gate::Clock));
+        assert_eq!(gate(with("cubic_damping", &[0.01], 20), &baseline()), Some(Gate::Determined));
+        let closer = Baseline { misfit: f64::NEG_INFINITY, ..baseline() };
+        assert_eq!(gate(law.clone(), &closer), Some(Gate::Training));
+        let lenient = Baseline { misfit: f64::INFINITY, ..baseline() };
+        // (An inertia of −0.02 kg m²: any force moves it far, so that it is well known.)
+        let negative = with("position_dependent_inertia", &[-1.02, 0.5], 0);
+        assert_eq!(as_it_is(negative, &lenient), Some(Gate::Inertia));
+        // A calibrated model that predicts better.
+        let folds = baseline().errors(&judge).len();
+        let better = Baseline { errors: OnceCell::from(vec![-50.0; folds]), ..baseline() };
+        assert_eq!(gate(law, &better), Some(Gate::CrossValidation));
+    }
 
     fn alternative(kind: &str, equations: &[&str], confidence: f64, equivalent: bool) -> Alternative {
         let equations = equations.iter().map(|e| (*e).to_string()).collect();

@@ -1,4 +1,4 @@
-//! How far laws without a name can be trusted.
+//! How far laws without a name can be trusted, and which are not handed back.
 //!
 //! | what | how |
 //! |---|---|
@@ -12,7 +12,7 @@ use greybox_model::Expr;
 use crate::along::Along;
 use crate::library::Mechanism;
 use crate::locate::{extent, time_of};
-use crate::search::{Fitted, Part};
+use crate::search::{Fitted, Part, Search};
 use crate::uncertainty::Uncertainty;
 use crate::validate;
 
@@ -63,6 +63,57 @@ pub struct Correlated {
     pub parameter: String,
     /// Correlation of the estimates, −1 to 1.
     pub correlation: f64,
+}
+
+/// What a closure must pass to be handed back, in this order.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum Gate {
+    /// No law acts at certain times of a single recording.
+    Clock,
+    /// The recordings determine its coefficients.
+    Determined,
+    /// It simulates the training recordings no worse than the calibrated model.
+    Training,
+    /// No inertia is negative.
+    Inertia,
+    /// It predicts what is left out of its fit better than the calibrated model, beyond chance.
+    CrossValidation,
+    /// It simulates the training recordings better than what stands without it, and predicts what is left out better.
+    Comparison,
+    /// It leaves no more than noise, or holds every law that is named.
+    Names,
+}
+
+/// A closure that was tried and is not handed back.
+#[derive(Debug, Clone, PartialEq)]
+pub struct Rejected {
+    /// The first gate that it fails at.
+    pub gate: Gate,
+    /// Its laws.
+    pub laws: Vec<RejectedLaw>,
+}
+
+/// A law of such a closure.
+#[derive(Debug, Clone, PartialEq)]
+pub struct RejectedLaw {
+    /// Kind of the library.
+    pub kind: String,
+    /// Equations that it enters.
+    pub equations: Vec<String>,
+    /// The law in the model's own names.
+    pub expression: String,
+}
+
+impl Rejected {
+    /// The laws of a model that fails at a gate.
+    pub(crate) fn at(gate: Gate, search: &Search<'_>, fitted: &Fitted) -> Rejected {
+        let law = |part: &Part| RejectedLaw {
+            kind: search.library[part.candidate.mechanism].kind.clone(),
+            equations: part.candidate.place.equations(&search.nominal().model),
+            expression: part.instance.expression.to_string(),
+        };
+        Rejected { gate, laws: fitted.parts.iter().map(law).collect() }
+    }
 }
 
 impl Proposal {

@@ -85,7 +85,10 @@ impl Func {
     /// Every function of the language.
     pub const ALL: [Func; 17] = {
         use Func::*;
-        [Sin, Cos, Tan, Exp, Ln, Sqrt, Tanh, Atan, Abs, Sign, Min, Max, Delay, Deadzone, Saturate, Step, Table]
+        [
+            Sin, Cos, Tan, Exp, Ln, Sqrt, Tanh, Atan, Abs, Sign, Min, Max, Delay, Deadzone, Saturate, Step,
+            Table,
+        ]
     };
 
     /// The function of this name in the model language.

@@ -579,7 +579,8 @@ impl<'a> Parser<'a> {
         if close.kind != Kind::Close {
             return Err(self.no_table(open, close));
         }
-        let fault = |span: Range<usize>, message: String, help: &str| Err(error(span, message, Some(help.into())));
+        let fault =
+            |span: Range<usize>, message: String, help: &str| Err(error(span, message, Some(help.into())));
         if let Some(knot) = knots.iter().find(|k| !matches!(k.expr, Expr::Num(_))) {
             let found = &self.text[knot.span.clone()];
             let help = "divide the first argument by a parameter of its unit, and write the knots as fractions of it";

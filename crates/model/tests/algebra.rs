@@ -410,7 +410,11 @@ fn syntax_errors_name_the_mend() {
         ("table(x, [0, 1", 9..10, &["never closed", "missing `]`"]),
         ("table(x, [0, 1), [a, b])", 14..15, &["found `)` after `1`"]),
         ("table(x, [], [])", 10..11, &["found `]`"]),
-        ("table(x, [0, k], [a, b])", 13..14, &["found `k`, expected a knot: a number", "divide the first argument"]),
+        (
+            "table(x, [0, k], [a, b])",
+            13..14,
+            &["found `k`, expected a knot: a number", "divide the first argument"],
+        ),
         ("table(x, [0, 2, -1], [a, b, c])", 16..18, &["`-1` is not larger", "increasing order"]),
         ("table(x, [0], [a])", 9..12, &["2 to 200 knots, found 1"]),
         ("table(x, [0, 1], [a, b, c])", 17..26, &["2 knots, but 3 values", "one value for each knot"]),

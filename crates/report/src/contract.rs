@@ -55,6 +55,10 @@ pub struct Report {
     /// How far the candidates can be trusted. Absent where there are none.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub closure: Option<Closure>,
+    /// The sum of laws that was tried in place of what has no name and is not in the improved model. Absent where none was
+    /// found, or it is.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub closure_rejected: Option<ClosureRejected>,
     /// What fewer of several mechanisms would leave: none, each alone, all but one, all. Empty where there is one, or
     /// none.
     #[serde(default, skip_serializing_if = "Vec::is_empty")]
@@ -273,6 +277,46 @@ pub struct Closure {
     pub cross_validation: Vec<Fold>,
     /// By parameter of a candidate, the parameter of the machine whose estimate is most correlated with its own.
     pub correlated_with: Ordered<Correlated>,
+}
+
+/// A sum of laws that fails at a gate.
+#[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize, JsonSchema)]
+pub struct ClosureRejected {
+    /// The first gate that it fails at.
+    pub gate: Gate,
+    /// Its laws.
+    pub laws: Vec<RejectedLaw>,
+}
+
+/// What a sum of laws must pass to be handed back, in this order.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Serialize, Deserialize, JsonSchema)]
+#[serde(rename_all = "snake_case")]
+pub enum Gate {
+    /// No law acts at certain times of a single recording.
+    Clock,
+    /// The recordings determine its coefficients.
+    Determined,
+    /// It simulates the training recordings no worse than the calibrated model.
+    Training,
+    /// No inertia is negative.
+    Inertia,
+    /// It predicts what is left out of its fit better than the calibrated model, beyond chance.
+    CrossValidation,
+    /// It simulates the training recordings better than what stands without it, and predicts what is left out better.
+    Comparison,
+    /// It leaves no more than noise, or holds every law that is named.
+    Names,
+}
+
+/// A law of a sum that is rejected.
+#[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize, JsonSchema)]
+pub struct RejectedLaw {
+    /// The kind of law.
+    pub kind: String,
+    /// The equation or equations that it enters.
+    pub equation: Names,
+    /// The law, an expression of the model language; its parameters have no values.
+    pub expression: String,
 }
 
 /// Where a variable was.

@@ -55,6 +55,7 @@ pub fn report(diagnosis: &Diagnosis, sources: &Sources<'_>) -> Report {
         mechanisms: d.mechanisms.iter().map(|m| mechanism(m, &d.improved, &reach)).collect(),
         candidates: d.candidates.iter().map(|m| mechanism(m, &d.improved, &reach)).collect(),
         closure: d.proposal.as_ref().map(closure),
+        closure_rejected: d.rejected.as_ref().map(closure_rejected),
         subsets: d
             .subsets
             .iter()
@@ -361,6 +362,24 @@ fn closure(of: &Proposal) -> Closure {
         cross_validation: of.folds.iter().map(fold).collect(),
         correlated_with: of.correlations.iter().map(correlated).collect(),
     }
+}
+
+fn closure_rejected(of: &proposal::Rejected) -> ClosureRejected {
+    let gate = match of.gate {
+        proposal::Gate::Clock => Gate::Clock,
+        proposal::Gate::Determined => Gate::Determined,
+        proposal::Gate::Training => Gate::Training,
+        proposal::Gate::Inertia => Gate::Inertia,
+        proposal::Gate::CrossValidation => Gate::CrossValidation,
+        proposal::Gate::Comparison => Gate::Comparison,
+        proposal::Gate::Names => Gate::Names,
+    };
+    let law = |law: &proposal::RejectedLaw| RejectedLaw {
+        kind: law.kind.clone(),
+        equation: equation_names(&law.equations),
+        expression: law.expression.clone(),
+    };
+    ClosureRejected { gate, laws: of.laws.iter().map(law).collect() }
 }
 
 fn estimate(e: &Estimated, unit: String) -> Estimate {

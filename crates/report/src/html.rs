@@ -382,6 +382,7 @@ struct LawView {
 struct RemainderView {
     significant: bool,
     text: String,
+    rejected: Option<String>,
     experiment: Option<String>,
     plots: Vec<LawView>,
 }
@@ -1266,6 +1267,7 @@ fn remainder_view(page: &Page) -> RemainderView {
     RemainderView {
         significant: remainder.significant,
         text,
+        rejected: sentence::rejected(&page.report),
         experiment: remainder.experiment.clone(),
         plots: law_views(page, None),
     }

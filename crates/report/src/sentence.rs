@@ -7,7 +7,8 @@ pub mod identified;
 pub mod recordings;
 
 use crate::contract::{
-    Alternative, Criterion, Fit, Interval, Location, Mechanism, Names, Report, Score, Verdict,
+    Alternative, Criterion, Fit, Gate, Interval, Location, Mechanism, Names, RejectedLaw, Report, Score,
+    Verdict,
 };
 use crate::{expression, format};
 
@@ -25,11 +26,13 @@ pub fn summary(report: &Report) -> Vec<String> {
     let mut out = Vec::new();
     match report.verdict {
         Verdict::Consistent => {
-            out.push(
-                "The model agrees with the recordings: once its parameters are calibrated, nothing beyond \
-                 measurement noise is missing."
-                    .to_owned(),
-            );
+            let agrees = "The model agrees with the recordings: once its parameters are calibrated,";
+            out.push(match report.remainder.significant {
+                true => {
+                    format!("{agrees} what is left passes for measurement noise, but for a small part of it.")
+                }
+                false => format!("{agrees} nothing beyond measurement noise is missing."),
+            });
             out.extend(error_change(&report.fit, Baseline::Nominal).map(|change| {
                 format!(
                     "Calibration changes the held-out error{} from {} to {}.",
@@ -95,8 +98,29 @@ fn unexplained(report: &Report, out: &mut Vec<String>) {
         )
     });
     out.extend(proposed(report));
+    out.extend(rejected(report));
     let experiment = report.remainder.experiment.as_deref();
     out.extend(experiment.map(|e| format!("To find out what it is: {}.", e.trim_end_matches('.'))));
+}
+
+/// The laws that were tried in place of what has no name and are not handed back, and why.
+pub fn rejected(report: &Report) -> Option<String> {
+    let closure = report.closure_rejected.as_ref()?;
+    let why = match closure.gate {
+        Gate::Clock => "it acts at certain times of a single recording, and nothing says that it acts again",
+        Gate::Determined => "the recordings do not determine its coefficients",
+        Gate::Training => "it simulates whole recordings worse than the calibrated model",
+        Gate::Inertia => "it makes an inertia negative",
+        Gate::CrossValidation => {
+            "it does not predict data that it was not fitted to better than the calibrated model"
+        }
+        Gate::Comparison => "it does no better than the improved model",
+        Gate::Names => "it leaves more than noise and lacks a law that is named",
+    };
+    let law =
+        |law: &RejectedLaw| format!("{}{}", expression::text(&law.expression), equations(&law.equation));
+    let laws: Vec<String> = closure.laws.iter().map(law).collect();
+    Some(format!("Tried and rejected: {}. As a model of what is missing, {why}.", joined(&laws, "and")))
 }
 
 /// How the held-out error changes from the calibrated to the improved model, to end a sentence with.

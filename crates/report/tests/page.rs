@@ -3,7 +3,8 @@
 
 use greybox_report::Page;
 use greybox_report::contract::{
-    Closure, Correlated, Finding, Fold, Interval, Range, Severity, Subset, Verdict,
+    Closure, ClosureRejected, Correlated, Finding, Fold, Gate, Interval, Range, RejectedLaw, Severity,
+    Subset, Verdict,
 };
 use greybox_report::page::{Channel, Recording, Residual, Role};
 
@@ -128,6 +129,20 @@ fn what_is_proposed_stands_in_a_table_and_in_the_bar() {
     ] {
         assert!(html.contains(text), "the page lacks {text:?}");
     }
+    // What was tried and is not handed back.
+    let law = |expression: &str| RejectedLaw {
+        kind: "quadratic_stiffness".to_owned(),
+        equation: "<hub>".into(),
+        expression: expression.to_owned(),
+    };
+    page.report.closure_rejected = Some(ClosureRejected {
+        gate: Gate::CrossValidation,
+        laws: vec![law("kq*theta^2"), law("c*abs(theta)*theta'")],
+    });
+    let html = page.to_html().unwrap();
+    let says = "Tried and rejected: kq·θ² in the &#60;hub&#62; equation and c·|θ|·θ′ in the &#60;hub&#62; equation. As a model of what is \
+                missing, it does not predict data that it was not fitted to better than the calibrated model.";
+    assert!(html.contains(says), "the page lacks {says:?}");
     // Where nobody looked for names.
     page.report.mechanisms.clear();
     (page.report.terms_only, page.report.verdict) = (true, Verdict::Unexplained);
@@ -312,12 +327,19 @@ fn an_empty_page_is_a_page() {
     page.report.fit = Default::default();
     page.report.findings.clear();
     page.report.inputs.clear();
-    for (verdict, remainder, says) in [
-        (Verdict::Consistent, 0.0, "nothing beyond measurement noise is missing"),
-        (Verdict::Unexplained, 0.3, "no mechanism in the library explains it"),
-        (Verdict::Unexplained, 0.001, "greybox check --model"),
+    for (verdict, significant, remainder, says) in [
+        (Verdict::Consistent, false, 0.0, "nothing beyond measurement noise is missing"),
+        (
+            Verdict::Consistent,
+            true,
+            0.1,
+            "what is left passes for measurement noise, but for a small part of it",
+        ),
+        (Verdict::Unexplained, true, 0.3, "no mechanism in the library explains it"),
+        (Verdict::Unexplained, true, 0.001, "greybox check --model"),
     ] {
         page.report.verdict = verdict;
+        page.report.remainder.significant = significant;
         page.report.remainder.share_of_residual = remainder;
         page.report.summary.clear();
         let html = page.to_html().unwrap();

@@ -422,6 +422,7 @@ pub(crate) fn page() -> Page {
         mechanisms: vec![mechanism(windows.clone())],
         candidates: Vec::new(),
         closure: None,
+        closure_rejected: None,
         subsets: Vec::new(),
         remainder: Remainder {
             significant: false,

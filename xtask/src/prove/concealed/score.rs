@@ -1,8 +1,9 @@
 //! What a report got right about a case.
 
 use greybox_report::Report;
-use greybox_report::contract::{Interval, Mechanism, Score as Fit, Verdict};
+use greybox_report::contract::{Basis, Interval, Mechanism, Score as Fit, Verdict};
 use serde::Serialize;
+use serde_json::json;
 
 use super::case::{Truth, TruthEffect};
 use super::kind::Kind;
@@ -36,6 +37,8 @@ pub(crate) struct Score {
     pub(crate) iou: Option<f64>,
     /// Outside the library: unexplained, or an accepted relative named.
     pub(crate) outside: Option<bool>,
+    /// Outside the library: what the improved model rests on, or the gate at which a closure was rejected.
+    pub(crate) answer: Option<String>,
     /// Outside the library: a kind that is no relative, named with confidence of 0.9 or more.
     pub(crate) confidently_wrong: Option<bool>,
     /// Held-out error over the oracle's, worst channel.
@@ -105,6 +108,7 @@ pub(crate) fn judge(truth: &Truth, report: &Report, oracle: Option<&Oracle>, sec
         }
         "outside" => {
             score.detected = said;
+            score.answer = Some(answer(report));
             let near = report.mechanisms.iter().all(|m| truth.relatives.contains(&m.kind.as_str()));
             score.outside =
                 Some(report.verdict == Verdict::Unexplained || (!report.mechanisms.is_empty() && near));
@@ -118,6 +122,16 @@ pub(crate) fn judge(truth: &Truth, report: &Report, oracle: Option<&Oracle>, sec
         }
     }
     score
+}
+
+/// What the improved model rests on where it holds laws; else the gate at which a closure was rejected, or that none was found.
+fn answer(report: &Report) -> String {
+    let said = |what: serde_json::Value| what.as_str().unwrap_or_default().replace('_', " ");
+    match (report.basis, &report.closure_rejected) {
+        (Basis::Calibrated, Some(rejected)) => format!("rejected: {}", said(json!(rejected.gate))),
+        (Basis::Calibrated, None) => "no closure found".to_owned(),
+        (basis, _) => said(json!(basis)),
+    }
 }
 
 fn judge_effects(truth: &Truth, report: &Report, score: &mut Score) {

@@ -375,6 +375,33 @@ fn row(name: &str, group: &[&Finished]) -> String {
     )
 }
 
+/// Of the laws that the library has no name for: how each was answered, case by case.
+fn outside(finished: &[Finished]) -> String {
+    let mut cases: Vec<&Finished> = finished.iter().filter(|f| f.truth.class == "outside").collect();
+    if cases.is_empty() {
+        return String::new();
+    }
+    let kind = |f: &Finished| f.truth.effects.first().map_or("", |e| e.kind);
+    cases.sort_by_key(|f| (kind(f), f.truth.index));
+    let mut text = format!(
+        "{:<32} {:<12} {:<8} {:>11}  {}\n",
+        "outside, by law", "system", "honest", "held-out", "answer"
+    );
+    for f in cases {
+        let honest = if f.score.outside == Some(true) { "yes" } else { "no" };
+        let held = f.score.holdout.map_or("-".to_owned(), |r| format!("{r:.2}"));
+        let answer = f.score.answer.as_deref().unwrap_or("failed");
+        let _ = writeln!(
+            text,
+            "{:<32} {:<12} {honest:<8} {held:>11}  {answer}",
+            kind(f).trim_start_matches("outside_"),
+            f.truth.system
+        );
+    }
+    text.push('\n');
+    text
+}
+
 /// The tables.
 pub(crate) fn render(finished: &[Finished], figures: &Figures) -> String {
     let head = format!(
@@ -406,6 +433,7 @@ pub(crate) fn render(finished: &[Finished], figures: &Figures) -> String {
     section("by tier", group_by(&|f| vec![f.truth.tier.map_or("null".to_owned(), |t| t.name().to_owned())]));
     section("by system", group_by(&|f| vec![f.truth.system.to_owned()]));
     section("by class", group_by(&|f| vec![f.truth.class.to_owned()]));
+    text.push_str(&outside(finished));
     text.push_str(&calibration(finished));
     for f in finished.iter().filter(|f| f.score.failure.is_some()) {
         let _ = writeln!(text, "failed: {} {}", f.truth.id, f.score.failure.as_deref().unwrap_or_default());
