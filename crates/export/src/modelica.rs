@@ -3,7 +3,7 @@
 use std::fmt::Write as _;
 
 use greybox_model::expr::Func;
-use greybox_model::{Expr, Model, System, Unit};
+use greybox_model::{Expr, Model, System, Table, Unit};
 
 use crate::error::ExportError;
 use crate::infix::{Dialect, atom, number, quoted, text};
@@ -186,12 +186,21 @@ pub fn modelica(model: &Model) -> Result<String, ExportError> {
     }
     let outputs: Vec<String> =
         model.measurements.iter().map(|m| names.fresh(&format!("y_{}", ascii(&m.channel)))).collect();
-    let mut writer = Text { names: &names, model, signs: false, tables: false };
+    let tables: Vec<(Expr, String)> =
+        tables(model).into_iter().map(|call| (call, names.fresh("table"))).collect();
+    let mut writer = Text { names: &names, model, signs: false, tables: tables.clone() };
     let mut equations = String::new();
     for s in &model.states {
         for primes in 1..s.order as u8 {
             let (own, below) = (writer.symbol(&s.name, primes), writer.symbol(&s.name, primes - 1));
             let _ = writeln!(equations, "  der({below}) = {own};");
+        }
+    }
+    for (call, own) in &tables {
+        if let Expr::Call(_, args) = call
+            && let Some(table) = Table::of(args)
+        {
+            let _ = writeln!(equations, "  {own} = {};", branches(&table, &mut writer));
         }
     }
     for e in &model.equations {
@@ -236,38 +245,56 @@ pub fn modelica(model: &Model) -> Result<String, ExportError> {
         let _ =
             writeln!(out, "  output Real {own}{} {};", attributes(unit(&m.unit), &[]), string(&m.channel));
     }
-    if writer.tables {
-        out.push_str(TABLE);
+    for (_, own) in &writer.tables {
+        let _ = writeln!(out, "  Real {own};");
     }
     let _ = write!(out, "equation\n{equations}end {class};\n");
     Ok(out)
 }
 
-/// The function that stands for a `table` of the model language.
-const TABLE: &str = r#"protected
-  function table "Linear between the knots, held beyond the first and the last"
-    input Real x;
-    input Real knots[:];
-    input Real values[size(knots, 1)];
-    output Real y;
-  protected
-    Integer i = 1;
-  algorithm
-    while i < size(knots, 1) - 1 and x >= knots[i + 1] loop
-      i := i + 1;
-    end while;
-    y := values[i] + (values[i + 1] - values[i])/(knots[i + 1] - knots[i])
-      *(max(knots[1], min(knots[end], x)) - knots[i]);
-  end table;
-"#;
+/// Every table of the model, once.
+fn tables(model: &Model) -> Vec<Expr> {
+    let sides = model.equations.iter().flat_map(|e| [&e.lhs, &e.rhs]);
+    let mut all: Vec<Expr> = Vec::new();
+    sides.chain(model.measurements.iter().map(|m| &m.expr)).for_each(|e| {
+        e.walk(&mut |e| {
+            if matches!(e, Expr::Call(Func::Table, _)) && !all.contains(e) {
+                all.push(e.clone());
+            }
+        });
+    });
+    all
+}
+
+/// `if x <= k1 then v1 elseif x < k2 then v1 + (v2 - v1)*(x - k1)/(k2 - k1) … else vn`
+fn branches(table: &Table<'_>, writer: &mut Text<'_>) -> String {
+    let x = atom(table.x, writer);
+    let knots = &table.knots;
+    let values: Vec<String> = table.values.iter().map(|v| atom(v, writer)).collect();
+    let mut out = format!("if {x} <= {} then {}", number(knots[0]), values[0]);
+    for (k, v) in knots.windows(2).zip(values.windows(2)) {
+        let from = atom(&Expr::Num(k[0]), writer);
+        let _ = write!(
+            out,
+            " elseif {x} < {} then {} + ({} - {})*({x} - {from})/{}",
+            number(k[1]),
+            v[0],
+            v[1],
+            v[0],
+            number(k[1] - k[0])
+        );
+    }
+    let _ = write!(out, " else {}", values[values.len() - 1]);
+    out
+}
 
 struct Text<'a> {
     names: &'a Names,
     model: &'a Model,
     /// Whether a `sign` was written.
     signs: bool,
-    /// Whether a `table` was written.
-    tables: bool,
+    /// The tables, and the variables that have their values.
+    tables: Vec<(Expr, String)>,
 }
 
 impl Dialect for Text<'_> {
@@ -303,10 +330,10 @@ impl Dialect for Text<'_> {
             Func::Saturate => return format!("(if {a} > {b} then {b} elseif {a} < -{b} then -{b} else {a})"),
             Func::Step => return format!("(if {a} < {b} then 0 else 1)"),
             Func::Table => {
-                self.tables = true;
-                let n = written.len() / 2;
-                let (knots, values) = (written[1..=n].join(", "), written[n + 1..].join(", "));
-                return format!("table({a}, {{{knots}}}, {{{values}}})");
+                let own = |(call, own): &(Expr, String)| {
+                    matches!(call, Expr::Call(_, known) if known == arguments).then(|| own.clone())
+                };
+                return self.tables.iter().find_map(own).unwrap_or_default();
             }
             Func::Ln => "log",
             // Modelica's own, with its events.

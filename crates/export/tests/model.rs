@@ -221,3 +221,29 @@ fn units_that_only_the_model_language_has() {
     let told = latex_document(&model);
     assert!(told.contains("& $25$ & degC"), "{told}");
 }
+
+/// A table is a variable with branches in Modelica, also inside another, and a small matrix in LaTeX.
+#[test]
+fn tables_are_written_out() {
+    let text = "[inputs]\nf = {}\n[states]\nx = {}\n[parameters]\nm = { value = 2 }\nfa = { value = 1 }\n[equations]\n\
+                valve = \"m*x'' + table(table(x, [0, 1], [0, 1]), [-1, 0.5], [-fa, fa^2]) = f\"\n";
+    let model = Model::from_toml(text, "valve.toml").unwrap();
+    let written = modelica(&model).unwrap();
+    for line in [
+        "  Real table;\n  Real table_2;\nequation\n",
+        "  table = if table_2 <= -1 then (-fa) elseif table_2 < 0.5 then (-fa) + ((fa^2) - (-fa))*(table_2 - (-1))/1.5 \
+         else (fa^2);\n",
+        "  table_2 = if x <= 0 then 0 elseif x < 1 then 0 + (1 - 0)*(x - 0)/1 else 1;\n",
+        "  m*der(x_dot) + table = f \"valve\";\n",
+    ] {
+        assert!(written.contains(line), "{line} is not in\n{written}");
+    }
+    let written = latex_document(&model);
+    for part in [
+        r"\operatorname{table}\left(\operatorname{table}\left(x;\; \begin{smallmatrix} 0 & 0 \\ 1 & 1 \end{smallmatrix}\right);",
+        r"-1 & -\mathit{fa} \\ 0.5 & \mathit{fa}^{2} \end{smallmatrix}",
+        r"\text{ linear between the values } v",
+    ] {
+        assert!(written.contains(part), "{part} is not in\n{written}");
+    }
+}

@@ -14,6 +14,7 @@ mod summary;
 use std::fmt::Write as _;
 
 use askama::Template;
+use greybox_model::Func;
 use serde::Serialize;
 
 use crate::contract::{
@@ -627,7 +628,7 @@ fn marked_equation(old: &str, new: &str) -> String {
 fn italic(shown: &str) -> String {
     let mut out = String::new();
     for token in expression::tokens(shown) {
-        if token.starts_with(char::is_alphabetic) && !FUNCTIONS.contains(&token) {
+        if token.starts_with(char::is_alphabetic) && Func::from_name(token).is_none() {
             let _ = write!(out, "<var>{}</var>", escape(token));
         } else {
             out.push_str(&escape(token));
@@ -635,12 +636,6 @@ fn italic(shown: &str) -> String {
     }
     out
 }
-
-/// Functions of the model language, set upright.
-const FUNCTIONS: [&str; 16] = [
-    "sin", "cos", "tan", "exp", "ln", "sqrt", "abs", "sign", "tanh", "atan", "min", "max", "delay",
-    "deadzone", "saturate", "step",
-];
 
 // -- where the residual comes from ------------------------------------------------------------------------
 
