@@ -25,8 +25,8 @@ use crate::evidence::{Evidence, least_kappa, price};
 use crate::place::own_coordinates;
 use crate::screen::{Held, Scored, Together, reselect, screen, screen_set, shift_without};
 use crate::search::{
-    Accepted, Fitted, Found, Law, MISFIT, MOST_SAMPLES, SAME_HOLD, Search, UNDECIDED, WHITE, laws, limits,
-    next_scale, odds, same_level, whole,
+    Accepted, Fitted, Found, Law, MISFIT, MOST_SAMPLES, Part, SAME_HOLD, Search, UNDECIDED, WHITE, laws,
+    limits, next_scale, odds, same_level, whole,
 };
 use crate::turns::Turns;
 use crate::uncertainty::Uncertainty;
@@ -326,6 +326,39 @@ impl Search<'_> {
             || does_as_well(self.with_one(&less, &rich, 0.0, scale))
     }
 
+    /// The law without a name that scores most in the place of these parts of a model, in one of their equations and with no
+    /// more parameters, and how far it scores above them, which may only imitate it. `None` where there is no such law.
+    pub(crate) fn unnamed_above(
+        &self,
+        model: &Fitted,
+        parts: &[usize],
+        scale: &[f64],
+    ) -> Option<(f64, Part)> {
+        let nominal = &self.nominal().model;
+        let own: Vec<&Candidate> = parts.iter().map(|&i| &model.parts[i].candidate).collect();
+        let complexity = |c: &Candidate| self.library[c.mechanism].complexity();
+        let most: f64 = own.iter().map(|c| complexity(c)).sum();
+        let equations: Vec<String> = own.iter().flat_map(|c| c.place.equations(nominal)).collect();
+        let is_rival = |c: &Candidate| {
+            !self.library[c.mechanism].named
+                && complexity(c) <= most
+                && c.place.equations(nominal).iter().any(|e| equations.contains(e))
+        };
+        let rivals = self.closing().into_iter().filter(is_rival);
+        let (plain, rich): (Vec<_>, Vec<_>) = rivals.partition(|c| self.library[c.mechanism].is_plain());
+        let mut last_first = parts.to_vec();
+        last_first.sort_unstable_by(|a, b| b.cmp(a));
+        let mut less = model.clone();
+        for part in last_first {
+            less = self.less(&less, part, scale)?;
+        }
+        let others = [self.larger(&less, &plain, 1, scale), self.with_one(&less, &rich, 0.0, scale)];
+        let score = |of: &Fitted| self.robust(&less, of, scale);
+        let scored = others.into_iter().flatten().map(|other| (score(&other), other));
+        let (best, mut other) = scored.max_by(|a, b| a.0.total_cmp(&b.0))?;
+        Some((best - score(model), other.parts.pop()?))
+    }
+
     /// Whether a law brings a coordinate's highest derivative into an equation that neither has it nor governs that
     /// coordinate. With such laws equations can be added to each other at will, and no coefficient means anything.
     fn mixes(&self, law: &Candidate) -> bool {
@@ -594,6 +627,33 @@ second = "n*y'' + c*y' + l*(y - x) = 0"
         };
         assert!(held("coulomb_friction", &|[_, _, v, ..]| [0.8 * f64::tanh(1e3 * v), 0.0, 0.0]));
         assert!(!held("cubic_stiffness", &|[x, ..]| [0.02 * x * x * x, 0.0, 0.0]));
+    }
+
+    /// What only imitates a law without a name scores below it, alone or with others; a right name scores above all of them.
+    #[test]
+    fn a_name_that_imitates_a_law_without_one_is_outdone() {
+        let library = crate::built_in().unwrap();
+        let above = |kinds: &[&str], more: &dyn Fn([f64; 5]) -> [f64; 3]| {
+            let search = Search::new(bodies(more, 61), &library, &crate::Quiet);
+            let found = nothing(&search);
+            let first = |c: &Candidate| c.place.equations(&search.nominal().model) == ["first"];
+            let named = |kind: &&str| {
+                let is_it = |c: &&Candidate| library[c.mechanism].kind == *kind && first(c);
+                search.terms().find(is_it).cloned().expect(kind)
+            };
+            let laws: Vec<Candidate> = kinds.iter().map(named).collect();
+            let model = search.larger(&found.calibrated, &laws, laws.len(), &found.scale).unwrap();
+            assert_eq!(model.parts.len(), kinds.len());
+            let all: Vec<usize> = (0..kinds.len()).collect();
+            search.unnamed_above(&model, &all, &found.scale).unwrap().0
+        };
+        let damper = |[_, _, v, ..]: [f64; 5]| [0.3 * v.abs(), 0.0, 0.0];
+        assert!(above(&["quadratic_stiffness"], &damper) > UNDECIDED);
+        assert!(above(&["quadratic_stiffness", "constant_offset"], &damper) > UNDECIDED);
+        let dry = |[_, _, v, ..]: [f64; 5]| [0.8 * f64::tanh(1e3 * v), 0.0, 0.0];
+        assert!(above(&["coulomb_friction"], &dry) < -UNDECIDED);
+        let cube = |[x, ..]: [f64; 5]| [20.0 * x * x * x, 0.0, 0.0];
+        assert!(above(&["cubic_stiffness"], &cube) < -UNDECIDED);
     }
 
     /// The acceleration of one body has no place in the equation of the other.

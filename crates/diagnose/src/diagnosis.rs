@@ -637,7 +637,7 @@ fn conclude(
     // Mechanisms, remainder, verdict.
     let believed = believed(&judged, &found, improved);
     let verdict = if believed.contains(&true) { Verdict::MissingPhysics } else { judged.verdict };
-    let Judged { shares, left, surface, alone, without, full, base, doubts, .. } = judged;
+    let Judged { shares, left, surface, alone, without, full, base, doubts, outdone, .. } = judged;
     let share = |rss: f64| (rss / base.max(1e-300)).clamp(0.0, 1.0);
     let significant = found.errs || left.significant(improved.parts.len()) || verdict == Verdict::Unexplained;
     let mut mechanisms =
@@ -654,11 +654,24 @@ fn conclude(
         // What is still missing may be what was taken for this.
         if significant
             || doubts[i].is_some_and(|d| d > -UNDECIDED)
+            || outdone[i].is_some()
             || is_shared(improved, &shares, i)
             || is_crowded(improved, &shares, i, &nominal.model)
         {
             m.confidence = m.confidence.min(DOUBTED);
             m.alternatives.iter_mut().for_each(|a| a.confidence = a.confidence.min(DOUBTED));
+        }
+        if let Some(law) = &outdone[i] {
+            let place = &law.candidate.place;
+            let mechanism = &library[law.candidate.mechanism];
+            m.alternatives.push(Alternative {
+                kind: mechanism.kind.clone(),
+                confidence: 1.0 - DOUBTED,
+                equivalent: false,
+                expression: law.instance.expression.to_string(),
+                separate: mechanism.separate(place.moves(&nominal.model)).to_string(),
+                site: Site::of(std::slice::from_ref(place), &nominal.model),
+            });
         }
     }
     let proposal = believed.contains(&false).then(|| {
@@ -757,6 +770,8 @@ struct Judged {
     base: f64,
     /// How far above each part the law is that casts doubt on it.
     doubts: Vec<Option<f64>>,
+    /// The law without a name that does the work of each part, or of all together, better.
+    outdone: Vec<Option<Part>>,
 }
 
 impl Judged {
@@ -823,7 +838,17 @@ impl Judged {
             }
             verdict => verdict,
         };
-        Judged { verdict, named, shares, left, surface, alone, without, full, base, doubts }
+        // (Beside an error of the model and in a closure, laws without a name were among the candidates.)
+        let is_asked = verdict == Verdict::MissingPhysics && !found.errs && !found.closed;
+        let outdoes = |parts: &[usize]| {
+            let (above, law) = search.unnamed_above(&found.improved, parts, &found.scale)?;
+            (above > UNDECIDED).then_some(law)
+        };
+        let indices: Vec<usize> = (0..found.improved.parts.len()).collect();
+        let all = if is_asked && indices.len() > 1 { outdoes(&indices) } else { None };
+        let of = |i: &usize| if is_asked { outdoes(&[*i]).or_else(|| all.clone()) } else { None };
+        let outdone = indices.par_iter().map(of).collect();
+        Judged { verdict, named, shares, left, surface, alone, without, full, base, doubts, outdone }
     }
 }
 
