@@ -210,10 +210,15 @@ impl Site {
     }
 }
 
+/// Equivalents first, then the likelier.
+fn rank(alternatives: &mut [Alternative]) {
+    alternatives.sort_by(|a, b| b.equivalent.cmp(&a.equivalent).then(b.confidence.total_cmp(&a.confidence)));
+}
+
 /// One entry per kind and place, the likeliest, and none that is the finding itself under its own name: those that the
 /// data cannot separate first.
 fn distinct(mut alternatives: Vec<Alternative>, kind: &str, site: &Site) -> Vec<Alternative> {
-    alternatives.sort_by(|a, b| b.equivalent.cmp(&a.equivalent).then(b.confidence.total_cmp(&a.confidence)));
+    rank(&mut alternatives);
     let mut out: Vec<Alternative> = Vec::new();
     for a in alternatives {
         let known = (a.kind == kind && a.site.is(site))
@@ -672,6 +677,7 @@ fn conclude(
                 separate: mechanism.separate(place.moves(&nominal.model)).to_string(),
                 site: Site::of(std::slice::from_ref(place), &nominal.model),
             });
+            rank(&mut m.alternatives);
         }
     }
     let proposal = believed.contains(&false).then(|| {
