@@ -642,11 +642,12 @@ fn conclude(
     // Mechanisms, remainder, verdict.
     let believed = believed(&judged, &found, improved);
     let verdict = if believed.contains(&true) { Verdict::MissingPhysics } else { judged.verdict };
-    let Judged { shares, left, surface, alone, without, full, base, doubts, outdone, .. } = judged;
+    let Judged { shares, left, surface, alone, without, full, base, doubts, .. } = judged;
     let share = |rss: f64| (rss / base.max(1e-300)).clamp(0.0, 1.0);
     let significant = found.errs || left.significant(improved.parts.len()) || verdict == Verdict::Unexplained;
     let mut mechanisms =
         findings(improved, &found, &nominal.model, library, &scale, &shares, &train_role, &uncertainty);
+    let outdone = outdone(search, &found, verdict);
     let mut subsets = Vec::new();
     if verdict == Verdict::MissingPhysics && believed.iter().all(|b| *b) && !found.closed {
         subsets = subsets_of(
@@ -754,6 +755,21 @@ fn conclude(
     })
 }
 
+/// For each part that is named, the law without a name that does its work, or that of all parts together, better. (Beside an
+/// error of the model and in a closure, such laws were among the candidates.)
+fn outdone(search: &Search<'_>, found: &Found, verdict: Verdict) -> Vec<Option<Part>> {
+    let parts: Vec<usize> = (0..found.improved.parts.len()).collect();
+    if verdict != Verdict::MissingPhysics || found.errs || found.closed {
+        return vec![None; parts.len()];
+    }
+    let outdoes = |parts: &[usize]| {
+        let (above, law) = search.unnamed_above(&found.improved, parts, &found.scale)?;
+        (above > UNDECIDED).then_some(law)
+    };
+    let all = if parts.len() > 1 { outdoes(&parts) } else { None };
+    parts.par_iter().map(|part| outdoes(&[*part]).or_else(|| all.clone())).collect()
+}
+
 /// The name of a part and the equations that it enters.
 fn named_as(part: &Part, library: &[Mechanism], nominal: &Model) -> (String, Vec<String>) {
     let kind = library[part.candidate.mechanism].kind.clone();
@@ -776,8 +792,6 @@ struct Judged {
     base: f64,
     /// How far above each part the law is that casts doubt on it.
     doubts: Vec<Option<f64>>,
-    /// The law without a name that does the work of each part, or of all together, better.
-    outdone: Vec<Option<Part>>,
 }
 
 impl Judged {
@@ -844,17 +858,7 @@ impl Judged {
             }
             verdict => verdict,
         };
-        // (Beside an error of the model and in a closure, laws without a name were among the candidates.)
-        let is_asked = verdict == Verdict::MissingPhysics && !found.errs && !found.closed;
-        let outdoes = |parts: &[usize]| {
-            let (above, law) = search.unnamed_above(&found.improved, parts, &found.scale)?;
-            (above > UNDECIDED).then_some(law)
-        };
-        let indices: Vec<usize> = (0..found.improved.parts.len()).collect();
-        let all = if is_asked && indices.len() > 1 { outdoes(&indices) } else { None };
-        let of = |i: &usize| if is_asked { outdoes(&[*i]).or_else(|| all.clone()) } else { None };
-        let outdone = indices.par_iter().map(of).collect();
-        Judged { verdict, named, shares, left, surface, alone, without, full, base, doubts, outdone }
+        Judged { verdict, named, shares, left, surface, alone, without, full, base, doubts }
     }
 }
 
@@ -919,13 +923,13 @@ impl Closed {
                 return Ok(Closed::new(found, polished, judge));
             };
             // Whole recordings may not tell what segments with free starts told.
-            let smaller = match failure {
-                Failure::Undetermined(part) => search.smaller(&found.improved, part, &found.scale),
+            let smaller = match (failure.gate, &failure.parts[..]) {
+                (Gate::Determined, [part]) => search.smaller(&found.improved, *part, &found.scale),
                 _ => None,
             };
             match smaller {
                 Some(smaller) if !smaller.parts.is_empty() => found.improved = smaller,
-                _ => return Err(Rejected::at(failure.gate(), search, &polished.fitted)),
+                _ => return Err(Rejected::at(failure.gate, search, &polished.fitted)),
             }
         }
     }
@@ -1213,8 +1217,8 @@ fn defend(
         let Some(failure) = gates.failure(&polished, &found.scale) else { return polished };
         // Without the part that is missed least. (That would be one that is not determined, unless it is so only beside
         // another that does the same.)
-        let open = match failure {
-            Failure::Clock(bound) => bound,
+        let open = match failure.gate {
+            Gate::Clock => failure.parts,
             _ => (0..fitted.parts.len()).collect(),
         };
         let smaller = open
@@ -1254,29 +1258,16 @@ struct Gates<'a> {
     named: bool,
 }
 
-/// Where a model fails that cannot be handed back.
-enum Failure {
-    /// These parts act at certain times of a single recording.
-    Clock(Vec<usize>),
-    /// The recordings do not determine the strengths of this part, and of no other less.
-    Undetermined(usize),
-    /// It simulates the training recordings worse than the calibrated model.
-    Worse,
-    /// An inertia of it is negative.
-    Inertia,
-    /// It does not predict what is left out of its fit better than the calibrated model, beyond chance.
-    CrossValidation,
+/// The gate that a model fails at.
+struct Failure {
+    gate: Gate,
+    /// The parts that it fails by, where it is not the model as a whole.
+    parts: Vec<usize>,
 }
 
 impl Failure {
-    fn gate(&self) -> Gate {
-        match self {
-            Failure::Clock(_) => Gate::Clock,
-            Failure::Undetermined(_) => Gate::Determined,
-            Failure::Worse => Gate::Training,
-            Failure::Inertia => Gate::Inertia,
-            Failure::CrossValidation => Gate::CrossValidation,
-        }
+    fn at(gate: Gate, parts: Vec<usize>) -> Option<Failure> {
+        Some(Failure { gate, parts })
     }
 }
 
@@ -1294,22 +1285,22 @@ impl<'a> Gates<'a> {
         let likely = self.named && leaves_noise(&scores, &polished.origin, &own);
         let bound = if likely { Vec::new() } else { search.bound_to_a_clock(fitted) };
         if !bound.is_empty() {
-            return Some(Failure::Clock(bound));
+            return Failure::at(Gate::Clock, bound);
         }
         let widths = Uncertainty::of(&polished.origin, &own).widths();
         if let Some(part) = search.undetermined(&polished.origin, &widths) {
-            return Some(Failure::Undetermined(part));
+            return Failure::at(Gate::Determined, vec![part]);
         }
         if self.judge.criterion.misfit(&scores).total_cmp(&self.baseline.misfit).is_gt() {
-            return Some(Failure::Worse);
+            return Failure::at(Gate::Training, Vec::new());
         }
         if search.has_negative_inertia(&fitted.setup, &fitted.level, &fitted.fit.point, scale) {
-            return Some(Failure::Inertia);
+            return Failure::at(Gate::Inertia, Vec::new());
         }
         let predicts = || {
             Gain::of(self.baseline.errors(self.judge), &self.judge.errors(polished, &own)).is_beyond_chance()
         };
-        (!likely && !predicts()).then_some(Failure::CrossValidation)
+        if likely || predicts() { None } else { Failure::at(Gate::CrossValidation, Vec::new()) }
     }
 }
 
@@ -2077,11 +2068,11 @@ mod tests {
         };
         let gate = |model: Fitted, baseline: &Baseline| {
             let gates = Gates::new(&search, baseline, &judge, false);
-            gates.failure(&polish(&model, scale, &judge), scale).map(|failure| failure.gate())
+            gates.failure(&polish(&model, scale, &judge), scale).map(|failure| failure.gate)
         };
         let as_it_is = |model: Fitted, baseline: &Baseline| {
             let gates = Gates::new(&search, baseline, &judge, false);
-            gates.failure(&Polished::kept(model), scale).map(|failure| failure.gate())
+            gates.failure(&Polished::kept(model), scale).map(|failure| failure.gate)
         };
         let law = with("quadratic_stiffness", &[9.0], 20);
         assert_eq!(gate(law.clone(), &baseline()), None);

@@ -188,7 +188,7 @@ pub fn modelica(model: &Model) -> Result<String, ExportError> {
         model.measurements.iter().map(|m| names.fresh(&format!("y_{}", ascii(&m.channel)))).collect();
     let tables: Vec<(Expr, String)> =
         tables(model).into_iter().map(|call| (call, names.fresh("table"))).collect();
-    let mut writer = Text { names: &names, model, signs: false, tables: tables.clone() };
+    let mut writer = Text { names: &names, model, signs: false, tables: &tables };
     let mut equations = String::new();
     for s in &model.states {
         for primes in 1..s.order as u8 {
@@ -245,7 +245,7 @@ pub fn modelica(model: &Model) -> Result<String, ExportError> {
         let _ =
             writeln!(out, "  output Real {own}{} {};", attributes(unit(&m.unit), &[]), string(&m.channel));
     }
-    for (_, own) in &writer.tables {
+    for (_, own) in &tables {
         let _ = writeln!(out, "  Real {own};");
     }
     let _ = write!(out, "equation\n{equations}end {class};\n");
@@ -294,7 +294,7 @@ struct Text<'a> {
     /// Whether a `sign` was written.
     signs: bool,
     /// The tables, and the variables that have their values.
-    tables: Vec<(Expr, String)>,
+    tables: &'a [(Expr, String)],
 }
 
 impl Dialect for Text<'_> {

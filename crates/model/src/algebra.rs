@@ -241,20 +241,16 @@ fn simplify_binary(op: BinOp, a: Expr, b: Expr) -> Expr {
 }
 
 fn simplify_call(f: Func, args: Vec<Expr>) -> Expr {
-    if f == Func::Table {
-        let call = Expr::Call(f, args);
-        return match call.constant() {
-            Some(value) if value.is_finite() && !has_variables(&call) => Expr::Num(value),
-            _ => call,
-        };
-    }
     let numbers: Option<Vec<f64>> =
         args.iter().map(|a| if let Expr::Num(v) = a { Some(*v) } else { None }).collect();
     if let Some(v) = numbers
         && let Some(&a) = v.first()
         && (f, a) != (Func::Sign, 0.0)
     {
-        let value = call(f, a, v.get(1).copied().unwrap_or(0.0));
+        let value = match Table::of(&args) {
+            Some(table) if f == Func::Table => interpolate(&table.knots, &v[1 + table.knots.len()..], a),
+            _ => call(f, a, v.get(1).copied().unwrap_or(0.0)),
+        };
         if value.is_finite() {
             return Expr::Num(value);
         }
@@ -267,10 +263,6 @@ fn simplify_call(f: Func, args: Vec<Expr>) -> Expr {
         (Func::Abs, [Expr::Neg(a)]) => Expr::Call(f, vec![(**a).clone()]),
         _ => Expr::Call(f, args),
     }
-}
-
-fn has_variables(e: &Expr) -> bool {
-    !e.variables().is_empty()
 }
 
 fn add(a: Expr, b: Expr) -> Expr {

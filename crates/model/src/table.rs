@@ -45,8 +45,8 @@ impl<'a> Table<'a> {
     }
 }
 
-/// The value at `x` of a table with these knots and values; not a number where `x` is none.
-pub fn interpolate(knots: &[f64], values: &[f64], x: f64) -> f64 {
+/// The value at `x` of a table with these knots and as many values; not a number where `x` is none.
+pub(crate) fn interpolate(knots: &[f64], values: &[f64], x: f64) -> f64 {
     let last = knots.len() - 1;
     if x.is_nan() || x <= knots[0] {
         return if x.is_nan() { x } else { values[0] };
