@@ -13,6 +13,19 @@ pub const MAX_KNOTS: usize = 200;
 /// ```
 ///
 /// It is linear in the values. The knots are numbers, so x has no dimension; the values share one.
+///
+/// ```
+/// use greybox_model::parse;
+///
+/// let spring = parse("table(x/x0, [-1, 0, 2], [fa, 0, fb])")?.expr;
+/// let value = |x: f64| {
+///     let of = |name: &str, _: u8| [("x", x), ("x0", 0.1), ("fa", -5.0), ("fb", 8.0)].iter().find(|v| v.0 == name).map(|v| v.1);
+///     spring.eval(&of)
+/// };
+/// assert_eq!(value(0.1), Some(4.0));
+/// assert_eq!(value(-0.7), Some(-5.0));
+/// # Ok::<(), greybox_model::SyntaxError>(())
+/// ```
 #[derive(Debug, Clone, PartialEq)]
 pub struct Table<'a> {
     /// The argument.
