@@ -366,8 +366,9 @@ impl Candidate {
         mechanism
             .parameters()
             .enumerate()
-            .map(|(at, name)| {
+            .filter_map(|(at, name)| {
                 let (lower, upper) = match mechanism.inner(name) {
+                    Some((_, inner)) if inner.fixed => return None,
                     Some((i, inner)) => {
                         let (low, high) = inner.bounds(scales[i].abs().max(1e-300));
                         // A positive parameter may run down to zero unless the file says otherwise.
@@ -376,7 +377,12 @@ impl Candidate {
                     }
                     None => (if positive(name) { 0.0 } else { f64::NEG_INFINITY }, f64::INFINITY),
                 };
-                Free { index: first + at, prior: Prior::Flat, lower, upper }
+                // (What a shape's changes of slope are normal with is its size.)
+                let prior = match mechanism.shape {
+                    Some(_) => Prior::Normal { mean: 0.0, std: 1.0 },
+                    None => Prior::Flat,
+                };
+                Some(Free { index: first + at, prior, lower, upper })
             })
             .collect()
     }

@@ -23,7 +23,7 @@ use rayon::prelude::*;
 use crate::candidate::Candidate;
 use crate::evidence::{Evidence, least_kappa, price};
 use crate::place::own_coordinates;
-use crate::screen::{Held, Scored, Together, reselect, screen, screen_set, shift_without};
+use crate::screen::{Held, Scored, Together, reselect, screen, screen_set, screen_shapes, shift_without};
 use crate::search::{
     Accepted, Fitted, Found, Law, MISFIT, MOST_SAMPLES, Part, SAME_HOLD, Search, UNDECIDED, WHITE, laws,
     limits, next_scale, odds, same_level, whole,
@@ -36,6 +36,8 @@ const AT_ONCE: usize = 3;
 /// Laws with constants or a memory of their own that a round fits a few steps, and those of them that go on.
 const TRIALS: usize = 6;
 const FINALISTS: usize = 2;
+/// Laws of free shape that are fitted.
+const SHAPES: usize = 3;
 /// Where a fit with new terms may begin: how much of their values, how much of the shift of the parameters that goes with
 /// them. First order may promise too much of either.
 const STARTS: [(f64, f64); 3] = [(1.0, 1.0), (1.0, 0.0), (1e-3, 0.0)];
@@ -67,9 +69,9 @@ impl Search<'_> {
             return None;
         }
         let nominal = self.nominal();
-        let terms = self.closing();
         let (plain, rich): (Vec<_>, Vec<_>) =
-            terms.iter().cloned().partition(|c| self.library[c.mechanism].is_plain());
+            self.closing().into_iter().partition(|c| self.library[c.mechanism].is_plain());
+        let shapes: Vec<Candidate> = self.allowed().filter(|c| self.is_shape(c)).cloned().collect();
         // With a limit of work of its own.
         let work = Arc::new(Work::of_fits_within(self.most_work));
         self.observer.begins(&work);
@@ -79,13 +81,24 @@ impl Search<'_> {
         let mut scale = found.scale.clone();
         let mut lengths = self.lengths().to_vec();
         lengths.extend(lengths.last().is_some_and(|last| 2 * last < whole(nominal)).then(|| whole(nominal)));
-        for (step, &length) in lengths.iter().enumerate() {
+        // Free shapes once formulas are at their end. (From short segments again they cost as much as everything before.)
+        let formulas = lengths.iter().map(|&length| (length, false));
+        let rest = lengths.last().map(|&length| (length, true));
+        let has_shape = |model: &Fitted| model.parts.iter().any(|part| self.is_shape(&part.candidate));
+        let mut formula = None;
+        for (step, (length, is_rest)) in formulas.chain(rest).enumerate() {
+            if is_rest {
+                if !leaves_something(&current, &scale) || current.misfit(&scale) <= MISFIT {
+                    break;
+                }
+                formula = Some((current.clone(), scale.clone()));
+            }
             let level = same_level(&current.setup, &nominal.windows(length, MOST_SAMPLES));
             let (setup, parameters) = (&current.setup, &current.fit.point.parameters);
             let stitched = setup.stitch(&current.level, &current.fit.point, &level, &scale);
             let measured = Point { parameters: parameters.clone(), starts: setup.starts(&level, parameters) };
             // At the shortest, from the measurements: what long segments believe is in doubt.
-            let points = if step == 0 { vec![measured] } else { vec![stitched, measured] };
+            let points = if length == lengths[0] { vec![measured] } else { vec![stitched, measured] };
             let fit = setup.fit(&level, &scale, &points, limits(25));
             current = Fitted { level, fit, ..current };
             let mut seen: Vec<Vec<Candidate>> = Vec::new();
@@ -98,7 +111,9 @@ impl Search<'_> {
                 let settled = |more: Option<Fitted>, terms: &[Candidate]| {
                     self.settled(&current, more?, odds(terms.len()), &scale).filter(is_new)
                 };
-                let more = if is_spent() || !leaves_something(&current, &scale) {
+                // (Without a shape the formula is at its end.)
+                let is_done = is_rest && !has_shape(&current);
+                let more = if is_done || is_spent() || !leaves_something(&current, &scale) {
                     None
                 } else {
                     let plain = settled(self.larger(&current, &plain, AT_ONCE, &scale), &plain);
@@ -110,18 +125,27 @@ impl Search<'_> {
                     both.max_by(|a, b| told(a).total_cmp(&told(b)))
                 };
                 // (Where the terms leave a misfit, others do not do their work for less.)
-                let other = || match current.misfit(&scale) <= MISFIT {
+                let other = || match !is_done && current.misfit(&scale) <= MISFIT {
                     true => self.reselected(&current, &plain, &scale).filter(is_new),
                     false => None,
                 };
-                let Some(next) = more.or_else(other) else { break };
+                let shape = || match is_rest && !is_spent() && leaves_something(&current, &scale) {
+                    true => settled(self.shaped(&current, &shapes, &scale), &shapes),
+                    false => None,
+                };
+                let Some(next) = more.or_else(other).or_else(shape) else { break };
                 // (Another hold may have stood in for what has a term now.)
                 current = self.redecide_holds(&next, &scale, SAME_HOLD);
             }
-            if !visited.insert(step, candidates(&current)) {
+            if !is_rest && !visited.insert(step, candidates(&current)) {
                 self.observer.begins(&nominal.work);
                 return None;
             }
+        }
+        if let Some(formula) = formula
+            && !has_shape(&current)
+        {
+            (current, scale) = formula;
         }
         // What is left is work of the search again.
         self.observer.begins(&nominal.work);
@@ -143,14 +167,23 @@ impl Search<'_> {
         })
     }
 
-    /// The terms that a closure may hold: none that acts by a clock, that mixes equations, or that tells an angle from the same
-    /// angle a turn later where the equations do not.
+    /// The terms of a formula that a closure may hold.
     fn closing(&self) -> Vec<Candidate> {
+        self.allowed().filter(|c| !self.is_shape(c)).cloned().collect()
+    }
+
+    /// Terms of a formula and of free shape: none that acts by a clock, that mixes equations, or that tells an angle from the
+    /// same angle a turn later where the equations do not.
+    fn allowed(&self) -> impl Iterator<Item = &Candidate> {
         let turns = Turns::of(&self.nominal().model);
-        let holds = |c: &&Candidate| {
+        let holds = move |c: &&Candidate| {
             !self.is_bound_to_a_clock(c) && !self.mixes(c) && turns.admits(c, &self.library[c.mechanism])
         };
-        self.terms().filter(holds).cloned().collect()
+        self.terms().filter(holds)
+    }
+
+    fn is_shape(&self, candidate: &Candidate) -> bool {
+        self.library[candidate.mechanism].shape.is_some()
     }
 
     /// What the recordings say for each part of a closure, and what the search that found some of them could not tell from
@@ -206,6 +239,23 @@ impl Search<'_> {
         let (setup, point) = (&base.setup, &base.fit.point);
         let together = screen_set(setup, self.library, &open, &base.level, scale, point, most)?;
         self.extend_by(base, &open, &together, &STARTS, scale, STEPS)
+    }
+
+    /// The model with a law of free shape, where that is worth the odds against one of them: of those that are likeliest to
+    /// first order, the one that is worth most.
+    fn shaped(&self, base: &Fitted, shapes: &[Candidate], scale: &[f64]) -> Option<Fitted> {
+        let open = open(base, shapes);
+        let (setup, level, point) = (&base.setup, &base.level, &base.fit.point);
+        let weight = least_kappa(setup, level, scale, point);
+        let mut likeliest = screen_shapes(setup, self.library, &open, level, scale, point, weight);
+        likeliest.truncate(SHAPES);
+        let tried = likeliest.par_iter().filter_map(|shape| {
+            let shaped = self.extend_by(base, &open, shape, &STARTS, scale, STEPS_OF_A_TRIAL)?;
+            Some((self.robust(base, &shaped, scale), shaped))
+        });
+        let best = tried.collect::<Vec<_>>().into_iter().max_by(|a, b| a.0.total_cmp(&b.0))?;
+        let shaped = self.refit(&best.1, scale, STEPS);
+        (self.robust(base, &shaped, scale) > odds(shapes.len())).then_some(shaped)
     }
 
     /// The model with other terms for those that it holds, where they do the same work for less: fewer coefficients, or laws
@@ -608,6 +658,37 @@ second = "n*y'' + c*y' + l*(y - x) = 0"
             assert!((value / 9.0 - 1.0).abs() < 0.01, "{value}");
             let right = search.reselected(&with(&["quadratic_stiffness"]), &plain, &scale).map(told);
             assert_eq!(right, None);
+        }
+    }
+
+    /// A force that no formula is near stands in a table over its own variable: with it, and with the formula beside it, the
+    /// equation is right all over the range.
+    #[test]
+    fn what_no_formula_reaches_has_a_free_shape() {
+        let library = crate::built_in().unwrap();
+        // A magnet beside the first wheel.
+        let magnet = |x: f64| 1.5 * (-((x - 0.2) / 0.2).powi(2)).exp();
+        let search = Search::new(bodies(&|[x, ..]| [magnet(x), 0.0, 0.0], 70), &library, &crate::Quiet);
+        let found = nothing(&search);
+        let closed = search.closure(&found, &found.calibrated, &mut Visited::default()).unwrap();
+        let told = terms(&closed, &library, &search.nominal().model);
+        assert!(told.iter().any(|t| (&*t.0, &*t.1) == ("free_position_force", "first")), "{told:?}");
+        assert!(closed.improved.misfit(&closed.scale) < 1.1);
+        let (model, _) = search.tabulated(&closed.improved).expect("a shape");
+        let first = model.equations[0].residual();
+        let force = |at: f64| {
+            let of = |name: &str, primes: u8| match (name, primes) {
+                ("x", 0) => Some(at),
+                ("x" | "y", _) => Some(0.0),
+                ("f", _) => Some(0.0),
+                _ => model.parameter(name).map(|i| model.parameters[i].value),
+            };
+            first.eval(&of).unwrap()
+        };
+        for i in -10..=10 {
+            let x = 0.06 * f64::from(i);
+            let error = force(x) - (32.0 * x + magnet(x));
+            assert!(error.abs() < 0.1, "{x}: {error}");
         }
     }
 

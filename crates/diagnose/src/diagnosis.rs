@@ -13,7 +13,7 @@ use greybox_recording::Recording;
 use rayon::prelude::*;
 
 use crate::along::Along;
-use crate::candidate::Candidate;
+use crate::candidate::{Candidate, Instance};
 use crate::closure::Visited;
 use crate::evidence::{Evidence, fall, kappa};
 use crate::library::{Mechanism, MechanismError, built_in};
@@ -268,6 +268,23 @@ pub struct Finding {
     /// Its law against the residual: variable, and per training sample (variable, residual force,
     /// law's force).
     pub curve: Option<Curve>,
+}
+
+impl Finding {
+    /// As it stands in the model that is handed back, where that is not the one that was fitted.
+    fn stands_as(&mut self, instance: &Instance, model: &Model, is_shape: bool) {
+        let at = |name: &String| model.parameter(name);
+        if is_shape {
+            self.expression = instance.expression.to_string();
+            let known = |i: usize| Estimate { value: model.parameters[i].value, ci95: None };
+            let own = instance.names.iter().filter_map(|name| Some((name.clone(), at(name)?)));
+            self.parameters = own.map(|(name, i)| (name, i, known(i))).collect();
+        } else {
+            for (name, index, _) in &mut self.parameters {
+                *index = at(name).unwrap_or(*index);
+            }
+        }
+    }
 }
 
 /// A law beside the force that the rest of the model leaves over.
@@ -542,7 +559,8 @@ fn conclude(
     };
     let mut rejected = None;
     // (What passes for coloured noise may hold what no name explains.)
-    if errs || judged.verdict == Verdict::Unexplained {
+    if errs || judged.verdict == Verdict::Unexplained || judged.left.significant(polished.fitted.parts.len())
+    {
         let closed = Closed::of(search, &found, &polished, &baseline, &judge);
         // What reaches the noise leaves no error of the model to be believed beside.
         if errs && !options.terms_only && !closed.as_ref().is_ok_and(|closed| closed.leaves_noise) {
@@ -595,7 +613,11 @@ fn conclude(
         let _ = model.resolve_units();
         model
     };
-    let (calibrated_model, improved_model) = (final_model(calibrated), final_model(improved));
+    let calibrated_model = final_model(calibrated);
+    let (improved_model, instances) = match search.tabulated(improved) {
+        Some((model, instances)) => (model, Some(instances)),
+        None => (final_model(improved), None),
+    };
     let parameters: Vec<ParameterChange> = (0..nominal.model.parameters.len())
         .map(|i| ParameterChange {
             index: i,
@@ -647,6 +669,12 @@ fn conclude(
     let significant = found.errs || left.significant(improved.parts.len()) || verdict == Verdict::Unexplained;
     let mut mechanisms =
         findings(improved, &found, &nominal.model, library, &scale, &shares, &train_role, &uncertainty);
+    if let Some(instances) = &instances {
+        improved.parts.iter().zip(instances).zip(&mut mechanisms).for_each(|((part, instance), finding)| {
+            let mechanism = &library[part.candidate.mechanism];
+            finding.stands_as(instance, &improved_model, mechanism.shape.is_some());
+        });
+    }
     let outdone = outdone(search, &found, verdict);
     let mut subsets = Vec::new();
     if verdict == Verdict::MissingPhysics && believed.iter().all(|b| *b) && !found.closed {
@@ -2088,6 +2116,43 @@ mod tests {
         let folds = baseline().errors(&judge).len();
         let better = Baseline { errors: OnceCell::from(vec![-50.0; folds]), ..baseline() };
         assert_eq!(gate(law, &better), Some(Gate::CrossValidation));
+    }
+
+    /// A closure takes the place of what it simulates better than, and keeps the names that it holds; where it leaves more than
+    /// noise it must hold them all.
+    #[test]
+    fn a_closure_is_better_than_what_stands_and_holds_its_names() {
+        use crate::closure::tests::{bodies, nothing};
+        let library = built_in().unwrap();
+        let friction = |[_, _, v, ..]: [f64; 5]| [0.8 * f64::tanh(1e3 * v), 0.0, 0.0];
+        let search = Search::new(bodies(&friction, 62), &library, &crate::Quiet);
+        let found = nothing(&search);
+        let judge = Judge::of(&found.calibrated, &residual_scale(&found.calibrated, &found.scale));
+        let baseline = Baseline::of(&found, &search.nominal().values(), &judge);
+        let closure = search.closure(&found, &found.calibrated, &mut Visited::default()).unwrap();
+        let polished = polish(&closure.improved, &closure.scale, &judge);
+        let closed = Closed::new(closure, polished, &judge);
+        assert!(closed.leaves_noise);
+        for has_names in [false, true] {
+            assert!(closed.outdoes((&found, &baseline.polished), has_names, &judge));
+            assert!(
+                !closed.outdoes((&closed.found, &closed.polished), has_names, &judge),
+                "it is no better than itself"
+            );
+        }
+        let own = closed.polished.fitted.parts[0].candidate.clone();
+        assert_eq!(library[own.mechanism].kind, "coulomb_friction");
+        let is_other = |c: &&Candidate| library[c.mechanism].kind == "cubic_stiffness";
+        let other = search.terms().find(is_other).unwrap();
+        assert_eq!(closed.names(&search, &[&own]), Some(vec![own.clone()]));
+        assert_eq!(
+            closed.names(&search, &[&own, other]),
+            Some(vec![own.clone()]),
+            "there is no less than noise"
+        );
+        let leaves_more = Closed { leaves_noise: false, ..closed };
+        assert_eq!(leaves_more.names(&search, &[&own]), Some(vec![own.clone()]));
+        assert_eq!(leaves_more.names(&search, &[&own, other]), None);
     }
 
     fn alternative(kind: &str, equations: &[&str], confidence: f64, equivalent: bool) -> Alternative {

@@ -12,17 +12,19 @@
 //! first order, by δ = −(H − H_k)⁻¹ s_k; what that does to fold k's own residual is its held-out error.
 //!
 //! Beside it stands one quantity that could take the place of the score's κ and of all conditions on folds. It decides which
-//! terms a closure holds, and nothing else yet. It asks for the strength θ of the law itself: with its covariance S as its interval has it
-//! (`uncertainty.rs`) and S₀ in white noise,
+//! terms a closure holds, and nothing else yet. It asks for the strength θ of the law itself: with the covariance S that the
+//! residual gives it (`uncertainty.rs`), S₀ in white noise, and V, what a fit of unit variance knows of it,
 //!
 //! ```text
-//! c = tr(S₀⁻¹ S) / dim θ,  at least 1          (Godambe, Ann. Math. Stat. 31, 1960)
-//! robust = (ν + 1) ln(1 + Σ n_c ln(RSS_old/RSS_new) / (c ν)) − price(k, n/c) − 2·surcharge
+//! c = tr(V⁻¹ S) / tr(V⁻¹ S₀),  at least 1      (Godambe, Ann. Math. Stat. 31, 1960)
+//! robust = (ν + γ) ln(1 + Σ n_c ln(RSS_old/RSS_new) / (c ν)) − price(k, n/c) − 2·surcharge
 //! ```
 //!
 //! the ratio of likelihoods adjusted by c (Chandler and Bate, Biometrika 94, 2007). S is that of stationary noise
 //! (ν = ∞: the first term is the sum over c), or of the scores of some forty blocks of samples where that is larger; then
-//! c is known with ν degrees of freedom, and the ratio is Student's. A law that is right only here and there, or whose gain
+//! c is known with ν degrees of freedom, and the ratio is Student's in γ dimensions, those of θ less what priors decide of
+//! them (MacKay, Neural Computation 4, 1992). A free shape has priors: it is one parameter, its size, and costs
+//! |s|²/c − ln |V| besides ([`Smoothness`]). A law that is right only here and there, or whose gain
 //! a slow misfit makes, has a large c, however large the gain.
 
 use greybox_calibrate::{Level, Point, Setup, qr};
@@ -196,10 +198,12 @@ pub fn folds(setup: &Setup, level: &Level, scale: &[f64], point: &Point) -> Fold
 /// By how much white noise overstates what the samples tell of some parameters.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Inflation {
-    /// Mean eigenvalue of their covariance over that in white noise, at least 1.
+    /// The size of their covariance over that in white noise, at least 1.
     pub factor: f64,
     /// Degrees of freedom that it is known with: infinite in stationary noise, whose model has few parameters.
     pub freedom: f64,
+    /// How many parameters there are, less what their priors decide.
+    pub parameters: f64,
 }
 
 /// What a comparison knows of each of the two models.
@@ -210,6 +214,25 @@ pub struct Side {
     pub parameters: f64,
     /// Surcharges of its mechanisms.
     pub surcharge: f64,
+    /// What its free shapes cost.
+    pub shapes: Smoothness,
+}
+
+/// What free shapes cost: of changes of slope s that are normal with variance one before the fit, and with covariance V after
+/// it, twice the logarithm of the marginal likelihood falls by |s|²/c − ln |V| (Laplace's approximation; c as in
+/// [this module](self)).
+#[derive(Debug, Clone, Copy, Default, PartialEq)]
+pub struct Smoothness {
+    /// |s|².
+    pub squares: f64,
+    /// −ln |V|.
+    pub certainty: f64,
+}
+
+impl Smoothness {
+    fn price(self, inflation: f64) -> f64 {
+        self.squares / inflation + self.certainty
+    }
 }
 
 /// Price of `k` parameters: BIC's ln N for each, no less than AIC's 2, and on little information more, by the
@@ -246,9 +269,12 @@ fn gain(old: &Side, new: &Side, count: &[usize], weight: impl Fn(usize) -> f64) 
 pub fn robust(old: &Side, new: &Side, count: &[usize], inflation: Inflation) -> f64 {
     let (gain, information) = gain(old, new, count, |_| 1.0 / inflation.factor);
     let freedom = inflation.freedom;
-    let told =
-        if freedom.is_finite() && gain > 0.0 { (freedom + 1.0) * (gain / freedom).ln_1p() } else { gain };
-    let dearer = price(new.parameters, information) - price(old.parameters, information);
+    let told = match freedom.is_finite() && gain > 0.0 {
+        true => (freedom + inflation.parameters) * (gain / freedom).ln_1p(),
+        false => gain,
+    };
+    let cost = |side: &Side| price(side.parameters, information) + side.shapes.price(inflation.factor);
+    let dearer = cost(new) - cost(old);
     told - dearer - 2.0 * (new.surcharge - old.surcharge)
 }
 
@@ -283,10 +309,10 @@ pub fn weigh(
 
 #[cfg(test)]
 mod tests {
-    use super::{Folds, Inflation, Side, price, robust, weigh};
+    use super::{Folds, Inflation, Side, Smoothness, price, robust, weigh};
 
     fn side(rss: f64, parameters: f64) -> Side {
-        Side { rss: vec![rss], parameters, surcharge: 0.0 }
+        Side { rss: vec![rss], parameters, surcharge: 0.0, shapes: Smoothness::default() }
     }
 
     #[test]
@@ -306,7 +332,12 @@ mod tests {
     #[test]
     fn what_a_slow_misfit_makes_is_worth_less() {
         let of = |factor, freedom| {
-            robust(&side(1200.0, 0.0), &side(1000.0, 1.0), &[1000], Inflation { factor, freedom })
+            robust(
+                &side(1200.0, 0.0),
+                &side(1000.0, 1.0),
+                &[1000],
+                Inflation { factor, freedom, parameters: 1.0 },
+            )
         };
         let gain = 1000.0 * 1.2_f64.ln();
         let student = |gain: f64, n: f64| 40.0 * (1.0 + gain / 39.0).ln() - price(1.0, n);
@@ -320,7 +351,7 @@ mod tests {
             "{many} {all}"
         );
         // What is worse is no better for it, and a surcharge is paid.
-        let plain = Inflation { factor: 1.0, freedom: 39.0 };
+        let plain = Inflation { factor: 1.0, freedom: 39.0, parameters: 1.0 };
         let worse = robust(&side(1000.0, 0.0), &side(1100.0, 1.0), &[1000], plain);
         assert!(worse < -90.0, "{worse}");
         let dear = Side { surcharge: 3.0, ..side(1000.0, 1.0) };

@@ -16,6 +16,8 @@
 //! zc = { grid = [0.01, 0.1], scale = "range(d)" }
 //! [first]                        # parameters of the law that the score test reaches through others
 //! fc = "s0*zc"
+//! [shape]                        # optional: `shape` in the law is a function of this, free at some knots
+//! of = "d'"
 //! [location]                     # where the law acts, if it has a threshold
 //! variable = "d'"
 //! low = "-2*vs"
@@ -44,13 +46,13 @@
 //! | `input`, `measurement`, `parameter` | the symbol, which `replace` stands in for | `u`; `y`; `p` |
 //!
 //! `t` and `pi` are known everywhere. A name listed under `linear` or `[inner]` that the law does not use
-//! is a *shape*: it serves the score test, and `[first]` turns it into the law's own parameters (`angle(y,
-//! x)` is the angle of the vector (x, y)). The law must be linear in the `linear` names, through `[first]`
-//! if need be.
+//! serves the score test alone, and `[first]` turns it into the law's own parameters (`angle(y, x)` is the angle of the
+//! vector (x, y)). The law must be linear in the `linear` names, through `[first]` if need be. A law of free shape
+//! ([`Shape`]) has no parameters of its own.
 
 use std::collections::BTreeMap;
 
-use greybox_model::{Expr, parse};
+use greybox_model::{Expr, Func, Table, parse};
 use serde::Deserialize;
 
 /// What a mechanism acts on.
@@ -139,12 +141,124 @@ pub struct Inner {
     pub spectral: Option<Expr>,
     /// What a spectral law is multiplied by.
     pub carrier: Option<Expr>,
+    /// It stays at its first value: a size that other parameters are relative to.
+    pub fixed: bool,
 }
 
 impl Inner {
+    /// A size that stays as it is.
+    fn fixed(name: &str, scale: Scale) -> Inner {
+        Inner {
+            name: name.to_string(),
+            grid: vec![1.0],
+            scale,
+            low: 0.0,
+            high: f64::INFINITY,
+            spectral: None,
+            carrier: None,
+            fixed: true,
+        }
+    }
+
     /// Smallest and largest admissible value, in the unit of its `scale`.
     pub(crate) fn bounds(&self, scale: f64) -> (f64, f64) {
         (self.low * scale, self.high * scale)
+    }
+}
+
+/// A function of free shape in a law, which writes `shape` where it stands.
+///
+/// ```text
+/// shape(x) = sf Σᵢ √hᵢ slopeᵢ max(|z̄| − |kᵢ|, 0),    z̄ = x/sr held between the first and the last of the knots k
+/// ```
+///
+/// over the knots on the side of z̄ between the two ends, hᵢ the mean distance to the neighbours of kᵢ, sr the root mean
+/// square of x. Each knot changes the slope by √hᵢ slopeᵢ. With these normal about zero the slope is a Wiener process (Wahba,
+/// *Spline Models for Observational Data*, 1990, §1.5; piecewise linear), whose size sf is. A constant and a straight line
+/// are no part of it: they have terms of their own.
+#[derive(Debug, Clone, PartialEq)]
+pub struct Shape {
+    /// The variable x.
+    pub of: Expr,
+    /// The law, with the variable `shape` for the function.
+    law: Expr,
+}
+
+impl Shape {
+    /// Knots, over the root mean square of the variable.
+    const KNOTS: [f64; 25] = [
+        -3.0, -2.75, -2.5, -2.25, -2.0, -1.75, -1.5, -1.25, -1.0, -0.75, -0.5, -0.25, 0.0, 0.25, 0.5, 0.75,
+        1.0, 1.25, 1.5, 1.75, 2.0, 2.25, 2.5, 2.75, 3.0,
+    ];
+    /// Names of the root mean square and of the size.
+    const SIZES: [&'static str; 2] = ["sr", "sf"];
+
+    /// Knots between the ends.
+    fn inner_knots() -> &'static [f64] {
+        &Shape::KNOTS[1..Shape::KNOTS.len() - 1]
+    }
+
+    /// Names of the changes of the slope, one for each knot between the ends.
+    fn changes() -> Vec<String> {
+        (1..=Shape::inner_knots().len()).map(|i| format!("slope{i}")).collect()
+    }
+
+    /// √h of each knot between the ends.
+    fn weights() -> Vec<f64> {
+        Shape::KNOTS.windows(3).map(|k| (0.5 * (k[2] - k[0])).sqrt()).collect()
+    }
+
+    /// What a change of one in the slope at a knot makes of the function at z.
+    fn hinge(knot: f64, z: f64) -> f64 {
+        match knot.total_cmp(&0.0) {
+            std::cmp::Ordering::Equal => 0.5 * z.abs(),
+            std::cmp::Ordering::Less => (knot - z).max(0.0),
+            std::cmp::Ordering::Greater => (z - knot).max(0.0),
+        }
+    }
+
+    /// The law as a sum over the knots.
+    fn expanded(&self) -> Expr {
+        let [root, size] = Shape::SIZES.map(Expr::var);
+        let call = |f: Func, args: Vec<Expr>| Expr::Call(f, args);
+        let [first, .., last] = Shape::KNOTS;
+        let held = call(
+            Func::Min,
+            vec![call(Func::Max, vec![self.of.clone() / root, Expr::Num(first)]), Expr::Num(last)],
+        );
+        let hinge = |knot: f64| match knot.total_cmp(&0.0) {
+            std::cmp::Ordering::Equal => Expr::Num(0.5) * call(Func::Abs, vec![held.clone()]),
+            std::cmp::Ordering::Less => call(Func::Max, vec![Expr::Num(knot) - held.clone(), Expr::Num(0.0)]),
+            std::cmp::Ordering::Greater => {
+                call(Func::Max, vec![held.clone() - Expr::Num(knot), Expr::Num(0.0)])
+            }
+        };
+        let terms = Shape::inner_knots().iter().zip(Shape::weights()).zip(Shape::changes());
+        let terms = terms.map(|((knot, weight), name)| Expr::Num(weight) * Expr::var(&name) * hinge(*knot));
+        let sum = terms.reduce(|a, b| a + b).unwrap_or(Expr::Num(0.0));
+        self.with(&(size * sum))
+    }
+
+    /// The law with this function for its shape.
+    fn with(&self, function: &Expr) -> Expr {
+        self.law.substitute(&|name, _| (name == "shape").then(|| function.clone()))
+    }
+
+    /// The law with the function as a table whose largest value is one, of these changes of the slope, and that largest value
+    /// over the size.
+    fn tabulated(&self, changes: &[f64]) -> (Expr, f64) {
+        let value = |z: f64| -> f64 {
+            let of = Shape::inner_knots().iter().zip(Shape::weights()).zip(changes);
+            of.map(|((knot, weight), change)| weight * change * Shape::hinge(*knot, z)).sum()
+        };
+        let values = Shape::KNOTS.map(value);
+        let largest = values.iter().fold(f64::MIN_POSITIVE, |m, v| m.max(v.abs()));
+        // (Four digits are closer than any recording tells a force.)
+        let rounded = |v: f64| Expr::Num((1e4 * v / largest).round() / 1e4 + 0.0);
+        let [root, size] = Shape::SIZES.map(Expr::var);
+        let table =
+            Table::call(self.of.clone() / root, &Shape::KNOTS, values.iter().copied().map(rounded).collect());
+        (self.with(&(size * table)), largest)
     }
 }
 
@@ -265,6 +379,8 @@ pub struct Mechanism {
     pub positive: Vec<String>,
     /// The other parameters.
     pub inner: Vec<Inner>,
+    /// The function of free shape that it holds, if it does.
+    pub shape: Option<Shape>,
     /// Parameters of the law that the score test reaches through others.
     pub first: Vec<(String, First)>,
     /// Further figures for the report, expressions in the parameters.
@@ -399,6 +515,7 @@ struct File {
     surcharge: f64,
     #[serde(default)]
     inner: toml::map::Map<String, toml::Value>,
+    shape: Option<ShapeFile>,
     location: Option<LocationFile>,
     #[serde(default)]
     equals: toml::map::Map<String, toml::Value>,
@@ -410,6 +527,12 @@ struct File {
 
 fn yes() -> bool {
     true
+}
+
+#[derive(Deserialize)]
+#[serde(deny_unknown_fields)]
+struct ShapeFile {
+    of: String,
 }
 
 #[derive(Deserialize)]
@@ -496,6 +619,29 @@ impl Mechanism {
             let value = expression(&formula("report", &name, &value)?, "report", &name)?;
             report.push((name, value));
         }
+        let mut inner: Vec<Inner> =
+            raw.inner.into_iter().map(|(name, value)| inner(name, value)).collect::<Result<_, _>>()?;
+        let (mut law, mut linear) = (law, raw.linear);
+        let mut shape = None;
+        if let Some(of) = raw.shape {
+            let of = expression(&of.of, "shape", "of")?;
+            if raw.named || !linear.is_empty() || !inner.is_empty() || !law.mentions("shape") {
+                return Err(Fault::new(
+                    "shape",
+                    "of",
+                    "a law of free shape has `named = false`, writes `shape` where the function stands, and has no parameters of its own",
+                ));
+            }
+            linear = Shape::changes();
+            inner = [Scale::Rms(of.clone()), Scale::One]
+                .into_iter()
+                .zip(Shape::SIZES)
+                .map(|(scale, name)| Inner::fixed(name, scale))
+                .collect();
+            let free = Shape { of, law };
+            law = free.expanded();
+            shape = Some(free);
+        }
         let mut mechanism = Mechanism {
             kind: raw.kind,
             family: raw.family,
@@ -509,9 +655,10 @@ impl Mechanism {
                 .into_iter()
                 .map(|(name, value)| memory(name, value))
                 .collect::<Result<_, _>>()?,
-            linear: raw.linear,
+            linear,
             positive: raw.positive,
-            inner: raw.inner.into_iter().map(|(name, value)| inner(name, value)).collect::<Result<_, _>>()?,
+            inner,
+            shape,
             first,
             report,
             own: Vec::new(),
@@ -543,26 +690,50 @@ impl Mechanism {
             return Err(Fault::new(
                 "",
                 "named",
-                "a law without a name is a force with strengths under `linear`, without `reaction`, `doubts`, `[equals]` and the time `t`",
+                "a law without a name is a force, or a change of an input or a measurement, that vanishes with its strengths under `linear`, without `reaction`, `doubts`, `[equals]` and the time `t`",
             ));
         }
         Ok(mechanism)
     }
 
-    /// Whether it is a force on one motion that vanishes with its strengths and knows no time: what a formula is a sum of. One
-    /// that equals the sum of others is none.
+    /// Whether it is what a formula is a sum of: something that vanishes with its strengths and knows no time, a force on one
+    /// motion or, without a name, a change of an input or of a reading. One that equals the sum of others is none.
     pub fn is_term(&self) -> bool {
-        !self.on.replaces()
-            && !self.linear.is_empty()
+        !self.linear.is_empty()
+            && self.vanishes()
             && self.reaction.is_none()
             && self.doubts.is_empty()
             && self.equals.is_empty()
             && !self.law.mentions("t")
     }
 
+    /// Whether nothing is left of the law without its strengths. (A change with a name is no sum: it is tried alone.)
+    fn vanishes(&self) -> bool {
+        let base = match self.on {
+            On::Input if !self.named => Expr::var("u"),
+            On::Measurement if !self.named => Expr::var("y"),
+            on if on.replaces() => return false,
+            _ => return true,
+        };
+        let without = |name: &str, _| self.linear.iter().any(|l| l == name).then_some(Expr::Num(0.0));
+        self.law.substitute(&without).simplify() == base
+    }
+
     /// Whether such a force is a function of the motion times one coefficient.
     pub(crate) fn is_plain(&self) -> bool {
         self.states.is_empty() && self.inner.is_empty() && self.first.is_empty() && self.linear.len() == 1
+    }
+
+    /// A law of free shape with the numbers of its function in a table, and what is left of these values of its parameters.
+    pub(crate) fn tabulated(&self, values: &[f64]) -> Option<(Mechanism, Vec<f64>)> {
+        let shape = self.shape.as_ref()?;
+        let of = |name: &str| self.own.iter().position(|own| own == name).map(|i| values[i]);
+        let changes: Vec<f64> = self.linear.iter().map(|name| of(name)).collect::<Option<_>>()?;
+        let (law, largest) = shape.tabulated(&changes);
+        let [root, size] = Shape::SIZES;
+        let own = Shape::SIZES.map(str::to_string).to_vec();
+        let left = vec![of(root)?, of(size)? * largest];
+        Some((Mechanism { law, own, linear: Vec::new(), ..self.clone() }, left))
     }
 
     /// Which of the law's own parameters vanish with its force: those that grow in proportion with its strengths, and all of
@@ -602,7 +773,7 @@ impl Mechanism {
             }
     }
 
-    /// Every name given to a parameter or a shape.
+    /// Every name given to a parameter, of the law or of the score test.
     fn names(&self) -> impl Iterator<Item = &str> {
         self.linear
             .iter()
@@ -1120,7 +1291,7 @@ fn inner(name: String, value: toml::Value) -> Result<Inner, Fault> {
     if !enclosed {
         return Err(fault(format!("`low` ({low}) and `high` ({high}) must enclose the grid")));
     }
-    Ok(Inner { name, grid: entry.grid, scale, low, high, spectral, carrier })
+    Ok(Inner { name, grid: entry.grid, scale, low, high, spectral, carrier, fixed: false })
 }
 
 fn scale(text: &str, name: &str) -> Result<Scale, Fault> {
@@ -1284,7 +1455,9 @@ mod tests {
             assert!(!mechanism.about.signature.is_empty());
             assert!(!mechanism.named || !mechanism.about.physics.is_empty(), "{file}: [about] physics");
             let described: Vec<&String> = mechanism.about.parameters.keys().collect();
-            let mut own = mechanism.own.clone();
+            // (The changes of a shape's slope are not reported.)
+            let is_told = |name: &&String| mechanism.shape.is_none() || !mechanism.linear.contains(*name);
+            let mut own: Vec<String> = mechanism.own.iter().filter(is_told).cloned().collect();
             own.sort();
             assert_eq!(described, own.iter().collect::<Vec<_>>(), "{file}: [about] parameters");
             for kind in &mechanism.about.confused_with {
@@ -1318,6 +1491,55 @@ mod tests {
         let both = read(&format!("{HEAD}domain = \"mechanical\"\n{body}{TAIL}elsewhere = \"s\"\n"));
         assert_eq!(both.domain, Some(Domain::Mechanical));
         assert_eq!((both.separate(true), both.separate(false)), ("e", "s"));
+    }
+
+    /// A change of an input or a reading is a term where nothing of it is left without its strengths, and it has no name.
+    #[test]
+    fn what_vanishes_with_its_strengths_is_a_term() {
+        let is_term = |on: &str, law: &str| {
+            let text = format!(
+                "kind = \"k\"\nfamily = \"f\"\non = \"{on}\"\nnamed = false\n{law}\nlinear = [\"c\"]{TAIL}"
+            );
+            Mechanism::from_toml(&text, "x.toml").is_ok_and(|m| m.is_term())
+        };
+        assert!(
+            is_term("measurement", "replace = \"y + c*y^2\"")
+                && is_term("input", "replace = \"u + c*u*abs(u)\"")
+        );
+        assert!(!is_term("input", "replace = \"c*u\"") && !is_term("measurement", "replace = \"2*y + c\""));
+        let library = built_in().unwrap();
+        let named = |kind: &str| library.iter().find(|m| m.kind == kind).unwrap();
+        assert!(!named("sensor_offset").is_term() && named("fading_input").is_term());
+    }
+
+    /// A law of free shape is the same function before and after its numbers stand in a table, no line and no constant.
+    #[test]
+    fn a_free_shape_is_a_table() {
+        let text = "kind = \"k\"\nfamily = \"f\"\non = \"motion\"\nnamed = false\nforce = \"d'*shape\"\n[shape]\nof = \"d\"";
+        let shape = Mechanism::from_toml(&format!("{text}{TAIL}"), "x.toml").unwrap();
+        assert!(shape.is_term() && !shape.is_plain());
+        let changes: Vec<f64> = (0..shape.linear.len()).map(|i| (1.0 + i as f64 * 1.7).sin()).collect();
+        let values = shape.values(&changes, &[0.2, 5.0]).unwrap();
+        let (table, left) = shape.tabulated(&values).unwrap();
+        assert_eq!(table.parameters().collect::<Vec<_>>(), ["sr", "sf"]);
+        let at = |m: &Mechanism, own: &[f64], d: f64| {
+            let of = |n: &str, primes: u8| match (n, primes) {
+                ("d", 0) => Some(d),
+                ("d", 1) => Some(1.0),
+                _ => m.parameters().position(|p| p == n).map(|i| own[i]),
+            };
+            m.law.eval(&of).unwrap()
+        };
+        let grid = (-40..=40).map(|i| 0.02 * f64::from(i));
+        let most = grid.clone().map(|d| at(&shape, &values, d).abs()).fold(0.0, f64::max);
+        assert!((most / left[1] - 1.0).abs() < 1e-9, "the size is the largest value: {most} {}", left[1]);
+        for d in grid {
+            let (before, after) = (at(&shape, &values, d), at(&table, &left, d));
+            assert!((before - after).abs() < 1e-4 * most, "{d}: {before} {after}");
+        }
+        assert_eq!(at(&shape, &values, 0.0), 0.0);
+        let [edge, beyond] = [0.6, 0.7].map(|d| at(&table, &left, d));
+        assert!((beyond - edge).abs() < 1e-12 * most, "held beyond the last knot: {edge} {beyond}");
     }
 
     #[test]
@@ -1359,6 +1581,13 @@ mod tests {
             ("force = \"d\"\nreplace = \"d\"", 4, "none has both"),
             ("force = \"d\"\nreaction = \"d\"", 5, "only a mechanism on a pair"),
             ("named = false\nforce = \"k*d*t\"\nlinear = [\"k\"]", 4, "a law without a name is a force"),
+            ("force = \"shape\"\n[shape]\nof = \"d\"", 6, "a law of free shape has `named = false`"),
+            (
+                "named = false\nforce = \"d\"\n[shape]\nof = \"d\"",
+                7,
+                "writes `shape` where the function stands",
+            ),
+            ("named = false\nforce = \"shape\"\n[shape]\nof = \"q\"", 5, "the law uses `q`"),
             ("force = \"fc*sign(d'\"\nlinear = [\"fc\"]", 4, "`force = \"fc*sign(d'\"`"),
             ("force = \"fc*sgn(d')\"\nlinear = [\"fc\"]", 4, "sgn"),
             ("force = \"fc*sign(d')\"", 4, "the law uses `fc`, which is neither a parameter"),

@@ -107,12 +107,13 @@ pub struct RejectedLaw {
 impl Rejected {
     /// The laws of a model that fails at a gate.
     pub(crate) fn at(gate: Gate, search: &Search<'_>, fitted: &Fitted) -> Rejected {
-        let law = |part: &Part| RejectedLaw {
+        let tables = search.tabulated(fitted).map(|(_, instances)| instances);
+        let law = |(i, part): (usize, &Part)| RejectedLaw {
             kind: search.library[part.candidate.mechanism].kind.clone(),
             equations: part.candidate.place.equations(&search.nominal().model),
-            expression: part.instance.expression.to_string(),
+            expression: tables.as_ref().map_or(&part.instance, |tables| &tables[i]).expression.to_string(),
         };
-        Rejected { gate, laws: fitted.parts.iter().map(law).collect() }
+        Rejected { gate, laws: fitted.parts.iter().enumerate().map(law).collect() }
     }
 }
 
@@ -138,7 +139,10 @@ impl Proposal {
         let errors = calibrated.iter().copied().zip(own.iter().copied());
         let folds = validate::folds(data).into_iter().zip(errors);
         let folds = folds.map(|(left_out, errors)| Fold::of(data, &left_out, errors));
-        let correlations = correlations(improved, proposed, uncertainty);
+        // (The changes of a shape's slope are no figures of their own.)
+        let formulas = proposed.iter().filter(|part| library[part.candidate.mechanism].shape.is_none());
+        let formulas: Vec<&Part> = formulas.copied().collect();
+        let correlations = correlations(improved, &formulas, uncertainty);
         Proposal { ranges, outside, folds: folds.collect(), correlations }
     }
 }

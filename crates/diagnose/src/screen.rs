@@ -25,6 +25,7 @@ use crate::along::Along;
 use crate::candidate::Candidate;
 use crate::library::{Mechanism, Scale};
 use crate::place::Place;
+use crate::shapes::evidence;
 use crate::spectra::Spectra;
 
 /// One candidate with one choice of its inner parameters, as columns of the regression.
@@ -1223,6 +1224,71 @@ pub fn screen_set(
     }
     let (coefficients, gain) = best?;
     all.together(&chosen, &coefficients, gain)
+}
+
+/// Widths of a free shape that are tried, each twice the one before.
+const WIDTHS: i32 = 30;
+
+/// The laws of free shape that make the residual likelier, the likeliest first: each with the size of the largest marginal
+/// likelihood ([`evidence`], every square worth `weight`), and the likeliest function of that size.
+pub(crate) fn screen_shapes(
+    setup: &Setup,
+    library: &[Mechanism],
+    candidates: &[Candidate],
+    level: &Level,
+    scale: &[f64],
+    point: &Point,
+    weight: f64,
+) -> Vec<Together> {
+    let lanes = lanes_at(setup, library, candidates, level, scale, point);
+    let blocks: Vec<Range<usize>> = lanes.variants.iter().map(|v| v.columns.clone()).collect();
+    let gram = gram(setup, level, scale, point, &lanes.signals, &lanes.columns, blocks);
+    let sized = |index: usize| {
+        let Projection { gg, gr, columns, base } = gram.projection(index);
+        let n = gr.len();
+        let root: Vec<f64> = (0..n * n).map(|i| f64::from(u8::from(i / n == i % n))).collect();
+        let strongest = (0..n).map(|i| gg[i * n + i]).fold(0.0, f64::max);
+        if !(strongest.is_finite() && strongest > 0.0) {
+            return None;
+        }
+        // From where the best known of them is just known.
+        let least = 1.0 / (weight * strongest).sqrt();
+        let tried = (0..WIDTHS).map(|i| least * 2f64.powi(i));
+        let tried = tried.map(|width| (evidence(&root, &gg, &gr, weight, width), width));
+        let (evidence, width) = tried.filter(|t| t.0.is_finite()).max_by(|a, b| a.0.total_cmp(&b.0))?;
+        let mut precision: Vec<f64> = gg.iter().map(|v| weight * v).collect();
+        (0..n).for_each(|i| precision[i * n + i] += 1.0 / (width * width));
+        let wanted: Vec<f64> = gr.iter().map(|v| weight * v).collect();
+        let changes = qr::solve_spd(&precision, n, &wanted);
+        let explained = 2.0 * qr::dot(&changes, &gr)
+            - (0..n).map(|i| changes[i] * qr::dot(&gg[i * n..(i + 1) * n], &changes)).sum::<f64>();
+        let mut shift = base;
+        for (column, change) in columns.iter().zip(&changes) {
+            shift.iter_mut().zip(column).for_each(|(s, x)| *s -= change * x);
+        }
+        let gain = explained / gram.remaining().max(1e-300);
+        let variant = &lanes.variants[index];
+        let mechanism = &library[candidates[variant.candidate].mechanism];
+        // (In a fit, where a square is worth one, what has the same balance of residual and size.)
+        let size = width * weight.sqrt();
+        let [root, _] = variant.inner[..] else { return None };
+        let changes: Vec<f64> = changes.iter().map(|c| c / size).collect();
+        let values = mechanism.values(&changes, &[root, size])?;
+        let scored = Scored {
+            candidate: variant.candidate,
+            gain,
+            values,
+            shift: shift.clone(),
+            scales: variant.scales.clone(),
+            faint: None,
+            others: Vec::new(),
+        };
+        Some((evidence, Together { members: vec![scored], gain, shift }))
+    };
+    let mut sized: Vec<(f64, Together)> = (0..lanes.variants.len()).filter_map(sized).collect();
+    sized.retain(|shape| shape.0 > 0.0);
+    sized.sort_by(|a, b| b.0.total_cmp(&a.0));
+    sized.into_iter().map(|shape| shape.1).collect()
 }
 
 /// A term that a model holds, of one coefficient.

@@ -5,14 +5,14 @@ use std::cell::LazyCell;
 use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, Ordering};
 
-use greybox_calibrate::{Ending, Fit, Free, Level, Limits, Point, Setup, Work, free_parameters};
+use greybox_calibrate::{Ending, Fit, Free, Level, Limits, Point, Setup, Work, free_parameters, qr};
 use greybox_model::system::CompileError;
 use greybox_model::{Hold, Model};
 use rayon::prelude::*;
 
 use crate::along::Along;
 use crate::candidate::{Candidate, Instance, candidates};
-use crate::evidence::{Evidence, Side, folds, kappa, least_kappa, robust, weigh};
+use crate::evidence::{Evidence, Side, Smoothness, folds, kappa, least_kappa, robust, weigh};
 use crate::explore::{Belief, Explorer, Hypothesis, Posterior};
 use crate::library::Mechanism;
 use crate::place::{Place, places};
@@ -356,7 +356,7 @@ impl<'a> Search<'a> {
         }
     }
 
-    /// What a formula is a sum of: forces that vanish with their strengths, with a name or without.
+    /// What a formula is a sum of: what vanishes with its strengths, with a name or without.
     pub(crate) fn terms(&self) -> impl Iterator<Item = &Candidate> {
         self.all.iter().chain(&self.unnamed).filter(|c| self.library[c.mechanism].is_term())
     }
@@ -405,6 +405,35 @@ impl<'a> Search<'a> {
         // The names come from the model itself.
         let setup = setup.with_carried(&memory).unwrap_or(setup);
         Ok((setup, out))
+    }
+
+    /// A model whose free shapes are tables, with the numbers of their functions, and the instances of its parts in it. `None`
+    /// where it has none.
+    pub(crate) fn tabulated(&self, fitted: &Fitted) -> Option<(Model, Vec<Instance>)> {
+        let law = |part: &Part| &self.library[part.candidate.mechanism];
+        if !fitted.parts.iter().any(|part| law(part).shape.is_some()) {
+            return None;
+        }
+        let mut model = self.nominal().model.clone();
+        model.inputs.iter_mut().zip(&fitted.setup.holds).for_each(|(input, hold)| input.hold = *hold);
+        let values = &fitted.fit.point.parameters;
+        model.parameters.iter_mut().zip(values).for_each(|(p, v)| p.value = *v);
+        let mut instances = Vec::new();
+        for part in &fitted.parts {
+            let value = |name: &String| fitted.setup.model.parameter(name).map(|i| values[i]);
+            let own: Vec<f64> = part.instance.names.iter().map(value).collect::<Option<_>>()?;
+            let first = model.parameters.len();
+            instances.push(match law(part).tabulated(&own) {
+                Some((table, left)) => {
+                    let instance = part.candidate.insert(&mut model, &table, &left);
+                    model.parameters[first].fixed = true; // what the knots are multiples of
+                    instance
+                }
+                None => part.candidate.insert(&mut model, law(part), &own),
+            });
+        }
+        let _ = model.resolve_units();
+        Some((model, instances))
     }
 
     /// The laws of a fitted model with their present values.
@@ -784,8 +813,35 @@ impl<'a> Search<'a> {
     fn side(&self, of: &Fitted, new: &Fitted, scale: &[f64]) -> Side {
         let rss = if new.setup.noise.is_some() { innovations(of, scale) } else { of.fit.rss.clone() };
         let mechanisms = || of.parts.iter().map(|part| &self.library[part.candidate.mechanism]);
-        let parameters = mechanisms().map(|m| m.parameters().count() as f64).sum();
-        Side { rss, parameters, surcharge: mechanisms().map(|m| m.surcharge).sum() }
+        // (Of a free shape its size alone: the rest has a prior.)
+        let parameters =
+            mechanisms().map(|m| if m.shape.is_some() { 1.0 } else { m.parameters().count() as f64 });
+        Side {
+            rss,
+            parameters: parameters.sum(),
+            surcharge: mechanisms().map(|m| m.surcharge).sum(),
+            shapes: self.smoothness(of, scale),
+        }
+    }
+
+    /// What the free shapes of a model cost.
+    fn smoothness(&self, of: &Fitted, scale: &[f64]) -> Smoothness {
+        let is_shape = |part: &&Part| self.library[part.candidate.mechanism].shape.is_some();
+        let free = |name: &String| {
+            let index = of.setup.model.parameter(name)?;
+            of.setup.free.iter().position(|f| f.index == index)
+        };
+        let names = of.parts.iter().filter(is_shape).flat_map(|part| &part.instance.names);
+        let positions: Vec<usize> = names.filter_map(free).collect();
+        if positions.is_empty() {
+            return Smoothness::default();
+        }
+        let value = |&i: &usize| of.fit.point.parameters[of.setup.free[i].index];
+        let known = Uncertainty::known(of, scale, &positions);
+        Smoothness {
+            squares: positions.iter().map(|i| value(i).powi(2)).sum(),
+            certainty: -qr::log_determinant(&known, positions.len()),
+        }
     }
 
     /// What is known of the strengths that `new` has and `old` has not ([`robust`]).

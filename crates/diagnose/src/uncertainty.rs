@@ -85,6 +85,12 @@ impl Linearised<'_> {
         Linearised { fitted, segments, priors, inverse: inverse(&h, np) }
     }
 
+    /// How many of these parameters the residual decides: their number less what their priors do (MacKay, *Bayesian
+    /// interpolation*, Neural Computation 4, 1992).
+    fn decided(&self, of: impl Iterator<Item = usize>) -> f64 {
+        of.map(|i| 1.0 - self.priors[i] * self.inverse[i][i]).sum()
+    }
+
     /// Covariance of the parameters, given that of their scores.
     fn covariance(&self, meat: &[f64]) -> Vec<f64> {
         between(&self.inverse, meat, self.priors.len())
@@ -182,7 +188,7 @@ impl Uncertainty {
         let stationary = Estimated { covariance: model.covariance(&meat), freedom };
         let scores = block_scores(model.fitted, &model.segments);
         let count = scores.len() as f64;
-        let freedom = (count - np as f64).max(2.0);
+        let freedom = (count - model.decided(0..np)).max(2.0);
         let mut meat = vec![0.0; np * np];
         for s in &scores {
             for a in 0..np {
@@ -197,30 +203,49 @@ impl Uncertainty {
         Uncertainty { np, stationary, blocks, surplus }
     }
 
-    /// tr(S₀⁻¹ S)/dim θ of the parameters θ at these positions among those that are free, with their covariance S and the
-    /// one in white noise, S₀.
+    /// tr(V⁻¹ S)/tr(V⁻¹ S₀) of the parameters θ at these positions among those that are free: S is the part of their covariance
+    /// that comes from the residual, S₀ the same in white noise, and V = (H⁻¹)_θ what a fit of unit variance knows of them with
+    /// their priors. (Where a prior decides, the residual says nothing, however it is distributed.)
     pub(crate) fn inflation(fitted: &Fitted, scale: &[f64], tested: &[usize]) -> Inflation {
         if tested.is_empty() {
-            return Inflation { factor: 1.0, freedom: f64::INFINITY };
+            return Inflation { factor: 1.0, freedom: f64::INFINITY, parameters: 0.0 };
         }
         let model = Linearised::of(fitted, scale);
         let (own, white) = (Uncertainty::at(&model), model.covariance(&model.white()));
         let t = tested.len();
-        let block = |all: &[f64]| -> Vec<f64> {
-            (0..t * t).map(|i| all[tested[i / t] * own.np + tested[i % t]]).collect()
+        let block = |at: &dyn Fn(usize, usize) -> f64| -> Vec<f64> {
+            (0..t * t).map(|i| at(tested[i / t], tested[i % t])).collect()
         };
-        let white = inverse(&block(&white), t);
-        let ratio = |covariance: &[f64]| {
-            let covariance = block(covariance);
-            (0..t).map(|a| qr::dot(&white[a], &covariance[a * t..(a + 1) * t])).sum::<f64>() / t as f64
+        let known = block(&|a, b| model.inverse[a][b]);
+        let certainty = inverse(&known, t);
+        // What the priors of θ are uncertain by, in the covariances that count them.
+        let (_, variance) = model.spent();
+        let by_priors = block(&|a, b| {
+            let of = |&i: &usize| model.inverse[a][i] * model.priors[i] * model.inverse[i][b];
+            variance * tested.iter().map(of).sum::<f64>()
+        });
+        let size = |covariance: &[f64], counted: f64| -> f64 {
+            let of = block(&|a, b| covariance[a * own.np + b]);
+            let of: Vec<f64> = of.iter().zip(&by_priors).map(|(c, p)| c - counted * p).collect();
+            (0..t).map(|a| qr::dot(&certainty[a], &of[a * t..(a + 1) * t])).sum()
         };
-        let (stationary, blocks) = (ratio(&own.stationary.covariance), ratio(&own.blocks.covariance));
+        let white = size(&white, 1.0);
+        let stationary = size(&own.stationary.covariance, 1.0) / white;
+        let blocks = size(&own.blocks.covariance, 0.0) / white;
         let (factor, freedom) = if blocks > own.surplus * stationary {
             (blocks, own.blocks.freedom)
         } else {
             (stationary, f64::INFINITY)
         };
-        Inflation { factor: if factor.is_finite() { factor.max(1.0) } else { 1.0 }, freedom }
+        let factor = if factor.is_finite() { factor.max(1.0) } else { 1.0 };
+        Inflation { factor, freedom, parameters: model.decided(tested.iter().copied()) }
+    }
+
+    /// Covariance of the parameters at these positions in white noise of the fit's scale.
+    pub(crate) fn known(fitted: &Fitted, scale: &[f64], positions: &[usize]) -> Vec<f64> {
+        let model = Linearised::of(fitted, scale);
+        let t = positions.len();
+        (0..t * t).map(|i| model.inverse[positions[i / t]][positions[i % t]]).collect()
     }
 
     /// Half width of the 95 % interval of a figure with this gradient in the free parameters.

@@ -1,7 +1,8 @@
 //! Expressions of the model language as a textbook prints them: `fc*sign(theta')` → fc·sign(θ′).
 //!
 //! Display only: the text is split into names, numbers and signs, never interpreted. Whatever it holds
-//! comes out, escaped in the HTML form, so an expression that does not parse is still shown.
+//! comes out, escaped in the HTML form, so an expression that does not parse is still shown. Of a long list, such as the
+//! knots of a table, the ends are shown.
 
 use crate::format::superscript_char;
 
@@ -106,6 +107,25 @@ enum Style {
     Html,
 }
 
+/// Most entries of a list in brackets that are all shown.
+const LONGEST_LIST: usize = 6;
+
+/// Leaves the first and the last entry of long lists, with an ellipsis between.
+fn shorten_lists(pieces: &mut Vec<&str>, word_gap: &mut Vec<bool>) {
+    let mut from = 0;
+    while let Some(open) = pieces[from..].iter().position(|p| *p == "[").map(|at| from + at) {
+        let Some(length) = pieces[open..].iter().position(|p| *p == "]") else { return };
+        let commas: Vec<usize> = (open..open + length).filter(|i| pieces[*i] == ",").collect();
+        if let (Some(first), Some(last)) = (commas.first(), commas.last())
+            && commas.len() >= LONGEST_LIST
+        {
+            pieces.splice(first + 1..*last, ["…"]);
+            word_gap.splice(first + 1..*last, [false]);
+        }
+        from = open + 1;
+    }
+}
+
 fn render(expression: &str, style: Style) -> String {
     // Blanks are set anew around the operators; only between two words do they mean something.
     let mut pieces: Vec<&str> = Vec::new();
@@ -119,6 +139,7 @@ fn render(expression: &str, style: Style) -> String {
         pieces.push(token);
         word_gap.push(std::mem::take(&mut blank));
     }
+    shorten_lists(&mut pieces, &mut word_gap);
     let mut out = String::new();
     // One entry per open parenthesis: true where it is the bar of an absolute value.
     let mut open: Vec<bool> = Vec::new();
@@ -307,6 +328,12 @@ mod tests {
             ("delay(x, tau_f)", "delay(x, τ_f)"),
             ("x^n", "x^n"),
             ("hub torque 2", "hub torque 2"),
+            ("table(x, [-1, 1], [a, b])", "table(x, [−1, 1], [a, b])"),
+            (
+                "table(x, [-3, -2, -1, 0, 1, 2, 3.5], [1, 2, 3, 4, 5, 6, -7])",
+                "table(x, [−3, …, 3.5], [1, …, −7])",
+            ),
+            ("[1, 2, 3, 4, 5, 6, 7", "[1, 2, 3, 4, 5, 6, 7"),
             ("", ""),
         ] {
             assert_eq!(text(source), shown, "{source}");
