@@ -88,7 +88,8 @@ impl Search<'_> {
         let mut formula = None;
         for (step, (length, is_rest)) in formulas.chain(rest).enumerate() {
             if is_rest {
-                if !leaves_something(&current, &scale) || current.misfit(&scale) <= MISFIT {
+                let is_enough = !leaves_something(&current, &scale) || current.misfit(&scale) <= MISFIT;
+                if is_enough || shapes.is_empty() {
                     break;
                 }
                 formula = Some((current.clone(), scale.clone()));
@@ -665,7 +666,9 @@ second = "n*y'' + c*y' + l*(y - x) = 0"
     /// equation is right all over the range.
     #[test]
     fn what_no_formula_reaches_has_a_free_shape() {
-        let library = crate::built_in().unwrap();
+        let file = include_str!("../more/free_position_force.toml");
+        let shape = Mechanism::from_toml(file, "free_position_force.toml").unwrap();
+        let library = [crate::built_in().unwrap(), vec![shape]].concat();
         // A magnet beside the first wheel.
         let magnet = |x: f64| 1.5 * (-((x - 0.2) / 0.2).powi(2)).exp();
         let search = Search::new(bodies(&|[x, ..]| [magnet(x), 0.0, 0.0], 70), &library, &crate::Quiet);

@@ -559,8 +559,8 @@ fn conclude(
     };
     let mut rejected = None;
     // (What passes for coloured noise may hold what no name explains.)
-    if errs || judged.verdict == Verdict::Unexplained || judged.left.significant(polished.fitted.parts.len())
-    {
+    let unnamed = polished.fitted.parts.is_empty();
+    if errs || judged.verdict == Verdict::Unexplained || unnamed && judged.left.significant(0) {
         let closed = Closed::of(search, &found, &polished, &baseline, &judge);
         // What reaches the noise leaves no error of the model to be believed beside.
         if errs && !options.terms_only && !closed.as_ref().is_ok_and(|closed| closed.leaves_noise) {
