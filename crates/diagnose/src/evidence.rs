@@ -350,6 +350,11 @@ mod tests {
             (all - (gain - price(1.0, 1000.0))).abs() < 1e-9 && (many - all).abs() < 0.01,
             "{many} {all}"
         );
+        // Of three strengths Student's ratio has three dimensions; a prior's price falls with what the residual is worth.
+        let three = Inflation { factor: 2.0, freedom: 39.0, parameters: 3.0 };
+        let shaped = Side { shapes: Smoothness { squares: 8.0, certainty: 5.0 }, ..side(1000.0, 1.0) };
+        let expected = 42.0 * (1.0 + gain / 78.0).ln() - price(1.0, 500.0) - (4.0 + 5.0);
+        assert!((robust(&side(1200.0, 0.0), &shaped, &[1000], three) - expected).abs() < 1e-9);
         // What is worse is no better for it, and a surcharge is paid.
         let plain = Inflation { factor: 1.0, freedom: 39.0, parameters: 1.0 };
         let worse = robust(&side(1000.0, 0.0), &side(1100.0, 1.0), &[1000], plain);

@@ -1001,6 +1001,21 @@ fn lanes_at(
     lanes(setup, library, candidates, &along, &spectra)
 }
 
+/// The same with the products of each variant's own responses.
+fn variants_at(
+    setup: &Setup,
+    library: &[Mechanism],
+    candidates: &[Candidate],
+    level: &Level,
+    scale: &[f64],
+    point: &Point,
+) -> (Lanes, Gram) {
+    let lanes = lanes_at(setup, library, candidates, level, scale, point);
+    let blocks: Vec<Range<usize>> = lanes.variants.iter().map(|v| v.columns.clone()).collect();
+    let gram = gram(setup, level, scale, point, &lanes.signals, &lanes.columns, blocks);
+    (lanes, gram)
+}
+
 /// The same with the products of all responses with each other.
 fn responses(
     setup: &Setup,
@@ -1240,9 +1255,7 @@ pub(crate) fn screen_shapes(
     point: &Point,
     weight: f64,
 ) -> Vec<Together> {
-    let lanes = lanes_at(setup, library, candidates, level, scale, point);
-    let blocks: Vec<Range<usize>> = lanes.variants.iter().map(|v| v.columns.clone()).collect();
-    let gram = gram(setup, level, scale, point, &lanes.signals, &lanes.columns, blocks);
+    let (lanes, gram) = variants_at(setup, library, candidates, level, scale, point);
     let sized = |index: usize| {
         let Projection { gg, gr, columns, base } = gram.projection(index);
         let n = gr.len();
@@ -1395,9 +1408,7 @@ pub fn screen(
     scale: &[f64],
     point: &Point,
 ) -> Vec<Scored> {
-    let lanes = lanes_at(setup, library, candidates, level, scale, point);
-    let blocks: Vec<Range<usize>> = lanes.variants.iter().map(|v| v.columns.clone()).collect();
-    let gram = gram(setup, level, scale, point, &lanes.signals, &lanes.columns, blocks);
+    let (lanes, gram) = variants_at(setup, library, candidates, level, scale, point);
     scored(library, candidates, &lanes, &gram)
 }
 
