@@ -50,6 +50,7 @@
 //! vector (x, y)). The law must be linear in the `linear` names, through `[first]` if need be. A law of free shape
 //! ([`Shape`]) has no parameters of its own.
 
+use std::cmp::Ordering;
 use std::collections::BTreeMap;
 
 use greybox_model::{Expr, Func, Table, parse};
@@ -172,8 +173,8 @@ impl Inner {
 /// shape(x) = sf Σᵢ √hᵢ slopeᵢ max(|z̄| − |kᵢ|, 0),    z̄ = x/sr held between the first and the last of the knots k
 /// ```
 ///
-/// over the knots on the side of z̄ between the two ends, hᵢ the mean distance to the neighbours of kᵢ, sr the root mean
-/// square of x. Each knot changes the slope by √hᵢ slopeᵢ. With these normal about zero the slope is a Wiener process (Wahba,
+/// over the knots on the side of z̄ between the two ends, the one at zero counting half, hᵢ the mean distance to the neighbours
+/// of kᵢ, sr the root mean square of x. Each knot changes the slope by √hᵢ slopeᵢ. With these normal about zero the slope is a Wiener process (Wahba,
 /// *Spline Models for Observational Data*, 1990, §1.5; piecewise linear), whose size sf is. A constant and a straight line
 /// are no part of it: they have terms of their own.
 #[derive(Debug, Clone, PartialEq)]
@@ -208,35 +209,26 @@ impl Shape {
         Shape::KNOTS.windows(3).map(|k| (0.5 * (k[2] - k[0])).sqrt()).collect()
     }
 
-    /// What a change of one in the slope at a knot makes of the function at z.
-    fn hinge(knot: f64, z: f64) -> f64 {
-        match knot.total_cmp(&0.0) {
-            std::cmp::Ordering::Equal => 0.5 * z.abs(),
-            std::cmp::Ordering::Less => (knot - z).max(0.0),
-            std::cmp::Ordering::Greater => (z - knot).max(0.0),
-        }
+    /// The function over its size, at z between the ends.
+    fn sum(z: &Expr) -> Expr {
+        let beyond = |from: Expr, to: Expr| Expr::Call(Func::Max, vec![from - to, Expr::Num(0.0)]);
+        let hinge = |k: f64| match k.total_cmp(&0.0) {
+            Ordering::Equal => Expr::Num(0.5) * Expr::Call(Func::Abs, vec![z.clone()]),
+            Ordering::Less => beyond(Expr::Num(k), z.clone()),
+            Ordering::Greater => beyond(z.clone(), Expr::Num(k)),
+        };
+        let terms = Shape::inner_knots().iter().zip(Shape::weights()).zip(Shape::changes());
+        let terms = terms.map(|((knot, weight), name)| Expr::Num(weight) * Expr::var(&name) * hinge(*knot));
+        terms.reduce(|a, b| a + b).unwrap_or(Expr::Num(0.0))
     }
 
     /// The law as a sum over the knots.
     fn expanded(&self) -> Expr {
         let [root, size] = Shape::SIZES.map(Expr::var);
-        let call = |f: Func, args: Vec<Expr>| Expr::Call(f, args);
-        let [first, .., last] = Shape::KNOTS;
-        let held = call(
-            Func::Min,
-            vec![call(Func::Max, vec![self.of.clone() / root, Expr::Num(first)]), Expr::Num(last)],
-        );
-        let hinge = |knot: f64| match knot.total_cmp(&0.0) {
-            std::cmp::Ordering::Equal => Expr::Num(0.5) * call(Func::Abs, vec![held.clone()]),
-            std::cmp::Ordering::Less => call(Func::Max, vec![Expr::Num(knot) - held.clone(), Expr::Num(0.0)]),
-            std::cmp::Ordering::Greater => {
-                call(Func::Max, vec![held.clone() - Expr::Num(knot), Expr::Num(0.0)])
-            }
-        };
-        let terms = Shape::inner_knots().iter().zip(Shape::weights()).zip(Shape::changes());
-        let terms = terms.map(|((knot, weight), name)| Expr::Num(weight) * Expr::var(&name) * hinge(*knot));
-        let sum = terms.reduce(|a, b| a + b).unwrap_or(Expr::Num(0.0));
-        self.with(&(size * sum))
+        let [first, .., last] = Shape::KNOTS.map(Expr::Num);
+        let above = Expr::Call(Func::Max, vec![self.of.clone() / root, first]);
+        let held = Expr::Call(Func::Min, vec![above, last]);
+        self.with(&(size * Shape::sum(&held)))
     }
 
     /// The law with this function for its shape.
@@ -247,10 +239,9 @@ impl Shape {
     /// The law with the function as a table whose largest value is one, of these changes of the slope, and that largest value
     /// over the size.
     fn tabulated(&self, changes: &[f64]) -> (Expr, f64) {
-        let value = |z: f64| -> f64 {
-            let of = Shape::inner_knots().iter().zip(Shape::weights()).zip(changes);
-            of.map(|((knot, weight), change)| weight * change * Shape::hinge(*knot, z)).sum()
-        };
+        let names = Shape::changes();
+        let change = |name: &str, _| names.iter().position(|n| n == name).map(|i| changes[i]);
+        let value = |z: f64| Shape::sum(&Expr::Num(z)).eval(&change).unwrap_or(0.0);
         let values = Shape::KNOTS.map(value);
         let largest = values.iter().fold(f64::MIN_POSITIVE, |m, v| m.max(v.abs()));
         // (Four digits are closer than any recording tells a force.)
