@@ -666,9 +666,7 @@ second = "n*y'' + c*y' + l*(y - x) = 0"
     /// equation is right all over the range.
     #[test]
     fn what_no_formula_reaches_has_a_free_shape() {
-        let file = include_str!("../more/free_position_force.toml");
-        let shape = Mechanism::from_toml(file, "free_position_force.toml").unwrap();
-        let library = [crate::built_in().unwrap(), vec![shape]].concat();
+        let library = crate::built_in().unwrap();
         // A magnet beside the first wheel.
         let magnet = |x: f64| 1.5 * (-((x - 0.2) / 0.2).powi(2)).exp();
         let search = Search::new(bodies(&|[x, ..]| [magnet(x), 0.0, 0.0], 70), &library, &crate::Quiet);

@@ -19,6 +19,7 @@ use crate::evidence::{Evidence, fall, kappa};
 use crate::library::{Mechanism, MechanismError, built_in};
 use crate::locate::{Location, force, locate};
 use crate::place::{Motion, Place};
+use crate::plausibility::Deviation;
 use crate::proposal::{Gate, Proposal, Rejected};
 use crate::search::{
     Fitted, Found, MISFIT, MOST_WORK, Part, Rival, Search, UNDECIDED, log_likelihood_gain, raw_rms, raw_rss,
@@ -1325,6 +1326,11 @@ impl<'a> Gates<'a> {
         if search.has_negative_inertia(&fitted.setup, &fitted.level, &fitted.fit.point, scale) {
             return Failure::at(Gate::Inertia, Vec::new());
         }
+        let machine = search.nominal().model.parameters.len();
+        let deviation = |of: &Fitted| Deviation::of(&of.setup.free, machine, &of.fit.point.parameters);
+        if !likely && deviation(fitted).is_implausible_beside(deviation(&self.baseline.polished.fitted)) {
+            return Failure::at(Gate::Parameters, Vec::new());
+        }
         let predicts = || {
             Gain::of(self.baseline.errors(self.judge), &self.judge.errors(polished, &own)).is_beyond_chance()
         };
@@ -2112,6 +2118,13 @@ mod tests {
         // (An inertia of −0.02 kg m²: any force moves it far, so that it is well known.)
         let negative = with("position_dependent_inertia", &[-1.02, 0.5], 0);
         assert_eq!(as_it_is(negative, &lenient), Some(Gate::Inertia));
+        // Five standard deviations from where the model states it, the calibrated one as stated.
+        let mut drawn_away = law.clone();
+        let damping = drawn_away.setup.free.iter().position(|f| f.index == 2).unwrap();
+        let value = drawn_away.fit.point.parameters[2];
+        drawn_away.setup.free[damping].prior =
+            greybox_calibrate::Prior::Normal { mean: value - 0.5, std: 0.1 };
+        assert_eq!(as_it_is(drawn_away, &lenient), Some(Gate::Parameters));
         // A calibrated model that predicts better.
         let folds = baseline().errors(&judge).len();
         let better = Baseline { errors: OnceCell::from(vec![-50.0; folds]), ..baseline() };

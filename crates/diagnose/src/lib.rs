@@ -14,6 +14,7 @@ mod explore;
 pub mod library;
 pub mod locate;
 pub mod place;
+mod plausibility;
 pub mod proposal;
 pub mod screen;
 pub mod search;

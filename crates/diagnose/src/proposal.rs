@@ -76,6 +76,9 @@ pub enum Gate {
     Training,
     /// No inertia is negative.
     Inertia,
+    /// The machine's own parameters are no less plausible than those of the calibrated model, or within what the model states of
+    /// them (`std`).
+    Parameters,
     /// It predicts what is left out of its fit better than the calibrated model, beyond chance.
     CrossValidation,
     /// It simulates the training recordings better than what stands without it, and predicts what is left out better.

@@ -58,21 +58,13 @@ fn record((more, beside): (&str, &str), [p, q]: [f64; 2], size: f64, seed: u64) 
     Recording::from_columns("run.csv", time, vec![channel("f", "N", force), channel("x", "m", x)]).unwrap()
 }
 
-/// The library and a file beside it.
-fn with(file: &str) -> Options {
-    let own = greybox_diagnose::Mechanism::from_toml(file, "own.toml").unwrap();
-    let library = [greybox_diagnose::built_in().unwrap(), vec![own]].concat();
-    Options { library: Some(library), ..Options::default() }
-}
-
 /// An input whose effect falls with how large it was.
 #[test]
 fn an_input_that_fades_is_proposed_with_its_constants() {
     let model = Model::from_toml(NOMINAL, "nominal.toml").unwrap();
     let fading = |size, seed| record((" - p*f*z", "lag = \"z' = q*(abs(f) - z)\""), [-0.2, 1.0], size, seed);
     let (train, held) = ([fading(1.0, 1), fading(1.0, 2)], [fading(1.3, 3)]);
-    let options = with(include_str!("../more/fading_input.toml"));
-    let found = diagnose(&model, &train, &held, &options, &Quiet).unwrap();
+    let found = diagnose(&model, &train, &held, &Options::default(), &Quiet).unwrap();
     let [candidate] = &found.candidates[..] else { panic!("{} candidates", found.candidates.len()) };
     assert_eq!((&*candidate.kind, candidate.input.as_deref()), ("fading_input", Some("f")));
     let value = |name: &str| candidate.parameters.iter().find(|p| p.0 == name).unwrap().2.value;

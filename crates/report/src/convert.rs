@@ -370,6 +370,7 @@ fn closure_rejected(of: &proposal::Rejected) -> ClosureRejected {
         proposal::Gate::Determined => Gate::Determined,
         proposal::Gate::Training => Gate::Training,
         proposal::Gate::Inertia => Gate::Inertia,
+        proposal::Gate::Parameters => Gate::Parameters,
         proposal::Gate::CrossValidation => Gate::CrossValidation,
         proposal::Gate::Comparison => Gate::Comparison,
         proposal::Gate::Names => Gate::Names,

@@ -111,6 +111,7 @@ pub fn rejected(report: &Report) -> Option<String> {
         Gate::Determined => "the recordings do not determine its coefficients",
         Gate::Training => "it simulates whole recordings worse than the calibrated model",
         Gate::Inertia => "it makes an inertia negative",
+        Gate::Parameters => "with it the machine's own parameters are far from what the model states of them",
         Gate::CrossValidation => {
             "it does not predict data that it was not fitted to better than the calibrated model"
         }
