@@ -22,6 +22,7 @@ use rayon::prelude::*;
 
 use crate::candidate::Candidate;
 use crate::evidence::{Evidence, least_kappa, price};
+use crate::library::Shape;
 use crate::place::own_coordinates;
 use crate::screen::{Held, Scored, Together, reselect, screen, screen_set, screen_shapes, shift_without};
 use crate::search::{
@@ -193,7 +194,7 @@ impl Search<'_> {
         let of = |index: usize| {
             let candidate = closure.parts[index].candidate.clone();
             let score =
-                self.less(closure, index, scale).map_or(0.0, |less| self.robust(&less, closure, scale));
+                self.less(closure, &[index], scale).map_or(0.0, |less| self.robust(&less, closure, scale));
             let known = found.accepted.iter().find(|a| a.candidate == candidate);
             let mut rivals = known.map_or(Vec::new(), |known| known.rivals.clone());
             rivals.retain(|r| r.equivalent && closure.parts.iter().all(|p| p.candidate != r.candidate));
@@ -256,7 +257,50 @@ impl Search<'_> {
         });
         let best = tried.collect::<Vec<_>>().into_iter().max_by(|a, b| a.0.total_cmp(&b.0))?;
         let shaped = self.refit(&best.1, scale, STEPS);
-        (self.robust(base, &shaped, scale) > odds(shapes.len())).then_some(shaped)
+        let odds = odds(shapes.len());
+        (self.robust(base, &shaped, scale) > odds).then(|| self.alone(shaped, odds, scale))
+    }
+
+    /// The model with its newest part, a law of free shape, without the formula of the same variable in the same place, unless
+    /// each of its terms is worth the odds: it was pieced together where a shape was lacking. (One by one its terms may not go.
+    /// They compensate each other.)
+    fn alone(&self, shaped: Fitted, odds: f64, scale: &[f64]) -> Fitted {
+        let Some((shape, others)) = shaped.parts.split_last() else { return shaped };
+        let law = |part: &Part| &self.library[part.candidate.mechanism];
+        let does_its_work =
+            |part: &Part| part.candidate.place == shape.candidate.place && law(shape).is_shape_of(law(part));
+        let formula: Vec<usize> = (0..others.len()).filter(|&i| does_its_work(&others[i])).collect();
+        if formula.is_empty() {
+            return shaped;
+        }
+        let less = self.less(&shaped, &formula, scale);
+        match less.and_then(|less| self.resized(&less, scale)) {
+            Some(less) if self.robust(&less, &shaped, scale) < odds * formula.len() as f64 => less,
+            _ => shaped,
+        }
+    }
+
+    /// The model with the size of its newest part, a law of free shape, where its changes of slope are one in the mean square: an
+    /// estimate that suits what it describes now (one step of expectation and maximisation, without the variances).
+    fn resized(&self, model: &Fitted, scale: &[f64]) -> Option<Fitted> {
+        let part = model.parts.last()?;
+        let law = &self.library[part.candidate.mechanism];
+        let index = |plain: &str| {
+            let k = law.parameters().position(|p| p == plain)?;
+            model.setup.model.parameter(&part.instance.names[k])
+        };
+        let changes: Vec<usize> = law.linear.iter().map(|name| index(name)).collect::<Option<_>>()?;
+        let size = index(Shape::SIZE)?;
+        let mut parameters = model.fit.point.parameters.clone();
+        let squares: f64 = changes.iter().map(|&i| parameters[i].powi(2)).sum();
+        let ratio = (squares / changes.len() as f64).sqrt();
+        if ratio.total_cmp(&0.0).is_le() {
+            return None;
+        }
+        changes.iter().for_each(|&i| parameters[i] /= ratio);
+        parameters[size] *= ratio;
+        let parts = laws(&model.parts, &model.setup.model, &parameters);
+        self.reassembled_from(model, &parts, vec![parameters], scale, STEPS)
     }
 
     /// The model with other terms for those that it holds, where they do the same work for less: fewer coefficients, or laws
@@ -330,7 +374,7 @@ impl Search<'_> {
         while !model.parts.is_empty() {
             let known = self.known(&model, &Uncertainty::of(&model, scale).widths());
             let least = (0..known.len()).min_by(|&a, &b| known[a].total_cmp(&known[b])).unwrap_or(0);
-            match self.less(&model, least, scale) {
+            match self.less(&model, &[least], scale) {
                 Some(less) if self.robust(&less, &model, scale) < odds => model = less,
                 _ => break,
             }
@@ -338,34 +382,41 @@ impl Search<'_> {
         model
     }
 
-    /// The model without part `index`, from where the others go, to first order, when it does.
-    fn less(&self, model: &Fitted, index: usize, scale: &[f64]) -> Option<Fitted> {
+    /// The model without these parts, from where the others go, to first order, when they do.
+    fn less(&self, model: &Fitted, parts: &[usize], scale: &[f64]) -> Option<Fitted> {
         let (setup, point) = (&model.setup, &model.fit.point);
-        let part = &model.parts[index];
-        let own: Vec<usize> = part.instance.names.iter().filter_map(|n| setup.model.parameter(n)).collect();
-        // (Constants mean nothing without the force.)
-        let vanish = self.library[part.candidate.mechanism].vanish_with_force();
+        // By parameter of these parts, whether it vanishes with the force. (Constants mean nothing without it.)
+        let own: Vec<(usize, bool)> = parts
+            .iter()
+            .flat_map(|&i| {
+                let part = &model.parts[i];
+                let vanish = self.library[part.candidate.mechanism].vanish_with_force();
+                part.instance.names.iter().zip(vanish).collect::<Vec<_>>()
+            })
+            .filter_map(|(name, vanishes)| Some((setup.model.parameter(name)?, vanishes)))
+            .collect();
+        let of = |index: usize| own.iter().find(|o| o.0 == index);
         let gone: Vec<(usize, f64)> = (0..setup.free.len())
-            .filter_map(|i| Some((i, own.iter().position(|&o| o == setup.free[i].index)?)))
-            .map(|(i, k)| (i, if vanish[k] { point.parameters[own[k]] } else { 0.0 }))
+            .filter_map(|i| Some((i, of(setup.free[i].index)?)))
+            .map(|(i, &(index, vanishes))| (i, if vanishes { point.parameters[index] } else { 0.0 }))
             .collect();
         let shift = shift_without(setup, &model.level, scale, point, &gone);
         let mut shifted = point.parameters.clone();
-        let kept = setup.free.iter().filter(|f| !own.contains(&f.index));
+        let kept = setup.free.iter().filter(|f| of(f.index).is_none());
         for (f, d) in kept.zip(shift) {
             shifted[f.index] = (shifted[f.index] + d).clamp(f.lower, f.upper);
         }
-        let start = (0..shifted.len()).filter(|i| !own.contains(i)).map(|i| shifted[i]).collect();
-        let mut parts = self.laws(model);
-        parts.remove(index);
-        self.reassembled_from(model, &parts, vec![start], scale, STEPS_WITHOUT)
+        let start = (0..shifted.len()).filter(|&i| of(i).is_none()).map(|i| shifted[i]).collect();
+        let laws = self.laws(model).into_iter().enumerate();
+        let laws: Vec<Law> = laws.filter(|(i, _)| !parts.contains(i)).map(|(_, law)| law).collect();
+        self.reassembled_from(model, &laws, vec![start], scale, STEPS_WITHOUT)
     }
 
     /// Whether up to three other terms do as well as part `index` of a closure: the recordings do not hold its name.
     pub(crate) fn is_replaceable(&self, closure: &Found, index: usize) -> bool {
         let (model, scale) = (&closure.improved, &closure.scale);
         let candidate = &model.parts[index].candidate;
-        let Some(less) = self.less(model, index, scale) else { return true };
+        let Some(less) = self.less(model, &[index], scale) else { return true };
         let others = self.closing().into_iter().filter(|c| c != candidate);
         let (plain, mut rich): (Vec<_>, Vec<_>) = others.partition(|c| self.library[c.mechanism].is_plain());
         // (Of two laws that do as well the plainer one has the name.)
@@ -401,7 +452,7 @@ impl Search<'_> {
         last_first.sort_unstable_by(|a, b| b.cmp(a));
         let mut less = model.clone();
         for part in last_first {
-            less = self.less(&less, part, scale)?;
+            less = self.less(&less, &[part], scale)?;
         }
         let others = [self.larger(&less, &plain, 1, scale), self.with_one(&less, &rich, 0.0, scale)];
         let score = |of: &Fitted| self.robust(&less, of, scale);
@@ -666,7 +717,15 @@ second = "n*y'' + c*y' + l*(y - x) = 0"
     /// equation is right all over the range.
     #[test]
     fn what_no_formula_reaches_has_a_free_shape() {
-        let library = crate::built_in().unwrap();
+        let kinds = [
+            "constant_offset",
+            "cubic_stiffness",
+            "viscous_friction",
+            "free_position_force",
+            "free_rate_force",
+        ];
+        let mut library = crate::built_in().unwrap();
+        library.retain(|m| kinds.contains(&&*m.kind));
         // A magnet beside the first wheel.
         let magnet = |x: f64| 1.5 * (-((x - 0.2) / 0.2).powi(2)).exp();
         let search = Search::new(bodies(&|[x, ..]| [magnet(x), 0.0, 0.0], 70), &library, &crate::Quiet);
@@ -691,6 +750,34 @@ second = "n*y'' + c*y' + l*(y - x) = 0"
             let error = force(x) - (32.0 * x + magnet(x));
             assert!(error.abs() < 0.1, "{x}: {error}");
         }
+    }
+
+    /// The formula that was pieced together in place of a shape goes when that comes, and the shape takes its size.
+    #[test]
+    fn a_shape_takes_the_place_of_the_formula_of_its_variable() {
+        let kinds = ["quadratic_stiffness", "cubic_stiffness", "free_position_force"];
+        let mut library = crate::built_in().unwrap();
+        library.retain(|m| kinds.contains(&&*m.kind));
+        let magnet = |x: f64| 1.5 * (-((x - 0.2) / 0.2).powi(2)).exp();
+        let search = Search::new(bodies(&|[x, ..]| [magnet(x), 0.0, 0.0], 71), &library, &crate::Quiet);
+        let Found { calibrated, scale, .. } = nothing(&search);
+        let first = |c: &&Candidate| c.place.equations(&search.nominal().model) == ["first"];
+        let (shapes, plain): (Vec<_>, Vec<_>) =
+            search.allowed().filter(first).cloned().partition(|c| search.is_shape(c));
+        let formula = search.larger(&calibrated, &plain, 2, &scale).unwrap();
+        assert_eq!(formula.parts.len(), 2);
+        let shaped = search.shaped(&formula, &shapes, &scale).unwrap();
+        let kinds: Vec<&str> = shaped.parts.iter().map(|p| &*library[p.candidate.mechanism].kind).collect();
+        assert_eq!(kinds, ["free_position_force"]);
+        assert!(shaped.rss() < formula.rss());
+        let value = |name: &String| shaped.fit.point.parameters[shaped.setup.model.parameter(name).unwrap()];
+        let part = &shaped.parts[0];
+        let law = &library[part.candidate.mechanism];
+        let is_change = |name: &str| law.linear.iter().any(|l| l == name);
+        let named = law.parameters().zip(&part.instance.names);
+        let changes: Vec<f64> = named.filter(|(plain, _)| is_change(plain)).map(|(_, n)| value(n)).collect();
+        let mean = changes.iter().map(|v| v * v).sum::<f64>() / changes.len() as f64;
+        assert!((0.3..3.0).contains(&mean), "{mean}");
     }
 
     /// No other terms do what a dry friction does; what a weak hardening does, a sine does too.

@@ -915,7 +915,7 @@ impl Closed {
         if !polished.fitted.parts.is_empty() {
             from.push(&found.improved);
         }
-        let gates = Gates::new(search, baseline, judge, false);
+        let gates = Gates::of_a_closure(search, &polished.fitted, baseline, judge);
         let mut visited = Visited::default();
         let (mut best, mut rejected): (Option<Closed>, _) = (None, None);
         for from in from {
@@ -1285,6 +1285,8 @@ struct Gates<'a> {
     judge: &'a Judge,
     /// A round believed its mechanisms.
     named: bool,
+    /// How far the machine's parameters may be from what the model states of them, if that counts.
+    stated: Option<Deviation>,
 }
 
 /// The gate that a model fails at.
@@ -1302,7 +1304,20 @@ impl Failure {
 
 impl<'a> Gates<'a> {
     fn new(search: &'a Search<'a>, baseline: &'a Baseline, judge: &'a Judge, named: bool) -> Gates<'a> {
-        Gates { search, baseline, judge, named }
+        Gates { search, baseline, judge, named, stated: None }
+    }
+
+    /// Those of a closure in the place of what `stands`: it takes the machine's parameters no farther from what the model states
+    /// of them than the calibrated model and that do. (A named law may stand for one of the given terms, and its parameter goes to zero.)
+    fn of_a_closure(
+        search: &'a Search<'a>,
+        stands: &Fitted,
+        baseline: &'a Baseline,
+        judge: &'a Judge,
+    ) -> Gates<'a> {
+        let calibrated = search.deviation(&baseline.polished.fitted);
+        let stated = Some(calibrated.larger(search.deviation(stands)));
+        Gates { stated, ..Gates::new(search, baseline, judge, false) }
     }
 
     /// The first gate that the model fails at, if it does.
@@ -1326,9 +1341,7 @@ impl<'a> Gates<'a> {
         if search.has_negative_inertia(&fitted.setup, &fitted.level, &fitted.fit.point, scale) {
             return Failure::at(Gate::Inertia, Vec::new());
         }
-        let machine = search.nominal().model.parameters.len();
-        let deviation = |of: &Fitted| Deviation::of(&of.setup.free, machine, &of.fit.point.parameters);
-        if !likely && deviation(fitted).is_implausible_beside(deviation(&self.baseline.polished.fitted)) {
+        if self.stated.is_some_and(|stated| search.deviation(fitted).is_implausible_beside(stated)) {
             return Failure::at(Gate::Parameters, Vec::new());
         }
         let predicts = || {
@@ -2101,11 +2114,11 @@ mod tests {
             search.reassembled_from(calibrated, &laws, vec![parameters], scale, steps).unwrap()
         };
         let gate = |model: Fitted, baseline: &Baseline| {
-            let gates = Gates::new(&search, baseline, &judge, false);
+            let gates = Gates::of_a_closure(&search, calibrated, baseline, &judge);
             gates.failure(&polish(&model, scale, &judge), scale).map(|failure| failure.gate)
         };
         let as_it_is = |model: Fitted, baseline: &Baseline| {
-            let gates = Gates::new(&search, baseline, &judge, false);
+            let gates = Gates::of_a_closure(&search, calibrated, baseline, &judge);
             gates.failure(&Polished::kept(model), scale).map(|failure| failure.gate)
         };
         let law = with("quadratic_stiffness", &[9.0], 20);

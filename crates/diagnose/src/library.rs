@@ -192,7 +192,9 @@ impl Shape {
         1.0, 1.25, 1.5, 1.75, 2.0, 2.25, 2.5, 2.75, 3.0,
     ];
     /// Names of the root mean square and of the size.
-    const SIZES: [&'static str; 2] = ["sr", "sf"];
+    const SIZES: [&'static str; 2] = ["sr", Shape::SIZE];
+    /// That of the size alone.
+    pub(crate) const SIZE: &'static str = "sf";
 
     /// Knots between the ends.
     fn inner_knots() -> &'static [f64] {
@@ -713,6 +715,21 @@ impl Mechanism {
     /// Whether such a force is a function of the motion times one coefficient.
     pub(crate) fn is_plain(&self) -> bool {
         self.states.is_empty() && self.inner.is_empty() && self.first.is_empty() && self.linear.len() == 1
+    }
+
+    /// Whether this law of free shape can be what another one is: a curve over the same one variable.
+    pub(crate) fn is_shape_of(&self, other: &Mechanism) -> bool {
+        let Some(shape) = &self.shape else { return false };
+        let placeholders = self.on.placeholders();
+        let moving = |of: &Expr| {
+            let mut variables = of.variables();
+            variables.retain(|(name, _)| **name != *"pi" && placeholders.contains(&&**name));
+            variables
+        };
+        let own = moving(&shape.of);
+        let [(name, primes)] = &own[..] else { return false };
+        let is_curve = || other.law.affine_in(&[(name, *primes)]).is_none();
+        self.on == other.on && other.states.is_empty() && moving(&other.law) == own && is_curve()
     }
 
     /// A law of free shape with the numbers of its function in a table, and what is left of these values of its parameters.
@@ -1504,6 +1521,26 @@ mod tests {
         for kind in ["fading_input", "quadratic_reading", "free_rate_force", "free_reading_characteristic"] {
             assert!(law(kind).is_term(), "{kind}");
         }
+    }
+
+    #[test]
+    fn a_shape_can_be_any_curve_over_its_variable() {
+        let library = built_in().unwrap();
+        let law = |kind: &str| library.iter().find(|m| m.kind == kind).unwrap();
+        let of = |shape: &str, kind: &str| law(shape).is_shape_of(law(kind));
+        for kind in ["cubic_stiffness", "asymmetric_stiffness", "end_stop", "cogging"] {
+            assert!(of("free_position_force", kind) && !of("free_rate_force", kind), "{kind}");
+        }
+        assert!(
+            of("free_rate_force", "quadratic_drag") && of("free_reading_characteristic", "cubic_reading")
+        );
+        // A line, a constant, more than one variable, a memory; a product is no single variable.
+        for kind in
+            ["viscous_friction", "constant_offset", "position_dependent_damping", "presliding_friction"]
+        {
+            assert!(!of("free_rate_force", kind) && !of("free_position_force", kind), "{kind}");
+        }
+        assert!(!of("free_power_force", "quadratic_drag") && !of("quadratic_drag", "quadratic_drag"));
     }
 
     /// A law of free shape is the same function before and after its numbers stand in a table, no line and no constant.

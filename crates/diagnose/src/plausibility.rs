@@ -34,6 +34,11 @@ impl Deviation {
         Deviation { squares: squares.iter().sum(), stated: squares.len() }
     }
 
+    /// The larger of two.
+    pub(crate) fn larger(self, other: Deviation) -> Deviation {
+        if other.squares > self.squares { other } else { self }
+    }
+
     /// Whether values as far from what is stated are rarer than one in a thousand, and farther than those of `other`.
     pub(crate) fn is_implausible_beside(self, other: Deviation) -> bool {
         let seldom = ChiSquared::new(self.stated as f64).is_ok_and(|chi| chi.sf(self.squares) < SELDOM);

@@ -76,8 +76,8 @@ pub enum Gate {
     Training,
     /// No inertia is negative.
     Inertia,
-    /// The machine's own parameters are no less plausible than those of the calibrated model, or within what the model states of
-    /// them (`std`).
+    /// The machine's own parameters are within what the model states of them (`std`), or no farther from there than those of the
+    /// calibrated model or of what stands without it.
     Parameters,
     /// It predicts what is left out of its fit better than the calibrated model, beyond chance.
     CrossValidation,

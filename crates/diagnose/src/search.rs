@@ -16,6 +16,7 @@ use crate::evidence::{Evidence, Side, Smoothness, folds, kappa, least_kappa, rob
 use crate::explore::{Belief, Explorer, Hypothesis, Posterior};
 use crate::library::Mechanism;
 use crate::place::{Place, places};
+use crate::plausibility::Deviation;
 use crate::screen::{Scored, Together, first_states, first_values, inner_scales, screen, screen_pairs};
 use crate::temperature::AnyScale;
 use crate::uncertainty::Uncertainty;
@@ -374,6 +375,12 @@ impl<'a> Search<'a> {
     /// The candidates it considers.
     pub fn candidates(&self) -> &[Candidate] {
         &self.all
+    }
+
+    /// How far the machine's own parameters are from what the model states of them.
+    pub(crate) fn deviation(&self, fitted: &Fitted) -> Deviation {
+        let machine = self.nominal.model.parameters.len();
+        Deviation::of(&fitted.setup.free, machine, &fitted.fit.point.parameters)
     }
 
     /// The nominal equations plus `parts` (candidate, values, sizes), parameters at `parameters`.

@@ -2,7 +2,7 @@
 
 use greybox_diagnose::diagnosis::{Basis, Finding};
 use greybox_diagnose::{Options, Quiet, Verdict, diagnose};
-use greybox_model::{Hold, Model, System};
+use greybox_model::{Hold, Model, System, WriteOptions};
 use greybox_recording::{Channel, Recording};
 use greybox_simulate::{Environment, Method, Seeds, Signal, integrate};
 use rand::SeedableRng;
@@ -76,6 +76,47 @@ fn an_input_that_fades_is_proposed_with_its_constants() {
     let [calibrated, improved] =
         [&found.holdout.calibrated, &found.holdout.improved].map(|r| r.scores[0].rmse);
     assert!(improved < 0.2 * calibrated, "{improved} {calibrated}");
+}
+
+/// A magnet beside the mass, which no formula of the library is near: the improved model has its force in a table.
+#[test]
+fn a_force_without_a_formula_is_proposed_as_a_table() {
+    let model = Model::from_toml(NOMINAL, "nominal.toml").unwrap();
+    let magnet = |size, seed| record((" + p*exp(-((x - q)/q)^2)", ""), [1.5, 0.05], size, seed);
+    let train = [magnet(1.2, 11), magnet(1.2, 12), magnet(1.2, 13)];
+    let held = [magnet(1.0, 14)];
+    let mut library = greybox_diagnose::built_in().unwrap();
+    let kinds = [
+        "constant_offset",
+        "quadratic_stiffness",
+        "cubic_stiffness",
+        "free_position_force",
+        "free_rate_force",
+    ];
+    library.retain(|m| kinds.contains(&&*m.kind));
+    let options = Options { library: Some(library), ..Options::default() };
+    let found = diagnose(&model, &train, &held, &options, &Quiet).unwrap();
+    assert_eq!(found.verdict, Verdict::Unexplained);
+    let kinds: Vec<&str> = found.candidates.iter().map(|c| &*c.kind).collect();
+    assert!(kinds.contains(&"free_position_force"), "{kinds:?}");
+    let [calibrated, improved] =
+        [&found.holdout.calibrated, &found.holdout.improved].map(|r| r.scores[0].rmse);
+    assert!(improved < 0.1 * calibrated, "{improved} {calibrated}");
+    // Its equation, written and read again, has the force.
+    let improved =
+        Model::from_toml(&found.improved.to_toml(&WriteOptions::default()), "improved.toml").unwrap();
+    let residual = improved.equations[0].residual();
+    for i in -5..=5 {
+        let x = 0.03 * f64::from(i);
+        let of = |name: &str, primes: u8| match (name, primes) {
+            ("x", 0) => Some(x),
+            ("x" | "f", _) => Some(0.0),
+            _ => improved.parameter(name).map(|i| improved.parameters[i].value),
+        };
+        let (force, truth) =
+            (residual.eval(&of).unwrap(), 21.0 * x + 1.5 * (-((x - 0.05) / 0.05).powi(2)).exp());
+        assert!((force - truth).abs() < 0.15, "{x}: {force} {truth}");
+    }
 }
 
 #[test]
