@@ -1308,7 +1308,8 @@ impl<'a> Gates<'a> {
     }
 
     /// Those of a closure in the place of what `stands`: it takes the machine's parameters no farther from what the model states
-    /// of them than the calibrated model and that do. (A named law may stand for one of the given terms, and its parameter goes to zero.)
+    /// of them than the calibrated model or that does. (Named laws are not held to it. One may stand in for a given term, whose
+    /// parameter then goes to zero: gravity for the spring of a linearised pendulum.)
     fn of_a_closure(
         search: &'a Search<'a>,
         stands: &Fitted,
@@ -2133,8 +2134,9 @@ mod tests {
         assert_eq!(as_it_is(negative, &lenient), Some(Gate::Inertia));
         // Five standard deviations from where the model states it, the calibrated one as stated.
         let mut drawn_away = law.clone();
-        let damping = drawn_away.setup.free.iter().position(|f| f.index == 2).unwrap();
-        let value = drawn_away.fit.point.parameters[2];
+        let index = drawn_away.setup.model.parameter("b").unwrap();
+        let damping = drawn_away.setup.free.iter().position(|f| f.index == index).unwrap();
+        let value = drawn_away.fit.point.parameters[index];
         drawn_away.setup.free[damping].prior =
             greybox_calibrate::Prior::Normal { mean: value - 0.5, std: 0.1 };
         assert_eq!(as_it_is(drawn_away, &lenient), Some(Gate::Parameters));
