@@ -290,7 +290,8 @@ impl Search<'_> {
             model.setup.model.parameter(&part.instance.names[k])
         };
         let changes: Vec<usize> = law.linear.iter().map(|name| index(name)).collect::<Option<_>>()?;
-        let size = index(Shape::SIZE)?;
+        let [_, size] = Shape::SIZES;
+        let size = index(size)?;
         let mut parameters = model.fit.point.parameters.clone();
         let squares: f64 = changes.iter().map(|&i| parameters[i].powi(2)).sum();
         let ratio = (squares / changes.len() as f64).sqrt();

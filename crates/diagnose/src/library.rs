@@ -192,9 +192,7 @@ impl Shape {
         1.0, 1.25, 1.5, 1.75, 2.0, 2.25, 2.5, 2.75, 3.0,
     ];
     /// Names of the root mean square and of the size.
-    const SIZES: [&'static str; 2] = ["sr", Shape::SIZE];
-    /// That of the size alone.
-    pub(crate) const SIZE: &'static str = "sf";
+    pub(crate) const SIZES: [&'static str; 2] = ["sr", "sf"];
 
     /// Knots between the ends.
     fn inner_knots() -> &'static [f64] {

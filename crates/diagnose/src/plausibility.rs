@@ -27,7 +27,7 @@ impl Deviation {
     /// Of these values of all parameters, of which the first `own` are the machine's.
     pub(crate) fn of(free: &[Free], own: usize, parameters: &[f64]) -> Deviation {
         let of = |f: &Free| match f.prior {
-            Prior::Normal { mean, std } => Some(((parameters[f.index] - mean) / std).powi(2)),
+            Prior::Normal { .. } => Some(f.prior.at(parameters[f.index]).0.powi(2)),
             Prior::Flat | Prior::Cauchy { .. } => None,
         };
         let squares: Vec<f64> = free.iter().filter(|f| f.index < own).filter_map(of).collect();
