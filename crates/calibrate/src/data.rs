@@ -3,7 +3,7 @@
 use std::ops::Range;
 use std::sync::OnceLock;
 
-use greybox_model::{Dimension, Expr, Hold, Input, Model, Unit, UnitError, nearest};
+use greybox_model::{Dimension, Expr, Func, Hold, Input, Model, State, Unit, UnitError, nearest};
 use greybox_recording::interpolate::{fill_missing, hold_missing};
 use greybox_recording::{Recording, SIZES, smooth::Smoothed};
 use greybox_simulate::{Environment, FINE, Signal};
@@ -568,13 +568,37 @@ pub struct Hats {
 
 impl Hats {
     /// Smoothed states of every piece: coordinates measured by a channel of their own (q and, from the
-    /// same window, q'), and rates measured by one.
+    /// same window, q'), and rates measured by one. A coordinate that a channel measures through a reading (q + so) is there
+    /// too, at the model's values of the parameters; since those may change it is not known.
     pub fn new(model: &Model, data: &Data) -> Hats {
+        let mut hats = Hats::of_known(model, data);
+        let own = |state: &State| (0..2).any(|primes| model.measurement_of(&state.name, primes).is_some());
+        let mut entry = 0;
+        for state in &model.states {
+            if !own(state) {
+                hats.tolerance[entry..entry + state.order].fill(f64::INFINITY);
+            }
+            entry += state.order;
+        }
+        hats
+    }
+
+    /// The same where the model's values of the parameters are right.
+    pub(crate) fn of_known(model: &Model, data: &Data) -> Hats {
         let mut sources: Vec<Option<(usize, usize)>> = Vec::new(); // (channel, derivative)
         let mut highest = Vec::new();
+        let mut readings: Vec<Option<Reading>> = Vec::new();
+        let mut first = Vec::new();
         for state in &model.states {
             let channel = |primes| model.measurement_of(&state.name, primes);
             let (position, rate) = (channel(0), channel(1));
+            let reading = match (position, rate) {
+                (None, None) => Reading::of(model, &state.name),
+                _ => None,
+            };
+            let position = position.or(reading.as_ref().map(|r| r.channel));
+            first.extend(vec![readings.len(); state.order]);
+            readings.extend(vec![reading; state.order]);
             for i in 0..state.order {
                 sources.push(match i {
                     0 => position.map(|c| (c, 0)),
@@ -583,24 +607,28 @@ impl Hats {
                     _ => None,
                 });
             }
+            let position = channel(0);
             highest.push(match state.order {
                 1 => position.map(|c| (c, 1)),
                 2 => rate.map(|c| (c, 1)).or(position.map(|c| (c, 2))),
                 _ => None,
             });
         }
-        let pick = |piece: &PieceData, source: &Option<(usize, usize)>| {
+        let pick = |piece: &PieceData, source: &Option<(usize, usize)>, reading: Option<&Reading>| {
             source.map(|(c, d)| {
                 let s = &piece.smooth[c];
-                match d {
-                    0 => s.value.clone(),
-                    1 => s.d1.clone(),
-                    _ => s.d2.clone(),
+                match (reading, d) {
+                    (Some(reading), d) => reading.undone(s, d),
+                    (None, 0) => s.value.clone(),
+                    (None, 1) => s.d1.clone(),
+                    (None, _) => s.d2.clone(),
                 }
             })
         };
-        let states: Vec<Vec<Option<Vec<f64>>>> =
-            data.pieces.iter().map(|p| sources.iter().map(|s| pick(p, s)).collect()).collect();
+        let of_piece = |p: &PieceData| -> Vec<Option<Vec<f64>>> {
+            sources.iter().zip(&readings).map(|(s, r)| pick(p, s, r.as_ref())).collect()
+        };
+        let states: Vec<Vec<Option<Vec<f64>>>> = data.pieces.iter().map(of_piece).collect();
         let tolerance = sources
             .iter()
             .enumerate()
@@ -627,11 +655,86 @@ impl Hats {
                     // Ten standard errors: noise of real sensors is coloured, and the estimate of it from
                     // fast differences is too small then; and room for what the smoothing bends, whose
                     // peaks stand well above its RMS.
-                    10.0 * errors.iter().copied().fold(0.0, f64::max) + 5.0 * bend + 1e-3 * spread(&all)
+                    let room = 10.0 * errors.iter().copied().fold(0.0, f64::max) + 5.0 * bend;
+                    let slope = readings[i].as_ref().map_or(1.0, |reading| {
+                        let slopes = states.iter().map(|s| reading.least_slope(s[first[i]].as_deref()));
+                        slopes.fold(f64::INFINITY, f64::min)
+                    });
+                    room / slope + 1e-3 * spread(&all)
                 }
             })
             .collect();
-        let highest = data.pieces.iter().map(|p| highest.iter().map(|s| pick(p, s)).collect()).collect();
+        let highest =
+            data.pieces.iter().map(|p| highest.iter().map(|s| pick(p, s, None)).collect()).collect();
         Hats { states, tolerance, highest }
+    }
+}
+
+/// How a sensor reads one coordinate, where that is not the coordinate itself: with an offset or a gain, or along a curve.
+#[derive(Debug, Clone)]
+struct Reading {
+    channel: usize,
+    /// The coordinate.
+    of: String,
+    /// The reading over it, its slope, and the slope of that, with numbers for the parameters.
+    law: [Expr; 3],
+}
+
+impl Reading {
+    /// The first channel that reads this coordinate alone.
+    fn of(model: &Model, state: &str) -> Option<Reading> {
+        let number = |name: &str, primes: u8| {
+            let value = model.parameter(name).filter(|_| primes == 0).map(|i| model.parameters[i].value);
+            value.map(Expr::Num)
+        };
+        model.measurements.iter().enumerate().find_map(|(channel, measurement)| {
+            let law = measurement.expr.substitute(&number);
+            let mut delays = false;
+            law.walk(&mut |e| delays |= matches!(e, Expr::Call(Func::Delay, _)));
+            let alone = law.variables().iter().all(|(name, primes)| **name == *state && *primes == 0);
+            let slope = law.derivative(state, 0).simplify();
+            let bend = slope.derivative(state, 0).simplify();
+            (alone && !delays && law.mentions(state)).then(|| Reading {
+                channel,
+                of: state.to_string(),
+                law: [law, slope, bend],
+            })
+        })
+    }
+
+    fn at(&self, derivative: usize, x: f64) -> f64 {
+        self.law[derivative].eval(&|name, _| (*name == *self.of).then_some(x)).unwrap_or(f64::NAN)
+    }
+
+    /// The coordinate (or its first or second derivative) along a smoothed channel; not a number where no value is read so.
+    fn undone(&self, channel: &Smoothed, derivative: usize) -> Vec<f64> {
+        const STEPS: usize = 30;
+        let inverse = |y: f64| {
+            let mut x = y;
+            for _ in 0..STEPS {
+                let step = (self.at(0, x) - y) / self.at(1, x);
+                x -= step;
+                if step.abs() <= 1e-12 * (x.abs() + y.abs()) {
+                    return x;
+                }
+            }
+            f64::NAN
+        };
+        let of = |k: usize| {
+            let x = inverse(channel.value[k]);
+            let slope = self.at(1, x);
+            match derivative {
+                0 => x,
+                1 => channel.d1[k] / slope,
+                _ => (channel.d2[k] - self.at(2, x) * (channel.d1[k] / slope).powi(2)) / slope,
+            }
+        };
+        (0..channel.value.len()).map(of).collect()
+    }
+
+    /// The least slope along the coordinate.
+    fn least_slope(&self, coordinate: Option<&[f64]>) -> f64 {
+        let slopes = coordinate.unwrap_or(&[]).iter().map(|x| self.at(1, *x).abs());
+        slopes.filter(|s| s.is_finite()).fold(f64::INFINITY, f64::min)
     }
 }

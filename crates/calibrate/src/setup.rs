@@ -185,6 +185,7 @@ impl Setup {
         for (p, v) in setup.model.parameters.iter_mut().zip(parameters) {
             p.value = *v;
         }
+        setup.hats = Arc::new(Hats::of_known(&setup.model, &setup.data));
         setup.choose_method(tolerance, JUDGED);
         if setup.method.evaluations() < self.method.evaluations() {
             setup.method = self.method;

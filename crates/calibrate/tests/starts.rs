@@ -64,3 +64,40 @@ fn the_start_of_a_free_decay_is_found() {
     }
     assert!(runs >= 9 && fits >= 9, "{runs} free runs and {fits} fits of 10");
 }
+
+/// What a sensor reads along a line or a curve tells where the machine is, once the parameters of that are known.
+#[test]
+fn a_sensor_with_a_characteristic_shows_where_the_machine_is() {
+    let (n, dt) = (600, 0.01);
+    let f = force(7, n, dt, 1.0, 5.0);
+    let plain = Model::from_toml(OSCILLATOR, "plain.toml").unwrap();
+    let x0 = [0.3, 0.0];
+    let truth = measure(&plain, &f, dt, &x0).remove(0);
+    let rate = |k: usize| (truth[k + 1] - truth[k - 1]) / (2.0 * dt);
+    let more = "so = { value = -0.5, unit = \"m\" }\ncr = { value = 2.0, unit = \"1/m^2\" }\n[equations]";
+    for (reading, slope) in [("x + so", 1.0), ("3*x - so", 3.0), ("x + cr*x^3 + so", 1.0)] {
+        let mut model = Model::from_toml(&OSCILLATOR.replace("[equations]", more), "reads.toml").unwrap();
+        model.measurements[0].expr = greybox_model::parse(reading).unwrap().expr;
+        let mut y = measure(&model, &f, dt, &x0);
+        y[0].iter_mut().zip(normal(3, n)).for_each(|(y, e)| *y += 1e-3 * e);
+        let free = setup(&model, &f, dt, &y);
+        let held = free.for_simulations_of(free.data.clone(), &free.values(), &[1e-4]);
+        for k in (20..n - 20).step_by(20) {
+            let start = held.start(0, k);
+            let prior = held.start_prior(0, k);
+            assert!(
+                (start[0] - truth[k]).abs() < 3.0 * prior[0].1,
+                "{reading} at {k}: {start:?} {}",
+                truth[k]
+            );
+            assert!((start[1] - rate(k)).abs() < 3.0 * prior[1].1, "{reading} at {k}: {start:?} {}", rate(k));
+            assert!(prior[0].1 < 0.05 / slope && prior[1].1 < 5.0 / slope, "{reading}: {prior:?}");
+            // Where the parameters are free, it is a place to begin and no more.
+            assert_eq!(free.start(0, k), start);
+            assert!(free.start_prior(0, k).iter().all(|p| p.1.is_infinite()));
+        }
+        let run = held.free_run(&held.values(), &[1e-3]);
+        let start = &run.starts[0];
+        assert!((start[0] - x0[0]).abs() < 3e-3 && (start[1] - x0[1]).abs() < 0.1, "{reading}: {start:?}");
+    }
+}
