@@ -503,7 +503,19 @@ fn conclude(
     // The model that fits best knows best how errors grow.
     let judge = Judge::of(&found.improved, &residual_scale(&found.improved, &found.scale));
     let window = judge.window;
-    let mut baseline = Baseline::of(&found, &nominal.values(), &judge);
+    let values = nominal.values();
+    let polished = || polish(&found.improved, &found.scale, &judge);
+    // The search fits the baseline with a scale that its mechanisms made small, and only where it goes on with it. What is
+    // compared with is the best that the equations can do alone.
+    let alone = || {
+        let alone = alone(nominal, false, options.work, &Untold(observer));
+        (alone.limited, Baseline::of(&alone, &values, &judge))
+    };
+    let has_parts = !found.improved.parts.is_empty();
+    let (mut baseline, of_the_found) = rayon::join(
+        || Baseline::of(&found, &values, &judge),
+        || has_parts.then(|| rayon::join(alone, polished)),
+    );
     let mut limited = found.limited;
     let mut found = found;
     // What no round believed may still be what the equations lack: where the noise does not explain the rest, it is
@@ -523,19 +535,14 @@ fn conclude(
     }
     let mut polished = if let Some(proposed) = proposed {
         proposed
-    } else if found.improved.parts.is_empty() {
-        baseline.polished.clone()
-    } else {
-        // The search fits the baseline with a scale that its mechanisms made small, and only where it goes on with
-        // it. What is compared with is the best that the equations can do alone.
-        let alone = alone(nominal, false, options.work, &Untold(observer));
-        limited |= alone.limited;
-        let alone = Baseline::of(&alone, &nominal.values(), &judge);
+    } else if let Some(((is_limited, alone), polished)) = of_the_found {
+        limited |= is_limited;
         if alone.misfit.total_cmp(&baseline.misfit).is_lt() {
             baseline = alone;
         }
-        let polished = polish(&found.improved, &found.scale, &judge);
         defend(search, &mut found, polished, &baseline, &judge, true)
+    } else {
+        baseline.polished.clone()
     };
     let judged_of = |found: &Found, polished: &Polished, named: &dyn Fn(&Part) -> bool| {
         let scale = residual_scale(&polished.fitted, &found.scale);
@@ -935,7 +942,9 @@ impl Closed {
                 break;
             }
         }
-        best.ok_or(rejected)
+        let mut best = best.ok_or(rejected)?;
+        best.found.accepted = search.accepted(found, &best.found);
+        Ok(best)
     }
 
     /// A closure that passes all gates, without what whole recordings do not determine; else what fails, and where.
@@ -1193,20 +1202,24 @@ fn leaves_noise(scores: &[Score], fitted: &Fitted, scale: &[f64]) -> bool {
 /// one that is judged best.
 fn best_horizon(fitted: &Fitted, points: &[Point], own: &[f64], scale: &[f64], judge: &Judge) -> Polished {
     let setup = &fitted.setup;
-    let mut best = (judge.misfit(setup, &fitted.fit.point.parameters, own), None);
-    for point in points {
-        for Horizon { level, fit } in setup.grow(&fitted.level, point, own, HORIZON) {
-            let quality = judge.misfit(setup, &fit.point.parameters, own);
-            if quality < best.0 {
-                best = (quality, Some((level, fit)));
-            }
+    let misfit = |point: &Point| judge.misfit(setup, &point.parameters, own);
+    let grown = |point: &Point| -> Vec<(f64, Horizon)> {
+        let horizons = setup.grow(&fitted.level, point, own, HORIZON);
+        horizons.into_par_iter().map(|horizon| (misfit(&horizon.fit.point), horizon)).collect()
+    };
+    let (as_it_is, grown): (f64, Vec<Vec<(f64, Horizon)>>) =
+        rayon::join(|| misfit(&fitted.fit.point), || points.par_iter().map(grown).collect());
+    let mut best = (as_it_is, None);
+    for (quality, horizon) in grown.into_iter().flatten() {
+        if quality < best.0 {
+            best = (quality, Some(horizon));
         }
     }
     match best.1 {
-        Some((level, mut fit)) => {
+        Some(Horizon { level, mut fit }) => {
             if fit.ending == Ending::Limit {
                 let further = setup.fit(&level, own, std::slice::from_ref(&fit.point), FURTHER);
-                if judge.misfit(setup, &further.point.parameters, own) <= best.0 {
+                if misfit(&further.point) <= best.0 {
                     fit = further;
                 }
             }

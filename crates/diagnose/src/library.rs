@@ -50,7 +50,6 @@
 //! vector (x, y)). The law must be linear in the `linear` names, through `[first]` if need be. A law of free shape
 //! ([`Shape`]) has no parameters of its own.
 
-use std::cmp::Ordering;
 use std::collections::BTreeMap;
 
 use greybox_model::{Expr, Func, Table, parse};
@@ -170,13 +169,13 @@ impl Inner {
 /// A function of free shape in a law, which writes `shape` where it stands.
 ///
 /// ```text
-/// shape(x) = sf Σᵢ √hᵢ slopeᵢ max(|z̄| − |kᵢ|, 0),    z̄ = x/sr held between the first and the last of the knots k
+/// shape(x) = sf h^½ Σᵢ slopeᵢ Bᵢ(z̄),    Bᵢ″ = 1/h from kᵢ − h/2 to kᵢ + h/2 and 0 elsewhere,    z̄ = x/sr held at ± 3
 /// ```
 ///
-/// over the knots on the side of z̄ between the two ends, the one at zero counting half, hᵢ the mean distance to the neighbours
-/// of kᵢ, sr the root mean square of x. Each knot changes the slope by √hᵢ slopeᵢ. With these normal about zero the slope is a Wiener process (Wahba,
-/// *Spline Models for Observational Data*, 1990, §1.5; piecewise linear), whose size sf is. A constant and a straight line
-/// are no part of it: they have terms of their own.
+/// over the knots kᵢ = 0, ± h, ± 2h, … within ± 3, with sr the root mean square of x. On the side of its knot away from zero
+/// Bᵢ is the straight line |z̄| − |kᵢ|, and about the knot a parabola: each knot changes the slope by sf h^½ slopeᵢ. With these
+/// changes normal about zero the slope is a Wiener process (Wahba, *Spline Models for Observational Data*, 1990, §1.5), whose
+/// size sf is. A constant and a straight line are no part of it: they have terms of their own.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Shape {
     /// The variable x.
@@ -186,48 +185,49 @@ pub struct Shape {
 }
 
 impl Shape {
-    /// Knots, over the root mean square of the variable.
-    const KNOTS: [f64; 25] = [
-        -3.0, -2.75, -2.5, -2.25, -2.0, -1.75, -1.5, -1.25, -1.0, -0.75, -0.5, -0.25, 0.0, 0.25, 0.5, 0.75,
-        1.0, 1.25, 1.5, 1.75, 2.0, 2.25, 2.5, 2.75, 3.0,
-    ];
+    /// Distance of the knots, and where they end, over the root mean square of the variable.
+    const STEP: f64 = 0.25;
+    const END: f64 = 3.0;
+    /// Knots on either side of zero.
+    const SIDE: usize = 11;
+    /// Values of the table for each knot: a straight line between them is as good as the parabola.
+    const FINER: usize = 4;
     /// Names of the root mean square and of the size.
     pub(crate) const SIZES: [&'static str; 2] = ["sr", "sf"];
 
-    /// Knots between the ends.
-    fn inner_knots() -> &'static [f64] {
-        &Shape::KNOTS[1..Shape::KNOTS.len() - 1]
-    }
-
-    /// Names of the changes of the slope, one for each knot between the ends.
+    /// Names of the changes of the slope, one for each knot, the one at zero in the middle.
     fn changes() -> Vec<String> {
-        (1..=Shape::inner_knots().len()).map(|i| format!("slope{i}")).collect()
+        (1..=2 * Shape::SIDE + 1).map(|i| format!("slope{i}")).collect()
     }
 
-    /// √h of each knot between the ends.
-    fn weights() -> Vec<f64> {
-        Shape::KNOTS.windows(3).map(|k| (0.5 * (k[2] - k[0])).sqrt()).collect()
-    }
-
-    /// The function over its size, at z between the ends.
+    /// The function over its size, at z between the ends: as sums over where the parabolas begin and end, on either side of
+    /// zero.
     fn sum(z: &Expr) -> Expr {
-        let beyond = |from: Expr, to: Expr| Expr::Call(Func::Max, vec![from - to, Expr::Num(0.0)]);
-        let hinge = |k: f64| match k.total_cmp(&0.0) {
-            Ordering::Equal => Expr::Num(0.5) * Expr::Call(Func::Abs, vec![z.clone()]),
-            Ordering::Less => beyond(Expr::Num(k), z.clone()),
-            Ordering::Greater => beyond(z.clone(), Expr::Num(k)),
+        let names = Shape::changes();
+        let change = |i: usize| Expr::var(&names[i]);
+        let (side, middle) = (Shape::SIDE, Expr::var(&names[Shape::SIDE]) * z.clone() * z.clone());
+        let beyond = |at: &Expr, edge: f64| {
+            let over = Expr::Call(Func::Max, vec![at.clone() - Expr::Num(edge), Expr::Num(0.0)]);
+            over.clone() * over
         };
-        let terms = Shape::inner_knots().iter().zip(Shape::weights()).zip(Shape::changes());
-        let terms = terms.map(|((knot, weight), name)| Expr::Num(weight) * Expr::var(&name) * hinge(*knot));
-        terms.reduce(|a, b| a + b).unwrap_or(Expr::Num(0.0))
+        let half = |at: Expr, knot: &dyn Fn(usize) -> Expr| {
+            let edges = (0..=side).map(|i| {
+                let next = if i < side { knot(i + 1) } else { Expr::Num(0.0) };
+                (next - knot(i)) * beyond(&at, (i as f64 + 0.5) * Shape::STEP)
+            });
+            edges.collect::<Vec<_>>()
+        };
+        let above = half(z.clone(), &|i| change(side + i));
+        let below = half(Expr::Num(0.0) - z.clone(), &|i| change(side - i));
+        let sum = above.into_iter().chain(below).fold(middle, |a, b| a + b);
+        Expr::Num(0.5 / Shape::STEP.sqrt()) * sum
     }
 
     /// The law as a sum over the knots.
     fn expanded(&self) -> Expr {
         let [root, size] = Shape::SIZES.map(Expr::var);
-        let [first, .., last] = Shape::KNOTS.map(Expr::Num);
-        let above = Expr::Call(Func::Max, vec![self.of.clone() / root, first]);
-        let held = Expr::Call(Func::Min, vec![above, last]);
+        let above = Expr::Call(Func::Max, vec![self.of.clone() / root, Expr::Num(-Shape::END)]);
+        let held = Expr::Call(Func::Min, vec![above, Expr::Num(Shape::END)]);
         self.with(&(size * Shape::sum(&held)))
     }
 
@@ -242,13 +242,16 @@ impl Shape {
         let names = Shape::changes();
         let change = |name: &str, _| names.iter().position(|n| n == name).map(|i| changes[i]);
         let value = |z: f64| Shape::sum(&Expr::Num(z)).eval(&change).unwrap_or(0.0);
-        let values = Shape::KNOTS.map(value);
+        let last = (Shape::FINER as f64 * Shape::END / Shape::STEP) as i32;
+        let knots: Vec<f64> =
+            (-last..=last).map(|i| f64::from(i) * Shape::STEP / Shape::FINER as f64).collect();
+        let values: Vec<f64> = knots.iter().map(|z| value(*z)).collect();
         let largest = values.iter().fold(f64::MIN_POSITIVE, |m, v| m.max(v.abs()));
         // (Four digits are closer than any recording tells a force.)
         let rounded = |v: f64| Expr::Num((1e4 * v / largest).round() / 1e4 + 0.0);
         let [root, size] = Shape::SIZES.map(Expr::var);
         let table =
-            Table::call(self.of.clone() / root, &Shape::KNOTS, values.iter().copied().map(rounded).collect());
+            Table::call(self.of.clone() / root, &knots, values.iter().copied().map(rounded).collect());
         (self.with(&(size * table)), largest)
     }
 }
@@ -1564,7 +1567,9 @@ mod tests {
         assert!((most / left[1] - 1.0).abs() < 1e-9, "the size is the largest value: {most} {}", left[1]);
         for d in grid {
             let (before, after) = (at(&shape, &values, d), at(&table, &left, d));
-            assert!((before - after).abs() < 1e-4 * most, "{d}: {before} {after}");
+            // The parabola's curvature, sf/√h at most, over the eighth of the squared distance of the values.
+            let most = 5.0 / Shape::STEP.sqrt() * (Shape::STEP / Shape::FINER as f64).powi(2) / 8.0;
+            assert!((before - after).abs() < most, "{d}: {before} {after}");
         }
         assert_eq!(at(&shape, &values, 0.0), 0.0);
         let [edge, beyond] = [0.6, 0.7].map(|d| at(&table, &left, d));

@@ -124,6 +124,11 @@ pub struct Part {
 /// A law at a place, the values of its parameters, and the sizes of the inner ones.
 pub(crate) type Law = (Candidate, Vec<f64>, Vec<f64>);
 
+/// Whether two models have the same parts, in whatever order.
+pub(crate) fn is_same(a: &[Candidate], b: &[Candidate]) -> bool {
+    a.len() == b.len() && a.iter().all(|c| b.contains(c))
+}
+
 /// The laws of a model with the values that its parameters give them.
 pub(crate) fn laws(parts: &[Part], model: &Model, parameters: &[f64]) -> Vec<Law> {
     let value = |name: &String| model.parameter(name).map(|i| parameters[i]);
@@ -802,7 +807,7 @@ impl<'a> Search<'a> {
         best
     }
 
-    fn weigh(&self, old: &Fitted, new: &Fitted, scale: &[f64]) -> Evidence {
+    pub(crate) fn weigh(&self, old: &Fitted, new: &Fitted, scale: &[f64]) -> Evidence {
         let kappa = kappa(&new.setup, &new.level, scale, &new.fit.point);
         self.weigh_with(old, new, scale, &kappa)
     }
@@ -845,8 +850,10 @@ impl<'a> Search<'a> {
         }
         let value = |&i: &usize| of.fit.point.parameters[of.setup.free[i].index];
         let known = Uncertainty::known(of, scale, &positions);
+        // (A fit counts the square of a change as that of a residual, whose variance is what the model leaves.)
+        let variance = of.rss() / of.fit.count.iter().sum::<usize>().max(1) as f64;
         Smoothness {
-            squares: positions.iter().map(|i| value(i).powi(2)).sum(),
+            squares: positions.iter().map(|i| value(i).powi(2)).sum::<f64>() / variance,
             certainty: -qr::log_determinant(&known, positions.len()),
         }
     }
@@ -1749,17 +1756,20 @@ impl<'a> Search<'a> {
         self.prune(state);
     }
 
-    /// Second thoughts; where they change the model, whether it lacks something still.
+    /// Second thoughts; where they change the model, whether it lacks something still. Mechanisms that were thought of before
+    /// would lead to the same again.
     fn think_again(&self, calibrated: &mut Fitted, state: &mut State) {
-        for _ in 0..MOST_MECHANISMS {
-            if self.is_spent() {
+        let mut seen: Vec<Vec<Candidate>> = Vec::new();
+        while seen.len() < MOST_MECHANISMS && !self.is_spent() {
+            let before = state.candidates();
+            if seen.iter().any(|s| is_same(s, &before)) {
                 break;
             }
-            let before = state.candidates();
             self.reconsider(calibrated, state);
             if state.candidates() == before {
                 break;
             }
+            seen.push(before);
             let after = state.candidates();
             self.level(calibrated, state);
             if state.candidates() == after {
