@@ -583,7 +583,8 @@ impl Hats {
         hats
     }
 
-    /// The same where the model's values of the parameters are right.
+    /// The same where the model's values of the parameters are right: then a reading tells its coordinate, unless it reads two
+    /// values as one.
     pub(crate) fn of_known(model: &Model, data: &Data) -> Hats {
         let mut sources: Vec<Option<(usize, usize)>> = Vec::new(); // (channel, derivative)
         let mut highest = Vec::new();
@@ -650,8 +651,8 @@ impl Hats {
                         .iter()
                         .map(|p| if *d == 0 { p.smooth[*c].value_bend } else { p.smooth[*c].d1_bend })
                         .fold(0.0, f64::max);
-                    let all: Vec<f64> =
-                        states.iter().filter_map(|s| s[i].as_ref()).flatten().copied().collect();
+                    let all = states.iter().filter_map(|s| s[i].as_ref()).flatten();
+                    let all: Vec<f64> = all.copied().filter(|v| v.is_finite()).collect();
                     // Ten standard errors: noise of real sensors is coloured, and the estimate of it from
                     // fast differences is too small then; and room for what the smoothing bends, whose
                     // peaks stand well above its RMS.
@@ -732,9 +733,14 @@ impl Reading {
         (0..channel.value.len()).map(of).collect()
     }
 
-    /// The least slope along the coordinate.
+    /// The least slope within twice the reach of the coordinate; zero where it changes its sign: another value is read the same.
     fn least_slope(&self, coordinate: Option<&[f64]>) -> f64 {
-        let slopes = coordinate.unwrap_or(&[]).iter().map(|x| self.at(1, *x).abs());
-        slopes.filter(|s| s.is_finite()).fold(f64::INFINITY, f64::min)
+        const POINTS: i32 = 50;
+        let finite = coordinate.unwrap_or(&[]).iter().filter(|x| x.is_finite());
+        let reach = 2.0 * finite.fold(0.0f64, |m, x| m.max(x.abs()));
+        let at = |i: i32| self.at(1, reach * f64::from(i) / f64::from(POINTS));
+        let slopes: Vec<f64> = (-POINTS..=POINTS).map(at).collect();
+        let is_one_way = slopes.iter().all(|s| *s > 0.0) || slopes.iter().all(|s| *s < 0.0);
+        if is_one_way { slopes.iter().fold(f64::INFINITY, |m, s| m.min(s.abs())) } else { 0.0 }
     }
 }

@@ -100,4 +100,12 @@ fn a_sensor_with_a_characteristic_shows_where_the_machine_is() {
         let start = &run.starts[0];
         assert!((start[0] - x0[0]).abs() < 3e-3 && (start[1] - x0[1]).abs() < 0.1, "{reading}: {start:?}");
     }
+    // A sine reads other angles as the same.
+    let mut model = plain.clone();
+    model.measurements[0].expr = greybox_model::parse("sin(3*x)").unwrap().expr;
+    let y = measure(&model, &f, dt, &x0);
+    let held = setup(&model, &f, dt, &y);
+    let held = held.for_simulations_of(held.data.clone(), &held.values(), &[1e-4]);
+    assert!((held.start(0, 30)[0] - truth[30]).abs() < 0.01, "{:?}", held.start(0, 30));
+    assert!(held.start_prior(0, 30)[0].1.is_infinite());
 }
