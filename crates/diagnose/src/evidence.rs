@@ -218,9 +218,9 @@ pub struct Side {
     pub shapes: Smoothness,
 }
 
-/// What free shapes cost: of changes of slope s that are normal before the fit, with the variance of a residual, and with
-/// covariance V over that after it, twice the logarithm of the marginal likelihood falls by |s|²/c − ln |V| (Laplace's
-/// approximation; s over the deviation of a residual; c as in [this module](self)).
+/// What free shapes cost: of changes of slope s that are normal with variance one before the fit, and with covariance V after
+/// it, twice the logarithm of the marginal likelihood falls by |s|²/c − ln |V| (Laplace's approximation; c as in
+/// [this module](self)).
 #[derive(Debug, Clone, Copy, Default, PartialEq)]
 pub struct Smoothness {
     /// |s|².

@@ -807,7 +807,7 @@ impl<'a> Search<'a> {
         best
     }
 
-    pub(crate) fn weigh(&self, old: &Fitted, new: &Fitted, scale: &[f64]) -> Evidence {
+    fn weigh(&self, old: &Fitted, new: &Fitted, scale: &[f64]) -> Evidence {
         let kappa = kappa(&new.setup, &new.level, scale, &new.fit.point);
         self.weigh_with(old, new, scale, &kappa)
     }
@@ -850,10 +850,8 @@ impl<'a> Search<'a> {
         }
         let value = |&i: &usize| of.fit.point.parameters[of.setup.free[i].index];
         let known = Uncertainty::known(of, scale, &positions);
-        // (A fit counts the square of a change as that of a residual, whose variance is what the model leaves.)
-        let variance = of.rss() / of.fit.count.iter().sum::<usize>().max(1) as f64;
         Smoothness {
-            squares: positions.iter().map(|i| value(i).powi(2)).sum::<f64>() / variance,
+            squares: positions.iter().map(|i| value(i).powi(2)).sum(),
             certainty: -qr::log_determinant(&known, positions.len()),
         }
     }
