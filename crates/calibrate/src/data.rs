@@ -3,7 +3,7 @@
 use std::ops::Range;
 use std::sync::OnceLock;
 
-use greybox_model::{Dimension, Expr, Func, Hold, Input, Model, State, Unit, UnitError, nearest};
+use greybox_model::{Dimension, Expr, Func, Hold, Input, Model, Unit, UnitError, nearest};
 use greybox_recording::interpolate::{fill_missing, hold_missing};
 use greybox_recording::{Recording, SIZES, smooth::Smoothed};
 use greybox_simulate::{Environment, FINE, Signal};
@@ -571,23 +571,19 @@ impl Hats {
     /// same window, q'), and rates measured by one. A coordinate that a channel measures through a reading (q + so) is there
     /// too, at the model's values of the parameters; since those may change it is not known.
     pub fn new(model: &Model, data: &Data) -> Hats {
-        let mut hats = Hats::of_known(model, data);
-        let own = |state: &State| (0..2).any(|primes| model.measurement_of(&state.name, primes).is_some());
-        let mut entry = 0;
-        for state in &model.states {
-            if !own(state) {
-                hats.tolerance[entry..entry + state.order].fill(f64::INFINITY);
-            }
-            entry += state.order;
-        }
-        hats
+        Hats::made(model, data, false)
     }
 
     /// The same where the model's values of the parameters are right: then a reading tells its coordinate, unless it reads two
     /// values as one.
     pub(crate) fn of_known(model: &Model, data: &Data) -> Hats {
+        Hats::made(model, data, true)
+    }
+
+    fn made(model: &Model, data: &Data, readings_are_known: bool) -> Hats {
         let mut sources: Vec<Option<(usize, usize)>> = Vec::new(); // (channel, derivative)
         let mut highest = Vec::new();
+        // By entry: how its coordinate is read, and which entry that is.
         let mut readings: Vec<Option<Reading>> = Vec::new();
         let mut first = Vec::new();
         for state in &model.states {
@@ -597,18 +593,17 @@ impl Hats {
                 (None, None) => Reading::of(model, &state.name),
                 _ => None,
             };
-            let position = position.or(reading.as_ref().map(|r| r.channel));
+            let read = position.or(reading.as_ref().map(|r| r.channel));
             first.extend(vec![readings.len(); state.order]);
             readings.extend(vec![reading; state.order]);
             for i in 0..state.order {
                 sources.push(match i {
-                    0 => position.map(|c| (c, 0)),
-                    1 => rate.map(|c| (c, 0)).or(position.map(|c| (c, 1))),
-                    2 => rate.map(|c| (c, 1)).or(position.map(|c| (c, 2))),
+                    0 => read.map(|c| (c, 0)),
+                    1 => rate.map(|c| (c, 0)).or(read.map(|c| (c, 1))),
+                    2 => rate.map(|c| (c, 1)).or(read.map(|c| (c, 2))),
                     _ => None,
                 });
             }
-            let position = channel(0);
             highest.push(match state.order {
                 1 => position.map(|c| (c, 1)),
                 2 => rate.map(|c| (c, 1)).or(position.map(|c| (c, 2))),
@@ -635,6 +630,7 @@ impl Hats {
             .enumerate()
             .map(|(i, source)| match source {
                 None => f64::INFINITY,
+                Some(_) if readings[i].is_some() && !readings_are_known => f64::INFINITY,
                 Some((c, d)) => {
                     let sigma = data.sigma[*c];
                     let errors: Vec<f64> = data

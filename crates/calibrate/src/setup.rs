@@ -172,20 +172,25 @@ impl Setup {
 
     /// The same model, integrated in the same way, with other recordings of its channels.
     pub fn with_data(&self, data: Arc<Data>) -> Setup {
-        let hats = Arc::new(Hats::new(&self.model, &data));
+        let hats = Hats::new(&self.model, &data);
+        self.with_smoothed(data, hats)
+    }
+
+    fn with_smoothed(&self, data: Arc<Data>, hats: Hats) -> Setup {
         let environments = Arc::new(data.environments(&self.holds));
-        Setup { data, hats, environments, noise: None, ..self.clone() }
+        Setup { data, hats: Arc::new(hats), environments, noise: None, ..self.clone() }
     }
 
     /// The same model for simulations of other recordings with these parameters: in the same steps, or in finer ones
     /// where those recordings ask for them at this tolerance (SI, per channel). A law can be far faster in a motion that
-    /// the fits never saw.
+    /// the fits never saw. Where a sensor reads a coordinate along a line or a curve, that tells the start.
     pub fn for_simulations_of(&self, data: Arc<Data>, parameters: &[f64], tolerance: &[f64]) -> Setup {
-        let mut setup = self.with_data(data);
-        for (p, v) in setup.model.parameters.iter_mut().zip(parameters) {
+        let mut model = self.model.clone();
+        for (p, v) in model.parameters.iter_mut().zip(parameters) {
             p.value = *v;
         }
-        setup.hats = Arc::new(Hats::of_known(&setup.model, &setup.data));
+        let hats = Hats::of_known(&model, &data);
+        let mut setup = Setup { model, ..self.with_smoothed(data, hats) };
         setup.choose_method(tolerance, JUDGED);
         if setup.method.evaluations() < self.method.evaluations() {
             setup.method = self.method;

@@ -64,7 +64,8 @@ impl Visited {
 
 impl Search<'_> {
     /// A closure that begins with the model `from`, in the place of what a search `found`. `None` where no term is worth its
-    /// odds, of a model whose laws [mix](Self::mixes) equations, and where it comes to what others `visited`.
+    /// odds, of a model whose laws [mix](Self::mixes) equations, and where it comes to what others `visited`. What the recordings
+    /// say for its parts is left open: [`accepted`](Self::accepted) is asked for the closure that is handed back.
     pub(crate) fn closure(&self, found: &Found, from: &Fitted, visited: &mut Visited) -> Option<Found> {
         if from.parts.iter().any(|part| self.mixes(&part.candidate)) {
             return None;

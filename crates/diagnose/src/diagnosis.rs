@@ -504,17 +504,19 @@ fn conclude(
     let judge = Judge::of(&found.improved, &residual_scale(&found.improved, &found.scale));
     let window = judge.window;
     let values = nominal.values();
-    let polished = || polish(&found.improved, &found.scale, &judge);
     // The search fits the baseline with a scale that its mechanisms made small, and only where it goes on with it. What is
     // compared with is the best that the equations can do alone.
-    let alone = || {
-        let alone = alone(nominal, false, options.work, &Untold(observer));
-        (alone.limited, Baseline::of(&alone, &values, &judge))
-    };
     let has_parts = !found.improved.parts.is_empty();
-    let (mut baseline, of_the_found) = rayon::join(
-        || Baseline::of(&found, &values, &judge),
-        || has_parts.then(|| rayon::join(alone, polished)),
+    let alone = has_parts.then(|| alone(nominal, false, options.work, &Untold(observer)));
+    let baseline_of = |found: &Found| Baseline::of(found, &values, &judge);
+    let (mut baseline, (alone, polished)) = rayon::join(
+        || baseline_of(&found),
+        || {
+            rayon::join(
+                || alone.as_ref().map(|alone| (alone.limited, baseline_of(alone))),
+                || has_parts.then(|| polish(&found.improved, &found.scale, &judge)),
+            )
+        },
     );
     let mut limited = found.limited;
     let mut found = found;
@@ -535,7 +537,7 @@ fn conclude(
     }
     let mut polished = if let Some(proposed) = proposed {
         proposed
-    } else if let Some(((is_limited, alone), polished)) = of_the_found {
+    } else if let (Some((is_limited, alone)), Some(polished)) = (alone, polished) {
         limited |= is_limited;
         if alone.misfit.total_cmp(&baseline.misfit).is_lt() {
             baseline = alone;

@@ -188,8 +188,8 @@ impl Shape {
     /// Distance of the knots, and where they end, over the root mean square of the variable.
     const STEP: f64 = 0.25;
     const END: f64 = 3.0;
-    /// Knots on either side of zero.
-    const SIDE: usize = 11;
+    /// Knots on either side of zero, between the ends.
+    const SIDE: usize = (Shape::END / Shape::STEP) as usize - 1;
     /// Values of the table for each knot: a straight line between them is as good as the parabola.
     const FINER: usize = 4;
     /// Names of the root mean square and of the size.
@@ -242,7 +242,7 @@ impl Shape {
         let names = Shape::changes();
         let change = |name: &str, _| names.iter().position(|n| n == name).map(|i| changes[i]);
         let value = |z: f64| Shape::sum(&Expr::Num(z)).eval(&change).unwrap_or(0.0);
-        let last = (Shape::FINER as f64 * Shape::END / Shape::STEP) as i32;
+        let last = (Shape::FINER * (Shape::SIDE + 1)) as i32;
         let knots: Vec<f64> =
             (-last..=last).map(|i| f64::from(i) * Shape::STEP / Shape::FINER as f64).collect();
         let values: Vec<f64> = knots.iter().map(|z| value(*z)).collect();
@@ -1568,8 +1568,8 @@ mod tests {
         for d in grid {
             let (before, after) = (at(&shape, &values, d), at(&table, &left, d));
             // The parabola's curvature, sf/√h at most, over the eighth of the squared distance of the values.
-            let most = 5.0 / Shape::STEP.sqrt() * (Shape::STEP / Shape::FINER as f64).powi(2) / 8.0;
-            assert!((before - after).abs() < most, "{d}: {before} {after}");
+            let bound = 5.0 / Shape::STEP.sqrt() * (Shape::STEP / Shape::FINER as f64).powi(2) / 8.0;
+            assert!((before - after).abs() < bound, "{d}: {before} {after}");
         }
         assert_eq!(at(&shape, &values, 0.0), 0.0);
         let [edge, beyond] = [0.6, 0.7].map(|d| at(&table, &left, d));
