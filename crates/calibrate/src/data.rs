@@ -569,7 +569,8 @@ pub struct Hats {
 impl Hats {
     /// Smoothed states of every piece: coordinates measured by a channel of their own (q and, from the
     /// same window, q'), and rates measured by one. A coordinate that a channel measures through a reading (q + so) is there
-    /// too, at the model's values of the parameters; since those may change it is not known.
+    /// too, at the model's values of the parameters; since those may change it is not known. Of a late sensor they are those that
+    /// it read.
     pub fn new(model: &Model, data: &Data) -> Hats {
         Hats::made(model, data, false)
     }
@@ -586,8 +587,10 @@ impl Hats {
         // By entry: how its coordinate is read, and which entry that is.
         let mut readings: Vec<Option<Reading>> = Vec::new();
         let mut first = Vec::new();
+        let prompt: Vec<Expr> = model.measurements.iter().map(|m| without_delays(&m.expr)).collect();
         for state in &model.states {
-            let channel = |primes| model.measurement_of(&state.name, primes);
+            let is = |e: &Expr, primes: u8| matches!(e, Expr::Var { name, primes: p } if **name == *state.name && *p == primes);
+            let channel = |primes| prompt.iter().position(|e| is(e, primes));
             let (position, rate) = (channel(0), channel(1));
             let reading = match (position, rate) {
                 (None, None) => Reading::of(model, &state.name),
@@ -630,7 +633,9 @@ impl Hats {
             .enumerate()
             .map(|(i, source)| match source {
                 None => f64::INFINITY,
-                Some(_) if readings[i].is_some() && !readings_are_known => f64::INFINITY,
+                Some(_) if readings[i].as_ref().is_some_and(|r| r.is_late || !readings_are_known) => {
+                    f64::INFINITY
+                }
                 Some((c, d)) => {
                     let sigma = data.sigma[*c];
                     let errors: Vec<f64> = data
@@ -673,6 +678,8 @@ struct Reading {
     channel: usize,
     /// The coordinate.
     of: String,
+    /// It reads where the machine was.
+    is_late: bool,
     /// The reading over it, its slope, and the slope of that, with numbers for the parameters.
     law: [Expr; 3],
 }
@@ -685,15 +692,15 @@ impl Reading {
             value.map(Expr::Num)
         };
         model.measurements.iter().enumerate().find_map(|(channel, measurement)| {
-            let law = measurement.expr.substitute(&number);
-            let mut delays = false;
-            law.walk(&mut |e| delays |= matches!(e, Expr::Call(Func::Delay, _)));
+            let prompt = without_delays(&measurement.expr);
+            let law = prompt.substitute(&number);
             let alone = law.variables().iter().all(|(name, primes)| **name == *state && *primes == 0);
             let slope = law.derivative(state, 0).simplify();
             let bend = slope.derivative(state, 0).simplify();
-            (alone && !delays && law.mentions(state)).then(|| Reading {
+            (alone && law.mentions(state)).then(|| Reading {
                 channel,
                 of: state.to_string(),
+                is_late: prompt != measurement.expr,
                 law: [law, slope, bend],
             })
         })
@@ -739,4 +746,12 @@ impl Reading {
         let is_one_way = slopes.iter().all(|s| *s > 0.0) || slopes.iter().all(|s| *s < 0.0);
         if is_one_way { slopes.iter().fold(f64::INFINITY, |m, s| m.min(s.abs())) } else { 0.0 }
     }
+}
+
+/// What a sensor reads if it is not late.
+fn without_delays(reading: &Expr) -> Expr {
+    reading.map(&mut |e| match e {
+        Expr::Call(Func::Delay, mut arguments) if !arguments.is_empty() => arguments.swap_remove(0),
+        e => e,
+    })
 }

@@ -16,10 +16,11 @@ fn a_late_sensor_shows_where_the_machine_was() {
     let measured = measure(&prompt, &f, dt, &[0.0, 0.0]);
     // The sensor: three samples late.
     let late: Vec<f64> = (0..n).map(|k| measured[0][k.saturating_sub(3)]).collect();
-    let before = setup(&prompt, &f, dt, &[late]);
+    let before = setup(&prompt, &f, dt, std::slice::from_ref(&late));
     let mut model = prompt.clone();
     model.measurements[0].expr = greybox_model::parse("delay(x, tau)").unwrap().expr;
-    let after = before.with_model(model, before.free.clone()).unwrap();
+    let after = before.with_model(model.clone(), before.free.clone()).unwrap();
+    let stated = setup(&model, &f, dt, &[late]);
     let (mut off, mut mended) = (0.0, 0.0);
     for k in (20..n - 20).step_by(20) {
         let truth = measured[0][k];
@@ -28,6 +29,10 @@ fn a_late_sensor_shows_where_the_machine_was() {
         let ((mean, std), (_, plain)) = (after.start_prior(0, k)[0], before.start_prior(0, k)[0]);
         let moved = after.start(0, k)[0] - before.start(0, k)[0];
         assert!((mean - after.start(0, k)[0]).abs() < 1e-15);
+        assert_eq!(
+            (stated.start(0, k), stated.start_prior(0, k)),
+            (after.start(0, k), after.start_prior(0, k))
+        );
         assert!((std - plain.hypot(moved)).abs() < 1e-15);
     }
     // The rate times τ misses ẍ τ²/2: a fifteenth of the whole for ωτ = 0.13.
@@ -80,7 +85,9 @@ fn a_sensor_with_a_characteristic_shows_where_the_machine_is() {
         model.measurements[0].expr = greybox_model::parse(reading).unwrap().expr;
         let mut y = measure(&model, &f, dt, &x0);
         y[0].iter_mut().zip(normal(3, n)).for_each(|(y, e)| *y += 1e-3 * e);
-        let free = setup(&model, &f, dt, &y);
+        // A sensor's characteristic that is found on the way.
+        let before = setup(&plain, &f, dt, &y);
+        let free = before.with_model(model, before.free.clone()).unwrap();
         let held = free.for_simulations_of(free.data.clone(), &free.values(), &[1e-4]);
         for k in (20..n - 20).step_by(20) {
             let start = held.start(0, k);
