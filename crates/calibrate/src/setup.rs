@@ -162,8 +162,11 @@ impl Setup {
     /// When the model does not compile.
     pub fn with_model(&self, model: Model, free: Vec<Free>) -> Result<Setup, CompileError> {
         let system = Arc::new(System::compile(&model)?);
-        let is_same = system.nx == self.system.nx && model.measurements == self.model.measurements;
-        let hats = if is_same { self.hats.clone() } else { Arc::new(Hats::new(&model, &self.data)) };
+        let hats = if system.nx == self.system.nx {
+            self.hats.clone()
+        } else {
+            Arc::new(Hats::new(&model, &self.data))
+        };
         Ok(Setup { model, system, hats, free, carried: Vec::new(), ..self.clone() })
     }
 

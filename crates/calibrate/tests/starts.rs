@@ -85,9 +85,7 @@ fn a_sensor_with_a_characteristic_shows_where_the_machine_is() {
         model.measurements[0].expr = greybox_model::parse(reading).unwrap().expr;
         let mut y = measure(&model, &f, dt, &x0);
         y[0].iter_mut().zip(normal(3, n)).for_each(|(y, e)| *y += 1e-3 * e);
-        // A sensor's characteristic that is found on the way.
-        let before = setup(&plain, &f, dt, &y);
-        let free = before.with_model(model, before.free.clone()).unwrap();
+        let free = setup(&model, &f, dt, &y);
         let held = free.for_simulations_of(free.data.clone(), &free.values(), &[1e-4]);
         for k in (20..n - 20).step_by(20) {
             let start = held.start(0, k);
