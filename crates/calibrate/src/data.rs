@@ -569,8 +569,8 @@ pub struct Hats {
 impl Hats {
     /// Smoothed states of every piece: coordinates measured by a channel of their own (q and, from the
     /// same window, q'), and rates measured by one. A coordinate that a channel measures through a reading (q + so) is there
-    /// too, at the model's values of the parameters; since those may change it is not known. Of a late sensor they are those that
-    /// it read.
+    /// too, at the model's values of the parameters; since those may change it is not known. Where only a late sensor measures a
+    /// coordinate, its readings are not shifted in time: [`Setup::start`](crate::Setup::start) does that.
     pub fn new(model: &Model, data: &Data) -> Hats {
         Hats::made(model, data, false)
     }
@@ -587,13 +587,16 @@ impl Hats {
         // By entry: how its coordinate is read, and which entry that is.
         let mut readings: Vec<Option<Reading>> = Vec::new();
         let mut first = Vec::new();
-        let prompt: Vec<Expr> = model.measurements.iter().map(|m| without_delays(&m.expr)).collect();
+        let prompt = without_delays(model);
         for state in &model.states {
-            let is = |e: &Expr, primes: u8| matches!(e, Expr::Var { name, primes: p } if **name == *state.name && *p == primes);
-            let channel = |primes| prompt.iter().position(|e| is(e, primes));
+            let channel = |primes| {
+                model
+                    .measurement_of(&state.name, primes)
+                    .or_else(|| prompt.measurement_of(&state.name, primes))
+            };
             let (position, rate) = (channel(0), channel(1));
             let reading = match (position, rate) {
-                (None, None) => Reading::of(model, &state.name),
+                (None, None) => Reading::of(model, &prompt, &state.name),
                 _ => None,
             };
             let read = position.or(reading.as_ref().map(|r| r.channel));
@@ -685,22 +688,21 @@ struct Reading {
 }
 
 impl Reading {
-    /// The first channel that reads this coordinate alone.
-    fn of(model: &Model, state: &str) -> Option<Reading> {
+    /// The first channel that reads this coordinate alone; `prompt` is the model [without delays](without_delays).
+    fn of(model: &Model, prompt: &Model, state: &str) -> Option<Reading> {
         let number = |name: &str, primes: u8| {
             let value = model.parameter(name).filter(|_| primes == 0).map(|i| model.parameters[i].value);
             value.map(Expr::Num)
         };
-        model.measurements.iter().enumerate().find_map(|(channel, measurement)| {
-            let prompt = without_delays(&measurement.expr);
-            let law = prompt.substitute(&number);
+        prompt.measurements.iter().enumerate().find_map(|(channel, measurement)| {
+            let law = measurement.expr.substitute(&number);
             let alone = law.variables().iter().all(|(name, primes)| **name == *state && *primes == 0);
             let slope = law.derivative(state, 0).simplify();
             let bend = slope.derivative(state, 0).simplify();
             (alone && law.mentions(state)).then(|| Reading {
                 channel,
                 of: state.to_string(),
-                is_late: prompt != measurement.expr,
+                is_late: *measurement != model.measurements[channel],
                 law: [law, slope, bend],
             })
         })
@@ -748,10 +750,14 @@ impl Reading {
     }
 }
 
-/// What a sensor reads if it is not late.
-fn without_delays(reading: &Expr) -> Expr {
-    reading.map(&mut |e| match e {
-        Expr::Call(Func::Delay, mut arguments) if !arguments.is_empty() => arguments.swap_remove(0),
-        e => e,
-    })
+/// The model with sensors that are not late.
+fn without_delays(model: &Model) -> Model {
+    let mut prompt = model.clone();
+    for measurement in &mut prompt.measurements {
+        measurement.expr = measurement.expr.map(&mut |e| match e {
+            Expr::Call(Func::Delay, mut arguments) if !arguments.is_empty() => arguments.swap_remove(0),
+            e => e,
+        });
+    }
+    prompt
 }

@@ -351,7 +351,9 @@ impl Setup {
             let [Expr::Var { name, .. }, tau] = &arguments[..] else { continue };
             let (Some(j), Some(tau)) = (self.model.state(name), tau.eval(&|n, _| known(n))) else { continue };
             let (first, order) = (self.system.offsets[j], self.model.states[j].order);
-            for i in 0..order {
+            // (What another sensor sees at once has not gone on.)
+            let seen_at_once = |i: usize| (0..=i).any(|p| self.model.measurement_of(name, p as u8).is_some());
+            for i in (0..order).filter(|i| !seen_at_once(*i)) {
                 let rate = if i + 1 < order {
                     self.hats.states[piece][first + i + 1].as_ref()
                 } else {

@@ -20,7 +20,7 @@ fn a_late_sensor_shows_where_the_machine_was() {
     let mut model = prompt.clone();
     model.measurements[0].expr = greybox_model::parse("delay(x, tau)").unwrap().expr;
     let after = before.with_model(model.clone(), before.free.clone()).unwrap();
-    let stated = setup(&model, &f, dt, &[late]);
+    let stated = setup(&model, &f, dt, std::slice::from_ref(&late));
     let (mut off, mut mended) = (0.0, 0.0);
     for k in (20..n - 20).step_by(20) {
         let truth = measured[0][k];
@@ -35,6 +35,16 @@ fn a_late_sensor_shows_where_the_machine_was() {
         );
         assert!((std - plain.hypot(moved)).abs() < 1e-15);
     }
+    // Beside a sensor that is not late the late one tells nothing, whichever comes first.
+    let mut both = prompt.clone();
+    both.measurements.insert(
+        0,
+        greybox_model::Measurement { channel: "late".to_string(), ..both.measurements[0].clone() },
+    );
+    both.measurements[0].expr = model.measurements[0].expr.clone();
+    let both = setup(&both, &f, dt, &[late, measured[0].clone()]);
+    let alone = setup(&prompt, &f, dt, &measured);
+    assert!((20..n - 20).all(|k| both.start(0, k) == alone.start(0, k)));
     // The rate times τ misses ẍ τ²/2: a fifteenth of the whole for ωτ = 0.13.
     assert!(mended < 0.05 * off, "{mended} {off}");
 }
