@@ -281,6 +281,8 @@ pub struct Tape {
     /// What runs the prologue, and what runs the rest.
     prepared: Vec<Code>,
     code: Vec<Code>,
+    /// By sign: what depends on its value.
+    after: Vec<Vec<(Reg, Op)>>,
     /// Registers of the compiled expressions, in the order they were given.
     pub outputs: Vec<Reg>,
     /// Non-smooth nodes in the order they are evaluated.
@@ -567,16 +569,23 @@ impl<'a> Compiler<'a> {
                 Op::Switch(k) => Op::Switch(k),
             })
             .collect();
+        let switches: Vec<Switch> =
+            self.switches.iter().map(|s| Switch { a: at(s.a), b: at(s.b), ..*s }).collect();
+        let after = |(k, switch): (usize, &Switch)| match switch.kind {
+            SwitchKind::Sign if switch.live => code::after(k, &ops, first_op, &switches),
+            _ => Vec::new(),
+        };
         Tape {
             leaves,
             kinds: self.kinds,
+            after: switches.iter().enumerate().map(after).collect(),
             constants: self.constants.clone(),
             prepared: code::compile(&ops[..prologue], first_op),
             code: code::compile(&ops[prologue..], first_op + prologue),
             ops,
             prologue,
             outputs: outputs.iter().map(|&r| at(r)).collect(),
-            switches: self.switches.iter().map(|s| Switch { a: at(s.a), b: at(s.b), ..*s }).collect(),
+            switches,
             delays: self
                 .delays
                 .iter()
@@ -644,6 +653,13 @@ impl Tape {
     #[inline]
     pub fn eval(&self, regs: &mut [f64], modes: &mut [i8], lambda: &[f64]) {
         code::run::<false>(&self.code, self.first_op() + self.prologue, &self.switches, regs, modes, lambda);
+    }
+
+    /// Evaluates again, after [`eval`](Self::eval) at the same point, what depends on the value `lambda[k]` of a sticking `sign`
+    /// `k` that has changed since.
+    #[inline]
+    pub fn eval_after(&self, k: usize, regs: &mut [f64], modes: &mut [i8], lambda: &[f64]) {
+        code::again(&self.after[k], &self.switches, regs, modes, lambda);
     }
 
     /// Evaluates the body with every mode taken from the arguments' values as they are met, and

@@ -45,6 +45,7 @@ impl Signal {
     }
 
     /// The smooth stretch that time `inside` lies in.
+    #[inline]
     pub(crate) fn piece(&self, inside: f64) -> Piece {
         let g = &self.grid;
         let last = g.len() - 1;

@@ -76,6 +76,21 @@ pub(crate) fn solve_one(a: &[f64], pivots: &[usize], n: usize, b: &mut [f64]) {
         b[0] *= a[0];
         return;
     }
+    if let ([l00, l01, l10, l11], [first, _], [b0, b1]) = (a, pivots, &mut *b) {
+        // (Two equations, the commonest case of several, in the same operations.)
+        if *first == 1 {
+            std::mem::swap(b0, b1);
+        }
+        if *l10 != 0.0 {
+            *b1 -= l10 * *b0;
+        }
+        *b1 *= l11;
+        if *l01 != 0.0 {
+            *b0 -= l01 * *b1;
+        }
+        *b0 *= l00;
+        return;
+    }
     let b = &mut b[..n];
     for (k, &p) in pivots[..n].iter().enumerate() {
         b.swap(k, p);

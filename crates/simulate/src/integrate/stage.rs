@@ -150,13 +150,28 @@ impl Core<'_> {
         }
     }
 
-    /// Highest derivatives (into their registers) and ẋ of stage `b`, with the values of sticking signs as they stand.
+    /// The right-hand side of stage `b`, with the values of sticking signs as they stand.
     #[inline]
     fn eval_free(&mut self, b: usize) {
+        let st = &mut self.stages[b];
+        self.system.rhs.eval(&mut st.regs, &mut self.modes, &st.lambda);
+        self.solve(b);
+    }
+
+    /// The same again with another value of the sticking sign `k`.
+    fn eval_with(&mut self, b: usize, k: usize, lambda: f64) {
+        let st = &mut self.stages[b];
+        st.lambda[k] = lambda;
+        self.system.rhs.eval_after(k, &mut st.regs, &mut self.modes, &st.lambda);
+        self.solve(b);
+    }
+
+    /// Highest derivatives (into their registers) and ẋ of stage `b`, whose equations are evaluated.
+    #[inline]
+    fn solve(&mut self, b: usize) {
         let system = self.system;
         let nz = system.nz;
         let st = &mut self.stages[b];
-        system.rhs.eval(&mut st.regs, &mut self.modes, &st.lambda);
         self.result.evaluations += 1;
         let outputs = &system.rhs.outputs;
         if !system.mass_is_fixed {
@@ -196,24 +211,19 @@ impl Core<'_> {
             self.stages[b].lambda[k] = 0.0;
         }
         self.eval_free(b);
-        // Gradient of the arguments with respect to the state; the last lane collects explicit time.
-        self.slopes(b, true);
-        let lanes = nx + 1;
         let mut held = std::mem::take(&mut self.stages[b].held);
         held.resize(m, nx);
         let f0 = &mut held.f0;
         f0.iter_mut().zip(self.rates.stage(b)).for_each(|(f0, f)| *f0 = f);
+        self.gradients(b, &sticking, &mut held);
         for (i, &k) in sticking.iter().enumerate() {
-            let row = &self.gd[tape.switches[k].a as usize * lanes..][..lanes];
-            held.gradient[i * nx..(i + 1) * nx].copy_from_slice(&row[..nx]);
-            held.a[i] = -(row[nx] + row[..nx].iter().zip(&*f0).map(|(g, f)| g * f).sum::<f64>());
-        }
-        for (i, &k) in sticking.iter().enumerate() {
-            self.stages[b].lambda[k] = 1.0;
-            self.eval_free(b);
-            self.stages[b].lambda[k] = 0.0;
-            for ((p, f1), f0) in held.pull[i * nx..].iter_mut().zip(self.rates.stage(b)).zip(&*f0) {
+            self.eval_with(b, k, 1.0);
+            for ((p, f1), f0) in held.pull[i * nx..].iter_mut().zip(self.rates.stage(b)).zip(&held.f0) {
                 *p = f1 - f0;
+            }
+            // (Others are seen without it.)
+            if m > 1 {
+                self.eval_with(b, k, 0.0);
             }
         }
         for i in 0..m {
@@ -226,11 +236,10 @@ impl Core<'_> {
         held.ok = small::factor(&mut held.b, &mut held.pivots, m);
         if held.ok {
             small::solve(&held.b, &held.pivots, m, &mut held.a, 1);
-            for (i, &k) in sticking.iter().enumerate() {
-                self.stages[b].lambda[k] = held.a[i];
-            }
         }
-        self.eval_free(b);
+        for (i, &k) in sticking.iter().enumerate() {
+            self.eval_with(b, k, if held.ok { held.a[i] } else { 0.0 });
+        }
         let st = &mut self.stages[b];
         if held.ok {
             // A velocity that is held does not change, not even by rounding: relative error control
@@ -244,6 +253,33 @@ impl Core<'_> {
         }
         st.held = held;
         self.sticking = sticking;
+    }
+
+    /// Gradients ∇g of the arguments of the sticking signs with respect to the state, and what ġ is without their values:
+    /// `held.a` = −ġ.
+    fn gradients(&mut self, b: usize, sticking: &[usize], held: &mut Held) {
+        let tape = &self.system.rhs;
+        let nx = self.system.nx;
+        let leaf = |k: usize| tape.switches[k].a as usize;
+        let states = System::STATES..System::STATES + nx;
+        // Mostly, what is held at zero is a state.
+        if sticking.iter().all(|&k| states.contains(&leaf(k))) {
+            held.gradient[..sticking.len() * nx].fill(0.0);
+            for (i, &k) in sticking.iter().enumerate() {
+                let entry = leaf(k) - states.start;
+                held.gradient[i * nx + entry] = 1.0;
+                held.a[i] = -held.f0[entry];
+            }
+            return;
+        }
+        // (The last lane collects explicit time.)
+        let lanes = nx + 1;
+        self.slopes(b, true);
+        for (i, &k) in sticking.iter().enumerate() {
+            let row = &self.gd[tape.switches[k].a as usize * lanes..][..lanes];
+            held.gradient[i * nx..(i + 1) * nx].copy_from_slice(&row[..nx]);
+            held.a[i] = -(row[nx] + row[..nx].iter().zip(&held.f0).map(|(g, f)| g * f).sum::<f64>());
+        }
     }
 
     /// Time derivatives of the registers at stage `b` into `self.gd`: with `split` one lane per state
