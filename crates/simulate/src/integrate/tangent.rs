@@ -61,14 +61,20 @@ impl WithSimd for TangentStep<'_, '_> {
             8 => core.tangent_step_of(h, 8),
             12 => core.tangent_step_of(h, 12),
             16 => core.tangent_step_of(h, 16),
+            24 => core.tangent_step_of(h, 24),
+            32 => core.tangent_step_of(h, 32),
             width => core.tangent_step_of(h, width),
         }
     }
 }
 
-/// The stride of a row of `lanes` tangents: a multiple of four, whose spare lanes are zero.
+/// The stride of a row of `lanes` tangents: a multiple of four, of eight where there are many, whose spare lanes are zero.
 pub(super) fn width(lanes: usize) -> usize {
-    if lanes > 2 { lanes.next_multiple_of(4) } else { lanes }
+    match lanes {
+        0..=2 => lanes,
+        3..=16 => lanes.next_multiple_of(4),
+        _ => lanes.next_multiple_of(8),
+    }
 }
 
 impl Core<'_> {
