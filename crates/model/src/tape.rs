@@ -927,4 +927,52 @@ mod tests {
         let error = Tape::compile(&[Expr::prime("y", 2)], kinds(), &names).unwrap_err();
         assert_eq!(error.to_string(), "unknown name `y''`");
     }
+
+    /// In a chain of sums each result is the next one's operand, on either side of it.
+    #[test]
+    fn a_chain_rounds_as_its_operations_do() {
+        let (x, v, k) = (Expr::var("x"), Expr::prime("x", 1), Expr::var("k"));
+        let chain =
+            x.clone() * v.clone() + k.clone() * v.clone() - x.clone() * x.clone() + v.clone() - k.clone();
+        let expr = (k.clone() * (v.clone() * (chain * x.clone()))) - v * k;
+        let tape = Tape::compile(&[expr], kinds(), &names).unwrap();
+        let is_link = |c: &&Code| {
+            use Code::*;
+            matches!(c, Plus(_) | Less(_) | Times(_) | PlusMul(..) | LessMul(..))
+        };
+        assert!(tape.code.iter().filter(is_link).count() >= 6, "{:?}", tape.code);
+        let mut regs = vec![0.0; tape.registers()];
+        for i in 0..40 {
+            let (x, v, k) = ((0.37 * f64::from(i)).sin() * 3.0, (0.91 * f64::from(i)).cos() * 0.7, 1.0 / 3.0);
+            regs[..3].copy_from_slice(&[x, v, k]);
+            tape.prepare(&mut regs, &mut []);
+            tape.eval(&mut regs, &mut [], &[]);
+            let chain = x * v + k * v - x * x + v - k;
+            assert_eq!(regs[tape.outputs[0] as usize], k * (v * (chain * x)) - v * k);
+        }
+    }
+
+    /// What a sign's value changes is evaluated again as all of it would be, whatever hangs on two signs.
+    #[test]
+    fn what_depends_on_a_sign_alone_is_evaluated_again() {
+        let (x, v, k) = (Expr::var("x"), Expr::prime("x", 1), Expr::var("k"));
+        let sign = |e: Expr| Expr::call(Func::Sign, vec![e]);
+        let first = sign(v.clone()) * k.clone() + x.clone();
+        let exprs = [first.clone() * sign(x.clone() - v.clone()), x.clone() * v.clone(), first, x - k];
+        let tape = Tape::compile(&exprs, kinds(), &names).unwrap();
+        assert_eq!(tape.after.iter().map(Vec::len).collect::<Vec<_>>(), [4, 2]);
+        let mut regs = vec![0.0; tape.registers()];
+        regs[..3].copy_from_slice(&[0.3, 0.7, 1.3]);
+        let (mut modes, mut lambda) = ([0; 2], [0.0; 2]);
+        tape.prepare(&mut regs, &mut modes);
+        modes = [0; 2];
+        tape.eval(&mut regs, &mut modes, &lambda);
+        for (k, value) in [(0, 0.4), (1, -0.6), (0, -1.0)] {
+            lambda[k] = value;
+            tape.eval_after(k, &mut regs, &mut modes, &lambda);
+            let mut all = regs.clone();
+            tape.eval(&mut all, &mut modes, &lambda);
+            assert_eq!(regs, all);
+        }
+    }
 }

@@ -338,6 +338,8 @@ struct Core<'a> {
     modes: Vec<i8>,
     sticking: Vec<usize>,
     live: Vec<usize>,
+    /// Whether the state alone tells on which side of their branches the switches are, unless they stick.
+    plain: bool,
     scale: Vec<f64>,
     s: f64,
     x: Vec<f64>,
@@ -462,7 +464,9 @@ impl<'a> Core<'a> {
                 }
             }
         }
-        let live = (0..tape.switches.len()).filter(|&k| tape.switches[k].live).collect();
+        let live: Vec<usize> = (0..tape.switches.len()).filter(|&k| tape.switches[k].live).collect();
+        let is_plain = |r: u32| state_leaf(system, Some(r)).is_some() || tape.is_fixed(r);
+        let plain = live.iter().all(|&k| is_plain(tape.switches[k].a) && is_plain(tape.switches[k].b));
         let mut source: Vec<usize> = (0..nx).map(|r| System::STATES + r + 1).collect();
         for j in 0..nz {
             source[system.offsets[j] + system.orders[j] - 1] = system.highest() + j;
@@ -483,6 +487,7 @@ impl<'a> Core<'a> {
             source,
             sticking: Vec::new(),
             live,
+            plain,
             scale: vec![0.0; modes.len()],
             modes,
             s,
@@ -601,7 +606,7 @@ impl<'a> Core<'a> {
             self.fresh = false;
         }
         for (at, delay) in self.breakpoints(s0) {
-            self.advance(at);
+            self.advance(at, false);
             self.jump_of_delay(delay, at, s1);
         }
         let substeps = self.substeps;
@@ -610,11 +615,11 @@ impl<'a> Core<'a> {
             for i in 1..substeps {
                 let at = s0 + i as f64 * h;
                 if at > self.s {
-                    self.advance(at);
+                    self.advance(at, false);
                 }
             }
         }
-        self.advance(s1);
+        self.advance(s1, self.zero_hold);
     }
 
     /// Instants inside (s0, s0 + dt) at which a delayed zero-order-hold input jumps.
@@ -668,14 +673,14 @@ impl<'a> Core<'a> {
         }
         let last = tableau.b.len();
         self.rates.along(&mut self.x1, &self.x, tableau.b, h);
+        self.stages[last].regs[System::STATES..][..nx].copy_from_slice(&self.x1);
         if end {
-            self.stages[last].regs[System::STATES..][..nx].copy_from_slice(&self.x1);
             self.eval_stage(last, self.s + h, mid);
         }
     }
 
-    /// Integrates to `to`, through whatever events lie before it.
-    fn advance(&mut self, to: f64) {
+    /// Integrates to `to`, through whatever events lie before it. Where an input `jumps` there, what follows evaluates anew.
+    fn advance(&mut self, to: f64, jumps: bool) {
         let end = self.tableau.b.len();
         let tiny = 1e-13 * (self.env.dt + to.abs());
         let watch = !self.live.is_empty();
@@ -693,8 +698,11 @@ impl<'a> Core<'a> {
                 // Two equal steps rather than a long and a very short one.
                 h = if self.h_next > 0.5 * remaining { 0.5 * remaining } else { self.h_next };
             }
-            let need_end = watch || self.tolerance.is_some() || !self.rhs_history.is_empty();
-            self.trial(h, need_end);
+            // Where the state alone tells whether a branch was left, the end need not be evaluated before an input jumps.
+            let is_told = self.plain && self.sticking.is_empty() && self.events_here < MOST_EVENTS;
+            let needs_end = watch && !(jumps && is_told);
+            let mut has_end = needs_end || self.tolerance.is_some() || !self.rhs_history.is_empty();
+            self.trial(h, has_end);
             if let Some((rtol, atol)) = self.tolerance {
                 let error = self.error(h, rtol, atol);
                 let grow = (0.9 * error.max(1e-10).powf(-0.2)).clamp(0.2, 5.0);
@@ -716,9 +724,9 @@ impl<'a> Core<'a> {
             let mut event = false;
             if watch && self.events_here < MOST_EVENTS && self.least_slack(end) < 0.0 {
                 h = self.locate_event(h);
-                event = true;
+                (event, has_end) = (true, true);
             }
-            self.accept(h, need_end);
+            self.accept(h, has_end);
             if event {
                 self.events_here += 1;
                 self.result.events += 1;

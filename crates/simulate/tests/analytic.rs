@@ -298,6 +298,36 @@ fn sensitivities_through_gaps_stops_and_saturation() {
 }
 
 /// Two bodies with friction between them and to the ground: both signs may stick at once.
+/// Switches that the state alone decides spare the evaluation before an input jumps, and the gradient of a speed that is held
+/// is known. Beside a switch that the input decides nothing is spared, behind a factor of one the gradient is not known: the
+/// motion is the same.
+#[test]
+fn switches_that_the_state_alone_decides_only_spare_work() {
+    let parameters =
+        [("J", 0.5), ("Jl", 0.4), ("ks", 9.0), ("fc", 0.6), ("fl", 0.2), ("one", 1.0), ("none", 0.0)];
+    let of = |q: &str, a: &str, more: &str| {
+        let hub = format!("J*q'' - ks*a + fc*sign({q}) = u{more}");
+        let link = format!("Jl*(q'' + a'') + ks*a + 0.05*a' + fl*sign({a}) = 0");
+        model(&["u"], &[("q", 2), ("a", 2)], &parameters, &[&hub, &link], &["q", "a"])
+    };
+    let swing = |k: usize| if (k / 23) % 3 == 0 { 4.4 } else { -2.8 };
+    let u: Vec<f64> = (0..400).map(|k| swing(k) * (k % 7) as f64 / 6.0).collect();
+    for hold in [Hold::Zero, Hold::Linear] {
+        let env = driven(hold, 0.02, &u);
+        let run = |m: &greybox_model::Model| run(m, &env, &[0.0; 4], Method::Rk4 { substeps: 2 });
+        let t = run(&of("q'", "a'", ""));
+        assert!(t.events > 50 && t.y[399].abs() > 0.01, "{} {}", t.events, t.y[399]);
+        let watched = run(&of("q'", "a'", " + none*abs(u - 5)"));
+        assert_eq!((&t.y, t.events), (&watched.y, watched.events));
+        let spared = watched.evaluations as f64 / t.evaluations as f64 - 1.0;
+        let expected = if hold == Hold::Zero { 0.02..0.1 } else { 0.0..1e-9 };
+        assert!(expected.contains(&spared), "{hold:?}: {spared}");
+        let unknown = run(&of("one*q'", "one*a'", ""));
+        let largest = t.y.iter().zip(&unknown.y).map(|(a, b)| (a - b).abs()).fold(0.0, f64::max);
+        assert!(largest < 4e-11, "{hold:?}: {largest}");
+    }
+}
+
 #[test]
 fn two_frictions_stick_together() {
     let m = model(

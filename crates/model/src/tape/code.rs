@@ -171,7 +171,13 @@ pub(super) fn run<const NATURAL: bool>(
 
 /// Runs `ops` again, each with its register.
 #[inline]
-pub(super) fn again(ops: &[(Reg, Op)], switches: &[Switch], regs: &mut [f64], modes: &mut [i8], lambda: &[f64]) {
+pub(super) fn again(
+    ops: &[(Reg, Op)],
+    switches: &[Switch],
+    regs: &mut [f64],
+    modes: &mut [i8],
+    lambda: &[f64],
+) {
     for &(out, op) in ops {
         regs[out as usize] = value::<false>(op, switches, regs, modes, lambda);
     }
