@@ -310,7 +310,7 @@ fn switches_that_the_state_alone_decides_only_spare_work() {
         let link = format!("Jl*(q'' + a'') + ks*a + 0.05*a' + fl*sign({a}) = 0");
         model(&["u"], &[("q", 2), ("a", 2)], &parameters, &[&hub, &link], &["q", "a"])
     };
-    let swing = |k: usize| if (k / 23) % 3 == 0 { 4.4 } else { -2.8 };
+    let swing = |k: usize| if (k / 23).is_multiple_of(3) { 4.4 } else { -2.8 };
     let u: Vec<f64> = (0..400).map(|k| swing(k) * (k % 7) as f64 / 6.0).collect();
     for hold in [Hold::Zero, Hold::Linear] {
         let env = driven(hold, 0.02, &u);

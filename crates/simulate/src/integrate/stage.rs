@@ -167,7 +167,7 @@ impl Core<'_> {
     }
 
     /// Highest derivatives (into their registers) and ẋ of stage `b`, whose equations are evaluated.
-    #[inline]
+    #[inline(always)]
     fn solve(&mut self, b: usize) {
         let system = self.system;
         let nz = system.nz;
