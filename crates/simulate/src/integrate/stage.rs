@@ -158,12 +158,11 @@ impl Core<'_> {
         self.solve(b);
     }
 
-    /// The same again with another value of the sticking sign `k`.
-    fn eval_with(&mut self, b: usize, k: usize, lambda: f64) {
+    /// The equations again with another value of the sticking sign `k`, not solved.
+    fn set_sign(&mut self, b: usize, k: usize, lambda: f64) {
         let st = &mut self.stages[b];
         st.lambda[k] = lambda;
         self.system.rhs.eval_after(k, &mut st.regs, &mut self.modes, &st.lambda);
-        self.solve(b);
     }
 
     /// Highest derivatives (into their registers) and ẋ of stage `b`, whose equations are evaluated.
@@ -217,14 +216,13 @@ impl Core<'_> {
         f0.iter_mut().zip(self.rates.stage(b)).for_each(|(f0, f)| *f0 = f);
         self.gradients(b, &sticking, &mut held);
         for (i, &k) in sticking.iter().enumerate() {
-            self.eval_with(b, k, 1.0);
+            self.set_sign(b, k, 1.0);
+            self.solve(b);
             for ((p, f1), f0) in held.pull[i * nx..].iter_mut().zip(self.rates.stage(b)).zip(&held.f0) {
                 *p = f1 - f0;
             }
             // (Others are seen without it.)
-            if m > 1 {
-                self.eval_with(b, k, 0.0);
-            }
+            self.set_sign(b, k, 0.0);
         }
         for i in 0..m {
             for j in 0..m {
@@ -236,10 +234,11 @@ impl Core<'_> {
         held.ok = small::factor(&mut held.b, &mut held.pivots, m);
         if held.ok {
             small::solve(&held.b, &held.pivots, m, &mut held.a, 1);
+            for (i, &k) in sticking.iter().enumerate() {
+                self.set_sign(b, k, held.a[i]);
+            }
         }
-        for (i, &k) in sticking.iter().enumerate() {
-            self.eval_with(b, k, if held.ok { held.a[i] } else { 0.0 });
-        }
+        self.solve(b);
         let st = &mut self.stages[b];
         if held.ok {
             // A velocity that is held does not change, not even by rounding: relative error control
