@@ -655,8 +655,9 @@ impl Tape {
         code::run::<false>(&self.code, self.first_op() + self.prologue, &self.switches, regs, modes, lambda);
     }
 
-    /// Evaluates again, after [`eval`](Self::eval) at the same point, what depends on the value `lambda[k]` of a sticking `sign`
-    /// `k` that has changed since.
+    /// Evaluates what depends on the value `lambda[k]` of the sticking `sign` with index `k` in `switches`, after that has changed.
+    /// All else in `regs` must stand as [`eval`](Self::eval) left it; the result is what `eval` would give. A switch of another
+    /// kind changes nothing.
     #[inline]
     pub fn eval_after(&self, k: usize, regs: &mut [f64], modes: &mut [i8], lambda: &[f64]) {
         code::again(&self.after[k], &self.switches, regs, modes, lambda);

@@ -338,8 +338,9 @@ struct Core<'a> {
     modes: Vec<i8>,
     sticking: Vec<usize>,
     live: Vec<usize>,
-    /// Whether the state alone tells on which side of their branches the switches are, unless they stick.
-    plain: bool,
+    /// Whether all switching functions depend on the state alone: no more is needed to see that a branch was left, unless a
+    /// sign sticks.
+    state_events: bool,
     scale: Vec<f64>,
     s: f64,
     x: Vec<f64>,
@@ -465,8 +466,8 @@ impl<'a> Core<'a> {
             }
         }
         let live: Vec<usize> = (0..tape.switches.len()).filter(|&k| tape.switches[k].live).collect();
-        let is_plain = |r: u32| state_leaf(system, Some(r)).is_some() || tape.is_fixed(r);
-        let plain = live.iter().all(|&k| is_plain(tape.switches[k].a) && is_plain(tape.switches[k].b));
+        let is_known = |r: u32| state_leaf(system, Some(r)).is_some() || tape.is_fixed(r);
+        let state_events = live.iter().all(|&k| is_known(tape.switches[k].a) && is_known(tape.switches[k].b));
         let mut source: Vec<usize> = (0..nx).map(|r| System::STATES + r + 1).collect();
         for j in 0..nz {
             source[system.offsets[j] + system.orders[j] - 1] = system.highest() + j;
@@ -487,7 +488,7 @@ impl<'a> Core<'a> {
             source,
             sticking: Vec::new(),
             live,
-            plain,
+            state_events,
             scale: vec![0.0; modes.len()],
             modes,
             s,
@@ -661,7 +662,7 @@ impl<'a> Core<'a> {
         self.fresh = false;
     }
 
-    /// One trial step of length `h` from (s, x), stage 0 evaluated there; the result in `x1`.
+    /// One trial step of length `h` from (s, x), stage 0 evaluated there; the result in `x1`, and with `end` evaluated there.
     fn trial(&mut self, h: f64, end: bool) {
         let nx = self.system.nx;
         let tableau = self.tableau;
@@ -673,13 +674,16 @@ impl<'a> Core<'a> {
         }
         let last = tableau.b.len();
         self.rates.along(&mut self.x1, &self.x, tableau.b, h);
-        self.stages[last].regs[System::STATES..][..nx].copy_from_slice(&self.x1);
+        if end || !self.live.is_empty() {
+            self.stages[last].regs[System::STATES..][..nx].copy_from_slice(&self.x1);
+        }
         if end {
             self.eval_stage(last, self.s + h, mid);
         }
     }
 
-    /// Integrates to `to`, through whatever events lie before it. Where an input `jumps` there, what follows evaluates anew.
+    /// Integrates to `to`, through whatever events lie before it. `jumps`: an input may jump there, so that the right-hand side is
+    /// evaluated anew from there on.
     fn advance(&mut self, to: f64, jumps: bool) {
         let end = self.tableau.b.len();
         let tiny = 1e-13 * (self.env.dt + to.abs());
@@ -698,9 +702,9 @@ impl<'a> Core<'a> {
                 // Two equal steps rather than a long and a very short one.
                 h = if self.h_next > 0.5 * remaining { 0.5 * remaining } else { self.h_next };
             }
-            // Where the state alone tells whether a branch was left, the end need not be evaluated before an input jumps.
-            let is_told = self.plain && self.sticking.is_empty() && self.events_here < MOST_EVENTS;
-            let needs_end = watch && !(jumps && is_told);
+            // Before an input jumps, an end at which the state alone shows that a branch was left need not be evaluated.
+            let is_seen = self.state_events && self.sticking.is_empty() && self.events_here < MOST_EVENTS;
+            let needs_end = watch && !(jumps && is_seen);
             let mut has_end = needs_end || self.tolerance.is_some() || !self.rhs_history.is_empty();
             self.trial(h, has_end);
             if let Some((rtol, atol)) = self.tolerance {

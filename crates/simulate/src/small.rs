@@ -72,27 +72,19 @@ pub(crate) fn solve_rows(a: &[f64], pivots: &[usize], n: usize, b: &mut [f64], l
 /// [`solve`] of one right-hand side: numbers in the place of rows, which are not worth cutting.
 #[inline]
 pub(crate) fn solve_one(a: &[f64], pivots: &[usize], n: usize, b: &mut [f64]) {
-    if n == 1 {
-        b[0] *= a[0];
-        return;
+    // Loops of known length for the usual sizes.
+    match n {
+        1 => solve_one_of(a, pivots, 1, b),
+        2 => solve_one_of(a, pivots, 2, b),
+        3 => solve_one_of(a, pivots, 3, b),
+        n => solve_one_of(a, pivots, n, b),
     }
-    if let ([l00, l01, l10, l11], [first, _], [b0, b1]) = (a, pivots, &mut *b) {
-        // (Two equations, the commonest case of several, in the same operations.)
-        if *first == 1 {
-            std::mem::swap(b0, b1);
-        }
-        if *l10 != 0.0 {
-            *b1 -= l10 * *b0;
-        }
-        *b1 *= l11;
-        if *l01 != 0.0 {
-            *b0 -= l01 * *b1;
-        }
-        *b0 *= l00;
-        return;
-    }
-    let b = &mut b[..n];
-    for (k, &p) in pivots[..n].iter().enumerate() {
+}
+
+#[inline(always)]
+fn solve_one_of(a: &[f64], pivots: &[usize], n: usize, b: &mut [f64]) {
+    let (a, pivots, b) = (&a[..n * n], &pivots[..n], &mut b[..n]);
+    for (k, &p) in pivots.iter().enumerate() {
         b.swap(k, p);
     }
     for k in 0..n {
@@ -129,18 +121,23 @@ fn less(row: &mut [f64], m: f64, known: &[f64]) {
 mod tests {
     use super::*;
 
-    /// One side of two equations has a way of its own: the numbers of many sides, to the last digit.
+    /// One right-hand side has loops of its own: they give the numbers of many sides, to the last digit.
     #[test]
-    fn two_equations_are_solved_as_any_others() {
-        for m in [[0.3, 2.0, 1.0, -0.7], [2.0, 0.3, 0.0, 1.5], [0.0, 2.0, -3.0, 0.1], [1.2, 0.0, 0.7, 0.9]] {
-            let (mut a, mut p) = (m, [0; 2]);
-            assert!(factor(&mut a, &mut p, 2));
-            let mut rows = [0.4, 1.1, -2.3, 0.6];
-            let mut sides = [[rows[0], rows[2]], [rows[1], rows[3]]];
-            solve(&a, &p, 2, &mut rows, 2);
-            sides.iter_mut().for_each(|side| solve(&a, &p, 2, side, 1));
-            assert_eq!(sides, [[rows[0], rows[2]], [rows[1], rows[3]]]);
-            assert!((m[0] * rows[0] + m[1] * rows[2] - 0.4).abs() < 1e-14);
+    fn one_side_is_solved_as_many_are() {
+        let m = [0.3, 2.0, 1.0, -0.7, 0.0, 1.5, 4.0, 0.5, -2.0, 0.8, 1.1, -0.4, 0.6, 0.9, -1.3, 2.2];
+        for n in 1..=4 {
+            let (mut a, mut p) = (m[..n * n].to_vec(), vec![0; n]);
+            assert!(factor(&mut a, &mut p, n));
+            let mut rows: Vec<f64> = (0..2 * n).map(|i| (1.7 * i as f64).sin()).collect();
+            let mut sides = [0, 1].map(|l| rows.iter().skip(l).step_by(2).copied().collect::<Vec<_>>());
+            let first = sides[0][0];
+            solve(&a, &p, n, &mut rows, 2);
+            for (l, side) in sides.iter_mut().enumerate() {
+                solve(&a, &p, n, side, 1);
+                assert!(side.iter().eq(rows.iter().skip(l).step_by(2)), "{n}: {side:?} {rows:?}");
+            }
+            let row: f64 = m[..n].iter().zip(&sides[0]).map(|(m, x)| m * x).sum();
+            assert!((row - first).abs() < 1e-14);
         }
     }
 

@@ -298,11 +298,11 @@ fn sensitivities_through_gaps_stops_and_saturation() {
 }
 
 /// Two bodies with friction between them and to the ground: both signs may stick at once.
-/// Switches that the state alone decides spare the evaluation before an input jumps, and the gradient of a speed that is held
-/// is known. Beside a switch that the input decides nothing is spared, behind a factor of one the gradient is not known: the
-/// motion is the same.
+/// Where all switching functions are states, the evaluation before an input jumps is spared, and the gradient of a speed that
+/// is held is known. Beside a switch on the input nothing is spared; behind a factor of one the gradient is computed. The motion
+/// is the same.
 #[test]
-fn switches_that_the_state_alone_decides_only_spare_work() {
+fn switching_on_the_state_alone_only_spares_work() {
     let parameters =
         [("J", 0.5), ("Jl", 0.4), ("ks", 9.0), ("fc", 0.6), ("fl", 0.2), ("one", 1.0), ("none", 0.0)];
     let of = |q: &str, a: &str, more: &str| {
@@ -320,10 +320,10 @@ fn switches_that_the_state_alone_decides_only_spare_work() {
         let watched = run(&of("q'", "a'", " + none*abs(u - 5)"));
         assert_eq!((&t.y, t.events), (&watched.y, watched.events));
         let spared = watched.evaluations as f64 / t.evaluations as f64 - 1.0;
-        let expected = if hold == Hold::Zero { 0.02..0.1 } else { 0.0..1e-9 };
+        let expected = if hold == Hold::Zero { 0.05..0.1 } else { 0.0..1e-9 };
         assert!(expected.contains(&spared), "{hold:?}: {spared}");
-        let unknown = run(&of("one*q'", "one*a'", ""));
-        let largest = t.y.iter().zip(&unknown.y).map(|(a, b)| (a - b).abs()).fold(0.0, f64::max);
+        let computed = run(&of("one*q'", "one*a'", ""));
+        let largest = t.y.iter().zip(&computed.y).map(|(a, b)| (a - b).abs()).fold(0.0, f64::max);
         assert!(largest < 4e-11, "{hold:?}: {largest}");
     }
 }

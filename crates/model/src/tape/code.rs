@@ -1,7 +1,8 @@
 //! What is run at every point: the operations in their order, frequent pairs in one.
 //!
-//! A pair writes both of its registers (tangents need them), and rounds as its two operations do. A sum of products is a chain,
-//! whose links wait for each other: a link takes the sum so far from the processor, not from its register.
+//! A pair writes both of its registers (tangents need them), and rounds as its two operations do. In a sum of products each
+//! operation needs the result before it. That result is at hand: to read it back from the memory of its register would take longer
+//! than to add.
 
 use super::{Op, Reg, Switch, powi};
 
@@ -20,7 +21,7 @@ pub(super) enum Code {
     SubMul(Reg, Reg, Reg),
     /// a b, then a b c.
     MulMul(Reg, Reg, Reg),
-    /// z + a, z the result before.
+    /// z + a. (z: the result before.)
     Plus(Reg),
     /// z − a.
     Less(Reg),

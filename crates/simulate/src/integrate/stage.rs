@@ -221,8 +221,10 @@ impl Core<'_> {
             for ((p, f1), f0) in held.pull[i * nx..].iter_mut().zip(self.rates.stage(b)).zip(&held.f0) {
                 *p = f1 - f0;
             }
-            // (Others are seen without it.)
-            self.set_sign(b, k, 0.0);
+            // (The next one is seen without it.)
+            if i + 1 < m {
+                self.set_sign(b, k, 0.0);
+            }
         }
         for i in 0..m {
             for j in 0..m {
@@ -234,9 +236,9 @@ impl Core<'_> {
         held.ok = small::factor(&mut held.b, &mut held.pivots, m);
         if held.ok {
             small::solve(&held.b, &held.pivots, m, &mut held.a, 1);
-            for (i, &k) in sticking.iter().enumerate() {
-                self.set_sign(b, k, held.a[i]);
-            }
+        }
+        for (i, &k) in sticking.iter().enumerate() {
+            self.set_sign(b, k, if held.ok { held.a[i] } else { 0.0 });
         }
         self.solve(b);
         let st = &mut self.stages[b];
