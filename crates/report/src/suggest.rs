@@ -140,7 +140,7 @@ fn way_of(kind: &str, subject: &Subject<'_>) -> Way {
         | "bouc_wen_hysteresis"
         | "cogging" => Way::Slow,
         "linear_stiffness" | "quadratic_stiffness" | "cubic_stiffness" | "gravity" => Way::Wide,
-        "quadratic_drag" | "position_dependent_inertia" => Way::Loud,
+        "quadratic_drag" | "load_dependent_damping" | "position_dependent_inertia" => Way::Loud,
         "actuator_lag" => corner("ta"),
         "input_delay" => corner("tau"),
         "sensor_delay" => corner("tsd"),
