@@ -2,7 +2,7 @@
 
 use std::sync::{Arc, Mutex, PoisonError};
 
-use greybox_diagnose::{Observer, Options, diagnose as run};
+use greybox_diagnose::{Options, ProgressListener, diagnose as run};
 use greybox_model::{Expr, Model, System, Unit, WriteOptions, parse, parse_equation};
 use greybox_recording::{Channel, MIN_SAMPLES, Recording, RecordingError};
 use greybox_report::contract::Report;
@@ -217,7 +217,7 @@ impl Meter {
     }
 }
 
-impl Observer for Meter {
+impl ProgressListener for Meter {
     fn begins(&self, work: &Arc<greybox_calibrate::Work>) {
         *self.0.lock().unwrap_or_else(PoisonError::into_inner) = Some(work.clone());
     }

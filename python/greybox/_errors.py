@@ -8,13 +8,13 @@ import json
 class GreyboxError(Exception):
     """Why a call did not finish. ``str(error)`` is what the command prints behind ``error:``.
 
-    Flags that a mend names are arguments here: ``--map`` is ``map=``.
+    Flags that the help names are arguments here: ``--map`` is ``map=``.
     """
 
     #: What is wrong.
     message: str
     #: What to do about it, where the message does not say.
-    mend: str | None
+    help: str | None
     #: Where: the parts that are known.
     file: str | None
     line: int | None
@@ -25,7 +25,7 @@ class GreyboxError(Exception):
         super().__init__(text)
         place = place or {}
         self.message = str(place.get("message", text))
-        for name in ("mend", "file", "line", "column", "channel"):
+        for name in ("help", "file", "line", "column", "channel"):
             setattr(self, name, place.get(name))
 
 

@@ -44,13 +44,13 @@ impl Wanted {
             "smc" => Way::Smc,
             other => {
                 return Err(
-                    Failure::input(format!("`{other}` is no method")).mend("choose `lqr`, `hjb` or `smc`")
+                    Failure::input(format!("`{other}` is no method")).help("choose `lqr`, `hjb` or `smc`")
                 );
             }
         };
         if let Some((name, value)) = self.size.iter().find(|(_, v)| !(*v > 0.0 && v.is_finite())) {
             return Err(Failure::input(format!("{value} is no size of `{name}`"))
-                .mend("give a positive number, such as `size={\"theta\": 0.5}`"));
+                .help("give a positive number, such as `size={\"theta\": 0.5}`"));
         }
         Ok(Request {
             method,

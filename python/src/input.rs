@@ -164,7 +164,7 @@ impl Sources {
         for (k, recording) in train.iter().enumerate() {
             if train[..k].iter().any(|other| other.name == recording.name) {
                 return Err(Failure::input(format!("two recordings are called {}", recording.name))
-                    .mend("give each a name of its own: `greybox.Recording(data, name=…)`"));
+                    .help("give each a name of its own: `greybox.Recording(data, name=…)`"));
             }
         }
         let holdout = train.split_off(count);
@@ -281,13 +281,13 @@ impl Model {
                 let known = model.parameters.iter().map(|p| p.name.as_str());
                 let failure = Failure::file(&self.0.path, format!("there is no parameter `{name}`"));
                 return Err(match nearest(name, known) {
-                    Some(near) => failure.mend(format!("did you mean `{near}`?")),
-                    None => failure.mend("name one of the model's [parameters]"),
+                    Some(near) => failure.help(format!("did you mean `{near}`?")),
+                    None => failure.help("name one of the model's [parameters]"),
                 });
             };
             if !value.is_finite() {
                 return Err(Failure::file(&self.0.path, format!("`{name}` cannot be {value}"))
-                    .mend("give a finite number"));
+                    .help("give a finite number"));
             }
             let parameter = &mut model.parameters[index];
             parameter.value = parameter.unit.as_ref().map_or(*value, |u| u.to_si(*value));
@@ -303,6 +303,6 @@ impl Model {
 /// Bad input: no such hold.
 pub(crate) fn hold(name: &str) -> Result<Hold, Failure> {
     [Hold::Zero, Hold::Linear, Hold::BandLimited].into_iter().find(|hold| hold.name() == name).ok_or_else(
-        || Failure::input(format!("`{name}` is no hold")).mend("choose `zero`, `linear` or `band_limited`"),
+        || Failure::input(format!("`{name}` is no hold")).help("choose `zero`, `linear` or `band_limited`"),
     )
 }

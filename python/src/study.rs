@@ -91,11 +91,11 @@ impl Wanted {
         }
         if self.replicates == 0 {
             return Err(Failure::input("no replicates leave nothing to count inclusions on")
-                .mend("ask for at least one"));
+                .help("ask for at least one"));
         }
         if !(1..=2).contains(&self.derivatives) {
             return Err(Failure::input(format!("`derivatives` is {}", self.derivatives))
-                .mend("2 for mechanics, 1 for first-order systems"));
+                .help("2 for mechanics, 1 for first-order systems"));
         }
         let usual = greybox_identify::Options::new(&borrowed(&self.states), &borrowed(&self.inputs));
         let delay = self.delay.as_ref().map(|state| DelayedState {
@@ -136,14 +136,14 @@ impl Wanted {
                     continue;
                 }
                 other => {
-                    return Err(Failure::input(format!("`{other}` is no part of a library")).mend(
+                    return Err(Failure::input(format!("`{other}` is no part of a library")).help(
                         "choose from `tensor`, `total`, `separate`, `constant`, `friction`, `trigonometric`",
                     ));
                 }
             };
             if chosen.replace(monomials).is_some_and(|before| before != monomials) {
                 return Err(Failure::input("library names two kinds of monomials")
-                    .mend("choose one of `tensor`, `total` and `separate`"));
+                    .help("choose one of `tensor`, `total` and `separate`"));
             }
             library.monomials = monomials;
         }

@@ -83,7 +83,7 @@ impl Watch {
     }
 }
 
-impl greybox_diagnose::Observer for Watch {
+impl greybox_diagnose::ProgressListener for Watch {
     fn begins(&self, work: &Arc<Work>) {
         Watch::begins(self, work);
     }
@@ -109,7 +109,7 @@ impl greybox_diagnose::Observer for Watch {
     }
 }
 
-impl greybox_identify::Observer for Watch {
+impl greybox_identify::ProgressListener for Watch {
     fn begins(&self, work: &Arc<Work>) {
         Watch::begins(self, work);
     }
@@ -121,7 +121,7 @@ impl greybox_identify::Observer for Watch {
 
 /// Does `work` without the interpreter's lock. Stages are told to `progress` on the caller's thread. An exception of
 /// `progress`, or Ctrl-C, is raised at once; the work then ends soon, unheard: a fit with the step that it is at, all
-/// the rest where the libraries next speak to their observer.
+/// the rest where the libraries next speak to their listener.
 ///
 /// # Errors
 /// What `work` says, an exception of `progress`, or `KeyboardInterrupt`. A panic is told as a failure of greybox.

@@ -49,4 +49,4 @@ health: str = greybox.check(recordings, inputs=["v"]).summary
 try:
     greybox.Model("no_such.toml")
 except greybox.InputError as refused:
-    place: tuple[str | None, int | None, str | None] = refused.file, refused.line, refused.mend
+    place: tuple[str | None, int | None, str | None] = refused.file, refused.line, refused.help

@@ -145,7 +145,7 @@ def test_a_model_is_read_changed_and_written(tmp_path):
 def test_an_error_says_where(tmp_path):
     with pytest.raises(greybox.InputError) as error:
         greybox.Model(NOMINAL.replace("b*x'", "bb*x'"))
-    assert (error.value.line, error.value.mend) == (11, "did you mean `b`?")
+    assert (error.value.line, error.value.help) == (11, "did you mean `b`?")
     assert "model.toml:11:" in str(error.value)
 
 

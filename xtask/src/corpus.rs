@@ -20,7 +20,7 @@ fn corpus(target: &str) -> Vec<PathBuf> {
 }
 
 #[test]
-fn what_the_fuzzer_found_stays_mended() {
+fn what_the_fuzzer_found_stays_corrected() {
     for (target, check) in targets::TARGETS {
         let files = corpus(target);
         assert!(files.len() >= 10, "{target}: only {} files", files.len());

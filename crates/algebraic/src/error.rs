@@ -1,4 +1,4 @@
-//! Why a kernel, a row or a stream cannot be made: what was found, what is needed, the mend.
+//! Why a kernel, a row or a stream cannot be made: what was found, what is needed, the fix.
 
 /// Why a kernel, its weights, the rows of a recording or a stream cannot be made.
 #[derive(Debug, Clone, PartialEq, thiserror::Error)]
@@ -113,7 +113,9 @@ pub enum AlgebraicError {
         needed: usize,
     },
     /// Every row touches a sample that is missing.
-    #[error("each of the {dropped} rows touches a missing sample: shorten the window or mend the recording")]
+    #[error(
+        "each of the {dropped} rows touches a missing sample: shorten the window or repair the recording"
+    )]
     NoRows {
         /// Number of rows that would have been there.
         dropped: usize,

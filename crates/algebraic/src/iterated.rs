@@ -98,7 +98,7 @@ impl Iterated {
     /// Factor of y⁽ᵏ⁾(0), k = `derivative`, that P(t) holds beyond I^q\[t^r y⁽ⁿ⁾\]; to be subtracted times y⁽ᵏ⁾(0)
     /// when it is known. 0 when n ≤ r + k: dʳ/dsʳ has removed it.
     ///
-    /// For Eq 3.10's jerk (n = q = 3, r = 2, k = 0) it is t²: the mend of E13.
+    /// For Eq 3.10's jerk (n = q = 3, r = 2, k = 0) it is t²: the fix of E13.
     pub fn initial_factor(&self, order: usize, derivative: usize, t: f64) -> f64 {
         let (r, q) = (self.s_derivatives, self.integrations);
         if order <= r + derivative || order > q {

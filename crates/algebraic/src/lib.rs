@@ -19,7 +19,7 @@
 //! | [`Kernel`] | w for any r, q and window; the exact quadrature weights of any derivative |
 //! | [`rows()`], [`rows_of_pieces`] | the regression's columns on sliding windows |
 //! | [`Stream`] | the same rows while samples arrive |
-//! | [`iterated`] | the thesis's signals P₁(t), P₂(t), … as printed, with E13 mended |
+//! | [`iterated`] | the thesis's signals P₁(t), P₂(t), … as printed, with E13 corrected |
 //! | [`Weights`] | noise gain, correlation of overlapping rows, effective number of rows |
 //!
 //! The method goes back to Fliess & Sira-Ramírez, ESAIM: COCV 9 (2003) 151, doi:10.1051/cocv:2003008; read as

@@ -92,14 +92,14 @@ fn e13_the_jerk_keeps_x0_t_squared_until_it_is_subtracted() {
     let jerk = at(|t| -0.375 * (-0.5 * t).exp() - 8.0 * (2.0 * t).cos());
     let second = at(|t| 0.75 * (-0.5 * t).exp() - 4.0 * (2.0 * t).sin());
     let printed = Iterated::new(2, 3, dt).unwrap().with_initial(Initial::Separate);
-    let mended = Iterated::new(2, 3, dt).unwrap().with_initial(Initial::FirstSample);
+    let corrected = Iterated::new(2, 3, dt).unwrap().with_initial(Initial::FirstSample);
     let of = |form: &Iterated, y: &[f64], n| form.signal(y, n, Hold::Smooth).unwrap();
-    let (p1, p1_mended, truth) = (of(&printed, &x, 3), of(&mended, &x, 3), of(&mended, &jerk, 0));
+    let (p1, p1_corrected, truth) = (of(&printed, &x, 3), of(&corrected, &x, 3), of(&corrected, &jerk, 0));
     let (p2, p2_truth) = (of(&printed, &x, 2), of(&printed, &second, 0));
     for k in (0..=5000).step_by(50) {
         let t = dt * k as f64;
         assert!((p1[k] - truth[k] - 3.0 * t * t).abs() < 1e-7);
-        assert!((p1_mended[k] - truth[k]).abs() < 1e-7);
+        assert!((p1_corrected[k] - truth[k]).abs() < 1e-7);
         assert!((p2[k] - p2_truth[k]).abs() < 1e-7);
         assert!((printed.initial_factor(3, 0, t) - t * t).abs() < 1e-12);
     }

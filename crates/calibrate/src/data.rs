@@ -14,7 +14,7 @@ use greybox_simulate::{Environment, FINE, Signal};
 pub enum DataError {
     /// A channel that the model needs is not in the file.
     #[error(
-        "{file}: there is no channel `{channel}`, which the model's {role} needs; the file has {available}. {mend}"
+        "{file}: there is no channel `{channel}`, which the model's {role} needs; the file has {available}. {help}"
     )]
     MissingChannel {
         /// File.
@@ -26,7 +26,7 @@ pub enum DataError {
         /// What there is instead.
         available: String,
         /// How to give the model a channel of the file.
-        mend: String,
+        help: String,
     },
     /// The header's unit and the model's do not measure the same thing.
     #[error(
@@ -77,7 +77,7 @@ pub enum DataError {
         largest: f64,
     },
     /// The derivative of a channel that has none.
-    #[error("{file}: input `{input}` is the derivative of channel `{channel}`, {reason}. {mend}")]
+    #[error("{file}: input `{input}` is the derivative of channel `{channel}`, {reason}. {help}")]
     Derivative {
         /// File.
         file: String,
@@ -88,7 +88,7 @@ pub enum DataError {
         /// Why there is none.
         reason: String,
         /// What to do instead.
-        mend: String,
+        help: String,
     },
     /// The model measures nothing.
     #[error("the model has no measured state: give one a channel, or add [measurements]")]
@@ -361,7 +361,7 @@ impl Data {
 
 /// How to give the model, which looks for `channel`, one that the recording has; `name` is that of the input or state, with
 /// the primes of its channel.
-fn mend(channel: &str, name: Option<(&str, &str)>, recording: &Recording) -> String {
+fn help(channel: &str, name: Option<(&str, &str)>, recording: &Recording) -> String {
     let there = recording.channels.iter().map(|c| c.name.as_str());
     // Of a name of one or two letters, any other is a slip away.
     let near = nearest(channel, there).filter(|_| channel.chars().count() > 2);
@@ -394,12 +394,12 @@ fn find_input(model: &Model, input: &Input, recording: &Recording) -> Result<Fou
         let wanted = Wanted { channel, role, name, unit: &input.unit, measured: None };
         return Ok(FoundInput { column: find_channel(model, recording, wanted)?, differentiated: false });
     };
-    let refused = |reason: &str, mend: String| DataError::Derivative {
+    let refused = |reason: &str, help: String| DataError::Derivative {
         file: recording.name.clone(),
         input: input.name.clone(),
         channel: base.to_owned(),
         reason: reason.to_owned(),
-        mend,
+        help,
     };
     if base.ends_with('\'') {
         return Err(refused(
@@ -442,8 +442,8 @@ fn find_input(model: &Model, input: &Input, recording: &Recording) -> Result<Fou
     let wanted = Wanted { channel: base, role, name: None, unit: &unit, measured: None };
     let column = find_channel(model, recording, wanted).map_err(|error| match error {
         DataError::MissingChannel { file, channel, role, available, .. } => {
-            let mend = mend(base, Some((&input.name, "'")), recording);
-            DataError::MissingChannel { file, channel, role, available, mend }
+            let help = help(base, Some((&input.name, "'")), recording);
+            DataError::MissingChannel { file, channel, role, available, help }
         }
         other => other,
     })?;
@@ -507,7 +507,7 @@ fn find_channel(
             channel: channel.to_string(),
             role,
             available: greybox_recording::told(available),
-            mend: mend(channel, name.map(|name| (name, "")), recording),
+            help: help(channel, name.map(|name| (name, "")), recording),
         });
     };
     let found = &recording.channels[index];
@@ -557,7 +557,7 @@ pub fn spread(values: &[f64]) -> f64 {
 
 /// What the measurements alone say of the states: value, derivative and their standard errors.
 #[derive(Debug, Clone)]
-pub struct Hats {
+pub struct SmoothedStates {
     /// Per piece, per entry of the state vector: the smoothed signal, where a channel measures it.
     pub states: Vec<Vec<Option<Vec<f64>>>>,
     /// Per entry of the state vector: standard deviation to allow a start value.
@@ -566,22 +566,22 @@ pub struct Hats {
     pub highest: Vec<Vec<Option<Vec<f64>>>>,
 }
 
-impl Hats {
+impl SmoothedStates {
     /// Smoothed states of every piece: coordinates measured by a channel of their own (q and, from the
     /// same window, q'), and rates measured by one. A coordinate that a channel measures through a reading (q + so) is there
     /// too, at the model's values of the parameters; since those may change it is not known. Where only a late sensor measures a
     /// coordinate, its readings are not shifted in time: [`Setup::start`](crate::Setup::start) does that.
-    pub fn new(model: &Model, data: &Data) -> Hats {
-        Hats::made(model, data, false)
+    pub fn new(model: &Model, data: &Data) -> SmoothedStates {
+        SmoothedStates::made(model, data, false)
     }
 
     /// The same where the model's values of the parameters are right: then a reading tells its coordinate, unless it reads two
     /// values as one.
-    pub(crate) fn of_known(model: &Model, data: &Data) -> Hats {
-        Hats::made(model, data, true)
+    pub(crate) fn of_known(model: &Model, data: &Data) -> SmoothedStates {
+        SmoothedStates::made(model, data, true)
     }
 
-    fn made(model: &Model, data: &Data, readings_are_known: bool) -> Hats {
+    fn made(model: &Model, data: &Data, readings_are_known: bool) -> SmoothedStates {
         let mut sources: Vec<Option<(usize, usize)>> = Vec::new(); // (channel, derivative)
         let mut highest = Vec::new();
         // By entry: how its coordinate is read, and which entry that is.
@@ -671,7 +671,7 @@ impl Hats {
             .collect();
         let highest =
             data.pieces.iter().map(|p| highest.iter().map(|s| pick(p, s, None)).collect()).collect();
-        Hats { states, tolerance, highest }
+        SmoothedStates { states, tolerance, highest }
     }
 }
 

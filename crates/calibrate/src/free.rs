@@ -2,7 +2,7 @@
 
 use greybox_model::{Dimension, Expr, Model};
 
-use crate::problem::{Free, Prior};
+use crate::problem::{FreeParameter, Prior};
 
 /// Scale of the prior of a parameter whose uncertainty is not stated, over its value.
 const UNSTATED: f64 = 0.5;
@@ -23,7 +23,7 @@ const MATCHED: usize = 7;
 ///
 /// A parameter may cross zero, but for those that physics keeps from it: where `positive = true` is stated, and where
 /// nothing is stated those that [`keeps_sign`] finds.
-pub fn free_parameters(model: &Model) -> Vec<Free> {
+pub fn free_parameters(model: &Model) -> Vec<FreeParameter> {
     let structure = Structure::of(model);
     model
         .parameters
@@ -47,7 +47,7 @@ pub fn free_parameters(model: &Model) -> Vec<Free> {
             } else {
                 (f64::NEG_INFINITY, f64::INFINITY)
             };
-            Free { index, prior, lower, upper }
+            FreeParameter { index, prior, lower, upper }
         })
         .collect()
 }

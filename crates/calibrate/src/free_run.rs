@@ -4,7 +4,7 @@ use greybox_simulate::{Seeds, Simulation, integrate};
 use rayon::prelude::*;
 
 use crate::problem::{Limits, Point, Segment};
-use crate::setup::{Level, Setup};
+use crate::setup::{Segmentation, Setup};
 
 /// A free run over every piece of the data.
 #[derive(Debug, Clone)]
@@ -225,7 +225,8 @@ impl Setup {
                 if horizon < LEAST_UNMEASURED && p.1.is_infinite() { (x0[j], 0.0) } else { *p }
             };
             let prior = prior.iter().enumerate().map(hold).collect();
-            let level = Level { segments: vec![Segment { piece, range: 0..horizon }], priors: vec![prior] };
+            let level =
+                Segmentation { segments: vec![Segment { piece, range: 0..horizon }], priors: vec![prior] };
             let point = Point { parameters: parameters.to_vec(), starts: vec![x0.clone()] };
             let fit = fixed
                 .with_problem(&level, scale, |p| p.fit(point, Limits { iterations: 12, tolerance: 1e-6 }));
@@ -332,7 +333,8 @@ impl Setup {
             let horizon = a..a + ((b - a) as f64 * START_SHARE) as usize;
             // Where the past matters, a stretch without it would be fitted to the wrong start.
             if horizon.len() >= 2 && !greybox_simulate::has_history(&self.system) {
-                let level = Level { segments: vec![Segment { piece, range: horizon }], priors: vec![prior] };
+                let level =
+                    Segmentation { segments: vec![Segment { piece, range: horizon }], priors: vec![prior] };
                 let point = Point { parameters: parameters.to_vec(), starts: vec![x0.clone()] };
                 let limits = Limits { iterations: 6, tolerance: 1e-4 };
                 let fit = fixed.with_problem(&level, &self.data.sigma, |p| p.fit(point, limits));

@@ -6,7 +6,7 @@
 //! Identification*, 2nd edition, section 10.5, of local minima).
 
 use crate::problem::{Fit, Limits, Point};
-use crate::setup::{Level, Setup};
+use crate::setup::{Segmentation, Setup};
 
 /// Factor by which the horizon grows.
 const GROWTH: usize = 2;
@@ -18,7 +18,7 @@ const STARTS: usize = 6;
 #[derive(Debug, Clone)]
 pub struct Horizon {
     /// The segments.
-    pub level: Level,
+    pub level: Segmentation,
     /// The fit.
     pub fit: Fit,
 }
@@ -26,7 +26,7 @@ pub struct Horizon {
 impl Setup {
     /// Fits at horizons that double from that of `from` until they span whole pieces, shortest first; the last is that
     /// of whole pieces. `limits` are those of each fit.
-    pub fn grow(&self, from: &Level, point: &Point, scale: &[f64], limits: Limits) -> Vec<Horizon> {
+    pub fn grow(&self, from: &Segmentation, point: &Point, scale: &[f64], limits: Limits) -> Vec<Horizon> {
         let longest = self.data.lengths().into_iter().max().unwrap_or(0);
         let mut length = from.segments.iter().map(|s| s.range.len()).max().unwrap_or(1).max(1);
         let (mut level, mut point) = (from.clone(), point.clone());
@@ -49,7 +49,14 @@ impl Setup {
 
     /// Fits at another level: from the stitched trajectory of a fit or from the measurements, whichever is better. The
     /// starts come first: parameters that fit elsewhere must not give way to starts that do not yet.
-    pub fn lengthen(&self, from: &Level, point: &Point, to: &Level, scale: &[f64], limits: Limits) -> Fit {
+    pub fn lengthen(
+        &self,
+        from: &Segmentation,
+        point: &Point,
+        to: &Segmentation,
+        scale: &[f64],
+        limits: Limits,
+    ) -> Fit {
         let stitched = self.stitch(from, point, to, scale);
         let measured =
             Point { parameters: point.parameters.clone(), starts: self.starts(to, &point.parameters) };

@@ -112,7 +112,7 @@ fn told(setup: &Setup, found: &InputNoise, fitted: bool) -> Finding {
         output.name,
         significant(found.effect / found.noise),
     );
-    let mend = if found.rounded {
+    let help = if found.rounded {
         "Use the commanded value in its place, or a finer sensor."
     } else {
         "Use the commanded value in its place, or filter it forwards and backwards, which adds no lag. If an equation says \
@@ -120,7 +120,7 @@ fn told(setup: &Setup, found: &InputNoise, fitted: bool) -> Finding {
     };
     Finding::new(severity, "input_noise", message)
         .on(&input.channel)
-        .mend(mend)
+        .help(help)
         .value(input.unit.difference_from_si(found.sigma), Some(&input.unit.text))
 }
 

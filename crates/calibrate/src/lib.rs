@@ -17,11 +17,13 @@ pub mod setup;
 pub mod stochastic;
 mod student;
 
-pub use data::{Data, DataError, Hats, PieceData, spread};
+pub use data::{Data, DataError, PieceData, SmoothedStates, spread};
 pub use free::free_parameters;
 pub use free_run::{Criterion, FreeRun, Score, window_length, window_of};
 pub use horizon::Horizon;
 pub use noise_model::Autoregression;
-pub use problem::{Ending, Fit, Free, Limits, Point, Prior, Problem, Segment, SegmentRows, StartPrior, Work};
-pub use setup::{Level, Setup, SetupError, UnknownState};
+pub use problem::{
+    Ending, Fit, FreeParameter, Limits, Point, Prior, Problem, Segment, SegmentRows, StartPrior, Work,
+};
+pub use setup::{Segmentation, Setup, SetupError, UnknownState};
 pub use student::student_quantile;

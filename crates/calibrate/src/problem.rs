@@ -110,7 +110,7 @@ impl Prior {
 
 /// A parameter the fit may move.
 #[derive(Debug, Clone, PartialEq)]
-pub struct Free {
+pub struct FreeParameter {
     /// Index in the system's parameter vector.
     pub index: usize,
     /// What is known of it before the fit.
@@ -137,7 +137,7 @@ pub struct Problem<'a> {
     /// One prior per segment.
     pub start_priors: &'a [StartPrior],
     /// Parameters to fit.
-    pub free: &'a [Free],
+    pub free: &'a [FreeParameter],
     /// Residual scale per channel.
     pub scale: &'a [f64],
     /// Entries of the state vector that a segment takes over from the one that ends where it starts.
@@ -638,7 +638,7 @@ impl Problem<'_> {
                 let shrink = damping / (1.0 + 0.1 * lambda.min(1e6));
                 let promised = self.promised(&global, &reduced, &moved, shrink);
                 if promised < f64::EPSILON * cost {
-                    let whole = |(f, d): (&Free, &f64)| {
+                    let whole = |(f, d): (&FreeParameter, &f64)| {
                         (f.lower..=f.upper).contains(&(point.parameters[f.index] + d))
                     };
                     if self.free.iter().zip(&step).all(whole) {

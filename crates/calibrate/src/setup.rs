@@ -8,9 +8,11 @@ use greybox_model::{Expr, Func, Hold, Model, System};
 use greybox_simulate::{Environment, MOST_TRIALS, Method, Seeds, Trajectory, integrate};
 use rayon::prelude::*;
 
-use crate::data::{Data, Hats};
+use crate::data::{Data, SmoothedStates};
 use crate::noise_model::{Autoregression, MOST};
-use crate::problem::{Fit, Free, Limits, Point, Problem, Segment, SegmentRows, StartPrior, Work, segments};
+use crate::problem::{
+    Fit, FreeParameter, Limits, Point, Problem, Segment, SegmentRows, StartPrior, Work, segments,
+};
 
 /// Shortest segment, samples.
 const LEAST: usize = 40;
@@ -40,7 +42,7 @@ pub struct Setup {
     /// The data.
     pub data: Arc<Data>,
     /// Smoothed measurements as states.
-    pub hats: Arc<Hats>,
+    pub smoothed_states: Arc<SmoothedStates>,
     /// Hold of each input.
     pub holds: Vec<Hold>,
     /// One environment per piece.
@@ -48,7 +50,7 @@ pub struct Setup {
     /// Integration method.
     pub method: Method,
     /// Parameters to fit with priors and bounds.
-    pub free: Vec<Free>,
+    pub free: Vec<FreeParameter>,
     /// Entries of the state vector carried from segment to segment (see [`Problem::carried`]).
     pub carried: Vec<usize>,
     /// Noise per channel by which fits are whitened (see [`Problem::noise`]); simulations and scores
@@ -112,7 +114,7 @@ pub struct UnknownState {
 
 /// A choice of segments with the priors of their starts.
 #[derive(Debug, Clone)]
-pub struct Level {
+pub struct Segmentation {
     /// The segments.
     pub segments: Vec<Segment>,
     /// Prior of each segment's initial state.
@@ -124,16 +126,16 @@ impl Setup {
     ///
     /// # Errors
     /// When the model does not compile, or has a mode so much faster than the samples that it cannot be simulated.
-    pub fn new(model: &Model, data: Arc<Data>, free: Vec<Free>) -> Result<Setup, SetupError> {
+    pub fn new(model: &Model, data: Arc<Data>, free: Vec<FreeParameter>) -> Result<Setup, SetupError> {
         let system = Arc::new(System::compile(model)?);
-        let hats = Arc::new(Hats::new(model, &data));
+        let smoothed_states = Arc::new(SmoothedStates::new(model, &data));
         let holds: Vec<Hold> = model.inputs.iter().map(|i| i.hold).collect();
         let environments = Arc::new(data.environments(&holds));
         let mut setup = Setup {
             model: model.clone(),
             system,
             data,
-            hats,
+            smoothed_states,
             holds,
             environments,
             method: Method::Rk4 { substeps: 1 },
@@ -160,25 +162,25 @@ impl Setup {
     ///
     /// # Errors
     /// When the model does not compile.
-    pub fn with_model(&self, model: Model, free: Vec<Free>) -> Result<Setup, CompileError> {
+    pub fn with_model(&self, model: Model, free: Vec<FreeParameter>) -> Result<Setup, CompileError> {
         let system = Arc::new(System::compile(&model)?);
-        let hats = if system.nx == self.system.nx {
-            self.hats.clone()
+        let smoothed_states = if system.nx == self.system.nx {
+            self.smoothed_states.clone()
         } else {
-            Arc::new(Hats::new(&model, &self.data))
+            Arc::new(SmoothedStates::new(&model, &self.data))
         };
-        Ok(Setup { model, system, hats, free, carried: Vec::new(), ..self.clone() })
+        Ok(Setup { model, system, smoothed_states, free, carried: Vec::new(), ..self.clone() })
     }
 
     /// The same model, integrated in the same way, with other recordings of its channels.
     pub fn with_data(&self, data: Arc<Data>) -> Setup {
-        let hats = Hats::new(&self.model, &data);
-        self.with_smoothed(data, hats)
+        let smoothed_states = SmoothedStates::new(&self.model, &data);
+        self.with_smoothed(data, smoothed_states)
     }
 
-    fn with_smoothed(&self, data: Arc<Data>, hats: Hats) -> Setup {
+    fn with_smoothed(&self, data: Arc<Data>, smoothed_states: SmoothedStates) -> Setup {
         let environments = Arc::new(data.environments(&self.holds));
-        Setup { data, hats: Arc::new(hats), environments, noise: None, ..self.clone() }
+        Setup { data, smoothed_states: Arc::new(smoothed_states), environments, noise: None, ..self.clone() }
     }
 
     /// The same model for simulations of other recordings with these parameters: in the same steps, or in finer ones
@@ -189,8 +191,8 @@ impl Setup {
         for (p, v) in model.parameters.iter_mut().zip(parameters) {
             p.value = *v;
         }
-        let hats = Hats::of_known(&model, &data);
-        let mut setup = Setup { model, ..self.with_smoothed(data, hats) };
+        let smoothed_states = SmoothedStates::of_known(&model, &data);
+        let mut setup = Setup { model, ..self.with_smoothed(data, smoothed_states) };
         setup.choose_method(tolerance, JUDGED);
         if setup.method.evaluations() < self.method.evaluations() {
             setup.method = self.method;
@@ -331,7 +333,7 @@ impl Setup {
     /// zero.
     pub fn start(&self, piece: usize, sample: usize) -> Vec<f64> {
         let mut x = self.given_start();
-        for (v, hat) in x.iter_mut().zip(&self.hats.states[piece]) {
+        for (v, hat) in x.iter_mut().zip(&self.smoothed_states.states[piece]) {
             if let Some(hat) = hat
                 && hat[sample].is_finite()
             {
@@ -355,9 +357,9 @@ impl Setup {
             let seen_at_once = |i: usize| (0..=i).any(|p| self.model.measurement_of(name, p as u8).is_some());
             for i in (0..order).filter(|i| !seen_at_once(*i)) {
                 let rate = if i + 1 < order {
-                    self.hats.states[piece][first + i + 1].as_ref()
+                    self.smoothed_states.states[piece][first + i + 1].as_ref()
                 } else {
-                    self.hats.highest[piece][j].as_ref()
+                    self.smoothed_states.highest[piece][j].as_ref()
                 };
                 moved[first + i] = rate.map_or(0.0, |r| tau * r[sample]);
             }
@@ -383,9 +385,9 @@ impl Setup {
         // slope there is four times that in the middle.
         let n = self.data.pieces[piece].len;
         let end = if sample < 3 || sample + 3 >= n { 4.0 } else { 1.0 };
-        let mut prior: StartPrior = self.hats.states[piece]
+        let mut prior: StartPrior = self.smoothed_states.states[piece]
             .iter()
-            .zip(&self.hats.tolerance)
+            .zip(&self.smoothed_states.tolerance)
             .zip(self.gone_on(piece, sample))
             .map(|((hat, tolerance), moved)| match hat {
                 Some(h) if h[sample].is_finite() => (h[sample] + moved, (end * tolerance).hypot(moved)),
@@ -404,7 +406,7 @@ impl Setup {
 
     /// Windows of about `length` samples, of at most `most` samples in all: where the data hold more, the
     /// windows are spread evenly over them.
-    pub fn windows(&self, length: usize, most: usize) -> Level {
+    pub fn windows(&self, length: usize, most: usize) -> Segmentation {
         let total: usize = self.data.lengths().iter().sum();
         let count = (total as f64 / length.max(1) as f64).round().max(1.0) as usize;
         let all = segments(&self.data.lengths(), count, length.min(LEAST));
@@ -415,21 +417,21 @@ impl Setup {
             (0..wanted).map(|i| all[(2 * i + 1) * all.len() / (2 * wanted)].clone()).collect()
         };
         let priors = chosen.iter().map(|s| self.start_prior(s.piece, s.range.start)).collect();
-        Level { segments: chosen, priors }
+        Segmentation { segments: chosen, priors }
     }
 
     /// About `count` segments over all pieces.
-    pub fn level(&self, count: usize) -> Level {
+    pub fn level(&self, count: usize) -> Segmentation {
         let segments = segments(&self.data.lengths(), count, LEAST);
         let priors = segments.iter().map(|s| self.start_prior(s.piece, s.range.start)).collect();
-        Level { segments, priors }
+        Segmentation { segments, priors }
     }
 
     /// Initial states from the measurements; unmeasured entries from a simulation with `parameters`. That at a piece's
     /// first sample, where smoothing is one-sided, is fitted to its first samples.
-    pub fn starts(&self, level: &Level, parameters: &[f64]) -> Vec<Vec<f64>> {
+    pub fn starts(&self, level: &Segmentation, parameters: &[f64]) -> Vec<Vec<f64>> {
         let unmeasured: Vec<usize> =
-            (0..self.system.nx).filter(|&i| self.hats.tolerance[i].is_infinite()).collect();
+            (0..self.system.nx).filter(|&i| self.smoothed_states.tolerance[i].is_infinite()).collect();
         let runs: Vec<Option<Vec<f64>>> = if unmeasured.is_empty() {
             Vec::new()
         } else {
@@ -472,7 +474,12 @@ impl Setup {
     }
 
     /// Runs `f` on the shooting problem of a level.
-    pub fn with_problem<R>(&self, level: &Level, scale: &[f64], f: impl FnOnce(&Problem<'_>) -> R) -> R {
+    pub fn with_problem<R>(
+        &self,
+        level: &Segmentation,
+        scale: &[f64],
+        f: impl FnOnce(&Problem<'_>) -> R,
+    ) -> R {
         self.with_problem_in(&self.environments, level, scale, f)
     }
 
@@ -480,7 +487,7 @@ impl Setup {
     pub fn with_problem_in<R>(
         &self,
         environments: &[Environment],
-        level: &Level,
+        level: &Segmentation,
         scale: &[f64],
         f: impl FnOnce(&Problem<'_>) -> R,
     ) -> R {
@@ -495,7 +502,7 @@ impl Setup {
             free: &self.free,
             scale,
             carried: &self.carried,
-            past: &self.hats.states,
+            past: &self.smoothed_states.states,
             noise: self.noise.as_ref().map(|noise| noise.as_slice()),
             work: &self.work,
         })
@@ -503,7 +510,7 @@ impl Setup {
 
     /// What the residuals at a point say of the noise: one autoregression per channel, of the raw
     /// residuals (measured − simulated, SI), whatever [`noise`](Self::noise) is now.
-    pub fn innovations(&self, level: &Level, scale: &[f64], point: &Point) -> Vec<Autoregression> {
+    pub fn innovations(&self, level: &Segmentation, scale: &[f64], point: &Point) -> Vec<Autoregression> {
         let raw = Setup { noise: None, ..self.clone() };
         let rows = raw.with_problem(level, scale, |p| p.rows(point, false, None));
         (0..self.system.ny)
@@ -526,7 +533,7 @@ impl Setup {
     }
 
     /// Fits from the cheapest of several starting points.
-    pub fn fit(&self, level: &Level, scale: &[f64], points: &[Point], limits: Limits) -> Fit {
+    pub fn fit(&self, level: &Segmentation, scale: &[f64], points: &[Point], limits: Limits) -> Fit {
         self.with_problem(level, scale, |problem| {
             let simulated = points.iter().map(|p| (problem.rows(p, false, None), p));
             let priced = simulated.map(|(rows, p)| (problem.cost_of(&rows, p), rows, p));
@@ -581,7 +588,13 @@ impl Setup {
 
     /// The `most` points of least cost, best first; points that cannot be simulated are left out, and so is
     /// what costs the same as a better one.
-    pub fn best_points(&self, level: &Level, scale: &[f64], points: Vec<Point>, most: usize) -> Vec<Point> {
+    pub fn best_points(
+        &self,
+        level: &Segmentation,
+        scale: &[f64],
+        points: Vec<Point>,
+        most: usize,
+    ) -> Vec<Point> {
         self.with_problem(level, scale, |problem| {
             let mut priced: Vec<(f64, Point)> = points.into_iter().map(|p| (problem.cost(&p), p)).collect();
             priced.retain(|p| p.0.is_finite());
@@ -593,7 +606,7 @@ impl Setup {
     }
 
     /// Start values for a finer or coarser level read off a fitted trajectory (stitched segments).
-    pub fn stitch(&self, from: &Level, fit: &Point, to: &Level, scale: &[f64]) -> Point {
+    pub fn stitch(&self, from: &Segmentation, fit: &Point, to: &Segmentation, scale: &[f64]) -> Point {
         let rows = self.with_problem(from, scale, |p| p.rows(fit, false, None));
         let starts = to
             .segments

@@ -351,7 +351,7 @@ impl Filter {
         // Of an entry of the state: by its sensor, else by the simulation.
         let size = |entry: usize| -> f64 {
             let seen: Vec<&Vec<f64>> =
-                nominal.hats.states.iter().filter_map(|states| states[entry].as_ref()).collect();
+                nominal.smoothed_states.states.iter().filter_map(|states| states[entry].as_ref()).collect();
             if !seen.is_empty() {
                 return rms(seen.into_iter().flatten());
             }
@@ -369,7 +369,7 @@ impl Filter {
             .enumerate()
             .map(|(j, state)| {
                 let seen: Vec<&Vec<f64>> =
-                    nominal.hats.highest.iter().filter_map(|h| h[j].as_ref()).collect();
+                    nominal.smoothed_states.highest.iter().filter_map(|h| h[j].as_ref()).collect();
                 let rate = size(offset[j] + order[j] - 1);
                 let highest =
                     if seen.is_empty() { rate / dt / FIRST_MEMORY } else { rms(seen.into_iter().flatten()) };

@@ -1,7 +1,7 @@
 //! Memory that no sensor sees, and delays, through the seams of the segments.
 
 use crate::common::*;
-use greybox_calibrate::{Level, Segment};
+use greybox_calibrate::{Segment, Segmentation};
 use greybox_model::Model;
 
 const BOUC_WEN: &str = r#"
@@ -91,7 +91,7 @@ fn hysteresis_is_recovered_when_its_memory_is_carried() {
         assert!((0.85..1.1).contains(&reduced), "{reduced}");
         // In short segments a memory that is free says little; carried, it says nearly as much.
         let short = carried.level(60);
-        let of = |s: &greybox_calibrate::Setup, level: &Level| {
+        let of = |s: &greybox_calibrate::Setup, level: &Segmentation| {
             let point = fit(s, level, &scale).point;
             s.with_problem(level, &scale, |p| standard_errors(p, &point))
         };
@@ -113,7 +113,7 @@ fn delayed_feedback_keeps_its_past_in_short_segments() {
         let s = setup(&off(&truth, &[1.2, 0.9, 0.8, 1.2]), &f, DT, &noisy(&clean, sigma, 20 + seed));
         let level = s.level(60);
         // One sample short of the next: nothing goes on there, and what was before is read off the measurement.
-        let cut = Level {
+        let cut = Segmentation {
             segments: level
                 .segments
                 .iter()
@@ -155,7 +155,7 @@ fn a_gap_between_segments_starts_a_new_chain() {
     let segments: Vec<Segment> =
         [200..300, 0..100, 100..180, 300..400].map(|range| Segment { piece: 0, range }).into();
     let priors = segments.iter().map(|g| s.start_prior(0, g.range.start)).collect();
-    let level = Level { segments, priors };
+    let level = Segmentation { segments, priors };
     s.with_problem(&level, &[1.0], |p| assert_eq!(p.chains(), [vec![1, 2], vec![0, 3]]));
     // What is asked for is said when it is not there; another model carries nothing.
     let error = s.with_carried(&["y".to_string()]).unwrap_err();

@@ -28,7 +28,7 @@ fn refusal(header: &str) -> String {
 }
 
 #[test]
-fn a_slip_in_the_name_of_a_state_s_channel_is_mended_at_the_state() {
+fn a_slip_in_the_name_of_a_state_s_channel_is_corrected_at_the_state() {
     let told = refusal("t,u,angle,spead");
     assert!(told.contains("Did you mean `angle`?"), "{told}");
     assert!(
@@ -38,7 +38,7 @@ fn a_slip_in_the_name_of_a_state_s_channel_is_mended_at_the_state() {
 }
 
 #[test]
-fn a_measurement_is_mended_at_its_key() {
+fn a_measurement_is_corrected_at_its_key() {
     let told = refusal("t,u,angel,speed");
     assert!(told.contains("`speed` in the place of `spead` under `[measurements]`"), "{told}");
 }

@@ -3,7 +3,7 @@
 
 use std::path::PathBuf;
 
-use greybox_calibrate::{Fit, Free, Limits, Point, Prior, Problem, Segment, Work};
+use greybox_calibrate::{Fit, FreeParameter, Limits, Point, Prior, Problem, Segment, Work};
 use greybox_model::{Hold, Model, System};
 use greybox_simulate::{Environment, Method, Signal};
 use serde_json::Value;
@@ -48,8 +48,13 @@ fn solve(case: &Value, start: &[f64]) -> Fit {
     let inputs =
         (0..x[0].len()).map(|i| Signal::new(Hold::Linear, 1.0, &column(i), |_| Vec::new())).collect();
     let environment = [Environment { start: 0.0, dt: 1.0, len: y.len(), inputs, forces: Vec::new() }];
-    let free: Vec<Free> = (0..start.len())
-        .map(|index| Free { index, prior: Prior::Flat, lower: f64::NEG_INFINITY, upper: f64::INFINITY })
+    let free: Vec<FreeParameter> = (0..start.len())
+        .map(|index| FreeParameter {
+            index,
+            prior: Prior::Flat,
+            lower: f64::NEG_INFINITY,
+            upper: f64::INFINITY,
+        })
         .collect();
     let segments = [Segment { piece: 0, range: 0..y.len() }];
     let size = (y.iter().map(|y| y * y).sum::<f64>() / y.len() as f64).sqrt();

@@ -3,7 +3,7 @@
 use std::sync::Arc;
 
 use crate::common::*;
-use greybox_calibrate::{Autoregression, Level, Limits, Point, Setup, qr};
+use greybox_calibrate::{Autoregression, Limits, Point, Segmentation, Setup, qr};
 use greybox_model::Model;
 
 const DT: f64 = 0.02;
@@ -24,7 +24,7 @@ fn first_order(a: f64, sigma: f64, seed: u64, n: usize) -> Vec<f64> {
 
 /// Variance of the unweighted estimates of the parameters under AR(1) noise, by the sandwich
 /// (JᵀJ)⁻¹ JᵀΣJ (JᵀJ)⁻¹ with Σ(k, l) = σ² a^|k−l|; the initial states are estimated along.
-fn sandwich(setup: &Setup, level: &Level, point: &Point, a: f64, sigma: f64) -> Vec<f64> {
+fn sandwich(setup: &Setup, level: &Segmentation, point: &Point, a: f64, sigma: f64) -> Vec<f64> {
     let rows = setup.with_problem(level, &[1.0], |p| p.rows(point, true, None));
     let (nx, np) = (setup.system.nx, setup.free.len());
     let width = nx * rows.len() + np;
@@ -150,7 +150,7 @@ fn whitening_touches_the_measurements_alone_and_missing_pieces_are_harmless() {
                 let mut expected = raw.to_vec();
                 model.whiten(&mut expected[..n], &missing);
                 assert_eq!(&expected[..n], &got[..n]);
-                if raw[n..].iter().all(|v| v.is_finite()) && plain.hats.tolerance[0] > 0.0 {
+                if raw[n..].iter().all(|v| v.is_finite()) && plain.smoothed_states.tolerance[0] > 0.0 {
                     assert_eq!(&expected[n..], &got[n..]);
                 }
             }

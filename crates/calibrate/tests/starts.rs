@@ -21,11 +21,11 @@ fn a_late_sensor_shows_where_the_machine_was() {
     model.measurements[0].expr = greybox_model::parse("delay(x, tau)").unwrap().expr;
     let after = before.with_model(model.clone(), before.free.clone()).unwrap();
     let stated = setup(&model, &f, dt, std::slice::from_ref(&late));
-    let (mut off, mut mended) = (0.0, 0.0);
+    let (mut off, mut corrected) = (0.0, 0.0);
     for k in (20..n - 20).step_by(20) {
         let truth = measured[0][k];
         off += (before.start(0, k)[0] - truth).powi(2);
-        mended += (after.start(0, k)[0] - truth).powi(2);
+        corrected += (after.start(0, k)[0] - truth).powi(2);
         let ((mean, std), (_, plain)) = (after.start_prior(0, k)[0], before.start_prior(0, k)[0]);
         let moved = after.start(0, k)[0] - before.start(0, k)[0];
         assert!((mean - after.start(0, k)[0]).abs() < 1e-15);
@@ -46,7 +46,7 @@ fn a_late_sensor_shows_where_the_machine_was() {
     let alone = setup(&prompt, &f, dt, &measured);
     assert!((20..n - 20).all(|k| both.start(0, k) == alone.start(0, k)));
     // The rate times τ misses ẍ τ²/2: a fifteenth of the whole for ωτ = 0.13.
-    assert!(mended < 0.05 * off, "{mended} {off}");
+    assert!(corrected < 0.05 * off, "{corrected} {off}");
 }
 
 /// A free decay whose frequency depends on its amplitude: the start is found beside the one that one-sided smoothing

@@ -7,7 +7,7 @@ use crate::failure::Failure;
 
 /// For whom a command speaks.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub(crate) enum Manner {
+pub(crate) enum OutputFormat {
     /// Plain language.
     Text,
     /// One JSON document.
@@ -36,7 +36,7 @@ impl Answer {
         Answer { met, ..self }
     }
 
-    /// Help or version: the same words in either manner.
+    /// Help or version: the same words in either output.
     pub(crate) fn words(text: String) -> Answer {
         Answer { text, json: None, met: Vec::new() }
     }
@@ -50,14 +50,14 @@ impl Answer {
     ///
     /// # Errors
     /// Bad input: standard output cannot be written.
-    pub(crate) fn print(&self, manner: Manner) -> Result<ExitCode, Failure> {
-        let printed = match (&self.json, manner) {
-            (Some(json), Manner::Json) => print(&format!("{json:#}\n")),
+    pub(crate) fn print(&self, output: OutputFormat) -> Result<ExitCode, Failure> {
+        let printed = match (&self.json, output) {
+            (Some(json), OutputFormat::Json) => print(&format!("{json:#}\n")),
             _ => print(&self.text),
         };
         printed.map_err(|e| {
             Failure::input(format!("standard output cannot be written: {e}"))
-                .mend("see that the disk has room; what `--out` names is written")
+                .help("see that the disk has room; what `--out` names is written")
         })?;
         let said: String = self.met.iter().map(|what| format!("failed: {what}\n")).collect();
         // With standard error closed there is nobody left to tell.

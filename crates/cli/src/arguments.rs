@@ -243,7 +243,7 @@ impl Cli {
                     ErrorKind::DisplayHelpOnMissingArgumentOrSubcommand | ErrorKind::MissingSubcommand
                 ) =>
             {
-                Err(Failure::input("no command is given").mend(
+                Err(Failure::input("no command is given").help(
                     "name one: `greybox diagnose`, `identify`, `calibrate`, `simulate`, `check`, `compare`, `control`, \
                      `export`, `new`, `mechanisms` or `demo`; \
                      `greybox --help` explains them",

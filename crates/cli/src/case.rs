@@ -45,7 +45,7 @@ pub(crate) struct Subject<'a> {
     pub(crate) files: &'a [&'a str],
 }
 
-const MEND: &str =
+const HELP: &str =
     "name a folder after `--save-case` that is not there yet, in a place that you may write to";
 
 /// The one result that holds no curves.
@@ -66,11 +66,11 @@ impl CaseOptions {
         let mut panic = None;
         let outcome = panic::catch_unwind(AssertUnwindSafe(work)).unwrap_or_else(|payload| {
             panic = Some(words(payload.as_ref()));
-            Err(Failure::fault().mend(format!("send the folder {} with it", path.display())))
+            Err(Failure::fault().help(format!("send the folder {} with it", path.display())))
         });
         let data = if self.with_data { "with the recordings" } else { "without the recordings" };
         let written = folder.write_new(&self.files(subject, &outcome, panic.as_deref()));
-        let written = written.map_err(|failure| failure.mend(MEND));
+        let written = written.map_err(|failure| failure.help(HELP));
         let mut answer = outcome?;
         written?;
         answer.add(&format!("Packed: {} ({data})\n", path.display()));
@@ -163,7 +163,7 @@ impl CaseOptions {
     fn told(&self, failure: &Failure, quotes: bool) -> Value {
         let mut told = failure.to_json();
         if quotes && !self.with_data {
-            for key in ["message", "mend"] {
+            for key in ["message", "help"] {
                 if let Some(text) = told["error"][key].as_str().map(masked) {
                     told["error"][key] = json!(text);
                 }
@@ -197,15 +197,15 @@ fn prepare(path: &Path, subject: &Subject<'_>) -> Result<OutputFolder, Failure> 
             folder,
             "a case holds one diagnosis, not one for each recording of a folder",
         )
-        .mend("name the recording that the case is about"));
+        .help("name the recording that the case is about"));
     }
     if path.exists() {
-        return Err(Failure::file(path, "this is there already, but a case needs a new folder").mend(MEND));
+        return Err(Failure::file(path, "this is there already, but a case needs a new folder").help(HELP));
     }
     if subject.out.starts_with(path) {
-        return Err(Failure::file(path, "the results would go into the case").mend(MEND));
+        return Err(Failure::file(path, "the results would go into the case").help(HELP));
     }
-    OutputFolder::prepare(path).map_err(|failure| failure.mend(MEND))
+    OutputFolder::prepare(path).map_err(|failure| failure.help(HELP))
 }
 
 /// The recording as the command sees it.

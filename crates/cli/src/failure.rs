@@ -5,7 +5,7 @@ use std::process::ExitCode;
 
 pub(crate) use greybox_commands::Failure;
 
-use crate::answer::{self, Manner};
+use crate::answer::{self, OutputFormat};
 
 /// A command line that clap refuses, in clap's words.
 pub(crate) fn usage(rendered: &str) -> Failure {
@@ -14,8 +14,8 @@ pub(crate) fn usage(rendered: &str) -> Failure {
 }
 
 /// Prints on standard error, and in JSON on standard output too where that is spoken.
-pub(crate) fn print(failure: &Failure, manner: Manner) -> ExitCode {
-    if manner == Manner::Json {
+pub(crate) fn print(failure: &Failure, output: OutputFormat) -> ExitCode {
+    if output == OutputFormat::Json {
         // Where standard output cannot be written, standard error says what is wrong.
         let _ = answer::print(&format!("{:#}\n", failure.to_json()));
     }

@@ -16,19 +16,20 @@ mod progress;
 use std::ffi::OsString;
 use std::process::ExitCode;
 
-use answer::Manner;
+use answer::OutputFormat;
 use arguments::Cli;
 use failure::Failure;
 use greybox_commands::{loading, story};
 
 fn main() -> ExitCode {
     let arguments: Vec<OsString> = std::env::args_os().collect();
-    let manner = if arguments.iter().any(|a| a == "--json") { Manner::Json } else { Manner::Text };
+    let output =
+        if arguments.iter().any(|a| a == "--json") { OutputFormat::Json } else { OutputFormat::Text };
     // The default hook has said on standard error where a panic was.
     let outcome = std::panic::catch_unwind(|| run(arguments)).unwrap_or_else(|_| Err(Failure::fault()));
-    match outcome.and_then(|answer| answer.print(manner)) {
+    match outcome.and_then(|answer| answer.print(output)) {
         Ok(status) => status,
-        Err(failure) => failure::print(&failure, manner),
+        Err(failure) => failure::print(&failure, output),
     }
 }
 

@@ -52,16 +52,16 @@ impl OutputFolder {
         let folder = OutputFolder { path: path.to_owned(), number, kept: AtomicBool::new(false) };
         if path.as_os_str().is_empty() {
             return Err(
-                Failure::input("the output folder has no name").mend("give one, such as `--out result`")
+                Failure::input("the output folder has no name").help("give one, such as `--out result`")
             );
         }
         if path.is_file() {
             return Err(Failure::file(path, "this is a file, but the results need a folder")
-                .mend("name another folder after `--out`, or move the file away"));
+                .help("name another folder after `--out`, or move the file away"));
         }
         if let Some(file) = path.ancestors().skip(1).find(|p| p.is_file()) {
             return Err(Failure::file(path, format!("`{}` is a file, not a folder", file.display()))
-                .mend("name another path after `--out`"));
+                .help("name another path after `--out`"));
         }
         let stage = folder.stage();
         fs::create_dir(&stage).and_then(|()| fs::remove_dir(&stage)).map_err(|e| folder.refused(&e))?;
@@ -84,7 +84,7 @@ impl OutputFolder {
         for input in inputs {
             if let Some(name) = names.iter().find(|name| same_file(&self.path.join(name), input)) {
                 return Err(Failure::file(input, format!("the new {name} would overwrite this input"))
-                    .mend("name another folder after `--out`"));
+                    .help("name another folder after `--out`"));
             }
         }
         Ok(())
@@ -99,7 +99,7 @@ impl OutputFolder {
             let path = self.path.join(name);
             if path.exists() && !fs::read(&path).is_ok_and(|old| old == *content) {
                 return Err(Failure::file(&path, "this file is there already, and is not of this demo")
-                    .mend("name another folder after `--out`"));
+                    .help("name another folder after `--out`"));
             }
         }
         Ok(())
@@ -202,7 +202,7 @@ impl OutputFolder {
         let lock = File::open(&self.path).ok();
         if let Some(Err(TryLockError::WouldBlock)) = lock.as_ref().map(File::try_lock) {
             return Err(Failure::file(&self.path, "another run of greybox is writing to this folder")
-                .mend("wait for it to end, or name another folder after `--out`"));
+                .help("wait for it to end, or name another folder after `--out`"));
         }
         self.kept.store(true, Ordering::Relaxed);
         for path in waiting(&self.path) {
@@ -252,7 +252,7 @@ impl OutputFolder {
 
     fn refused(&self, error: &io::Error) -> Failure {
         Failure::file(&self.path, format!("the output cannot be written: {error}"))
-            .mend("name a place after `--out` that you may write to, and see that the disk has room")
+            .help("name a place after `--out` that you may write to, and see that the disk has room")
     }
 }
 
@@ -310,7 +310,7 @@ fn ordinary(path: &Path) -> Result<(), Failure> {
     {
         let what = if found.is_dir() { "this is a folder" } else { "this is a device, not an ordinary file" };
         return Err(Failure::file(path, format!("{what}, but the result is one file"))
-            .mend("name another place after `--out`, such as `simulated.csv`"));
+            .help("name another place after `--out`, such as `simulated.csv`"));
     }
     Ok(())
 }
@@ -331,14 +331,14 @@ impl OutputFile {
         ordinary(path)?;
         if let Some(input) = inputs.iter().find(|input| same_file(path, input)) {
             return Err(Failure::file(input, "the result would overwrite this input")
-                .mend("name another file after `--out`"));
+                .help("name another file after `--out`"));
         }
         // A link is followed: its target is replaced, the link stays.
         let resolved = fs::canonicalize(path).unwrap_or_else(|_| path.to_owned());
         let path = resolved.as_path();
         let Some(name) = path.file_name().and_then(|n| n.to_str()) else {
             return Err(Failure::file(path, "this is not the name of a file")
-                .mend("name a file after `--out`, such as `simulated.csv`"));
+                .help("name a file after `--out`, such as `simulated.csv`"));
         };
         let parent = match path.parent() {
             Some(parent) if !parent.as_os_str().is_empty() => parent,

@@ -6,7 +6,7 @@ use std::thread::JoinHandle;
 use std::time::Duration;
 
 use greybox_commands::{diagnose, identify};
-use greybox_diagnose::{Observer, Stage, Weighed};
+use greybox_diagnose::{ProgressListener, Stage, Weighed};
 use indicatif::{ProgressBar, ProgressDrawTarget, ProgressStyle};
 
 use crate::log::{self, Log};
@@ -70,7 +70,7 @@ impl Progress {
     }
 }
 
-impl Observer for Progress {
+impl ProgressListener for Progress {
     fn stage(&self, stage: Stage) {
         Progress::stage(self, diagnose::told(stage));
     }
@@ -82,7 +82,7 @@ impl Observer for Progress {
     }
 }
 
-impl greybox_identify::Observer for Progress {
+impl greybox_identify::ProgressListener for Progress {
     fn stage(&self, name: &str) {
         Progress::stage(self, identify::told(name));
     }

@@ -154,7 +154,7 @@ fn json_agrees(bench: &Bench, row: &Row, words: &Said) -> bool {
         && error["exit_code"] == row.code
         && error["message"].is_string()
         && told("message")
-        && told("mend")
+        && told("help")
 }
 
 /// A block of the page: its heading and what the terminal shows.

@@ -189,7 +189,7 @@ fn a_case_needs_a_place_of_its_own() {
     let refuses = |command: &[&str], more: &[&str], expected: &[&str]| {
         bench.refuses(&[command, more].concat(), expected);
     };
-    refuses(&diagnose, &["--save-case", "there"], &["there: this is there already", "mend: ", "--save-case"]);
+    refuses(&diagnose, &["--save-case", "there"], &["there: this is there already", "help: ", "--save-case"]);
     refuses(&diagnose, &["--save-case", "out"], &["out: the results would go into the case", "--save-case"]);
     refuses(
         &diagnose,

@@ -106,7 +106,7 @@ fn check_names_the_gap_and_still_exits_0() {
     let outcome = bench.greybox(&["check", "holed.csv"]);
     assert_eq!(outcome.code, 0);
     assert!(
-        outcome.stdout.contains("60 rows are missing") && outcome.stdout.contains("mend:"),
+        outcome.stdout.contains("60 rows are missing") && outcome.stdout.contains("help:"),
         "{}",
         outcome.stdout
     );
@@ -197,17 +197,17 @@ fn with_both<'a>(model: &'a str, recording: &'a str) -> [Vec<&'a str>; 4] {
 }
 
 #[test]
-fn a_bad_model_is_shown_with_its_line_and_mend() {
+fn a_bad_model_is_shown_with_its_line_and_help() {
     let bench = bench();
     let cases: [(&str, &str, &[&str]); 5] = [
         (
             "k*x = f",
             "kk*x = f",
-            &["equation \"body\"", "`kk` is not defined", "bad.toml:15:", "^^\n", "mend", "`k`"],
+            &["equation \"body\"", "`kk` is not defined", "bad.toml:15:", "^^\n", "help:", "`k`"],
         ),
         ("b*x' + k*x = f", "b*x' + k*x = m", &["equation \"body\"", "bad.toml:15:", "`m`", "kg"]),
         ("k*x = f\"\n", "k*x = f\"\nagain = \"x'' = 0\"\n", &["bad.toml:", "2 equations", "1 state"]),
-        ("value = 30.0", "valu = 30.0", &["bad.toml:12:", "`valu`", "mend", "`value`"]),
+        ("value = 30.0", "valu = 30.0", &["bad.toml:12:", "`valu`", "help:", "`value`"]),
         ("[parameters]", "[parameters", &["bad.toml:9:", "TOML"]),
     ];
     for (good, bad, expected) in cases {
@@ -249,7 +249,7 @@ fn paths_that_lead_to_the_wrong_thing() {
         bench.refuses(&arguments, &["nowhere.csv", "no such file"]);
     }
     for arguments in with_both("nowhere.toml", "run1.csv") {
-        bench.refuses(&arguments, &["nowhere.toml", "no such file", "mend"]);
+        bench.refuses(&arguments, &["nowhere.toml", "no such file", "help:"]);
     }
     // `diagnose` and `check` take a folder of recordings.
     for arguments in with_both("model.toml", "folder") {
@@ -260,17 +260,17 @@ fn paths_that_lead_to_the_wrong_thing() {
         bench.refuses(&arguments, &["folder", found]);
     }
     for arguments in with_both("folder", "run1.csv") {
-        bench.refuses(&arguments, &["folder", "this is a folder", "mend"]);
+        bench.refuses(&arguments, &["folder", "this is a folder", "help:"]);
     }
     for arguments in with_both("run1.csv", "model.toml") {
-        bench.refuses(&arguments, &["run1.csv", "this is a recording", "mend"]);
+        bench.refuses(&arguments, &["run1.csv", "this is a recording", "help:"]);
     }
     for arguments in with_both("model.toml", "model.toml") {
-        bench.refuses(&arguments, &["model.toml", "this is a model", "mend"]);
+        bench.refuses(&arguments, &["model.toml", "this is a model", "help:"]);
     }
     bench.refuses(
         &["calibrate", "model.toml", "run1.csv", "--holdout", "./run1.csv", "--out", "out"],
-        &["run1.csv", "named twice", "mend"],
+        &["run1.csv", "named twice", "help:"],
     );
     bench.refuses(&["check", "run1.csv", "--inputs", "g"], &["run1.csv", "no channel `g`", "`f`, `x`"]);
 }
@@ -282,26 +282,26 @@ fn outputs_that_cannot_be_written() {
     for command in ["diagnose", "calibrate"] {
         bench.refuses(
             &[command, "model.toml", "run1.csv", "--out", "file"],
-            &["file", "need a folder", "mend"],
+            &["file", "need a folder", "help:"],
         );
         bench.refuses(
             &[command, "model.toml", "run1.csv", "--out", "file/under"],
-            &["file/under", "`file` is a file", "mend"],
+            &["file/under", "`file` is a file", "help:"],
         );
     }
     let simulate = |out| ["simulate", "model.toml", "run1.csv", "--out", out];
-    bench.refuses(&simulate("file/under.csv"), &["file", "mend"]);
-    bench.refuses(&simulate("."), &["this is a folder", "mend"]);
-    bench.refuses(&simulate("run1.csv"), &["run1.csv", "overwrite", "mend"]);
+    bench.refuses(&simulate("file/under.csv"), &["file", "help:"]);
+    bench.refuses(&simulate("."), &["this is a folder", "help:"]);
+    bench.refuses(&simulate("run1.csv"), &["run1.csv", "overwrite", "help:"]);
     // Results never replace what the command reads, nor does the demo replace the user's files.
     bench.refuses(
         &["calibrate", "model.toml", "run1.csv", "--out", "."],
-        &["model.toml", "overwrite", "mend"],
+        &["model.toml", "overwrite", "help:"],
     );
     bench.write("improved.toml", MODEL);
     bench.refuses(&["diagnose", "improved.toml", "run1.csv", "--out", "."], &["improved.toml", "overwrite"]);
     bench.write("rotary_link.toml", MODEL);
-    bench.refuses(&["demo", "--out", "."], &["rotary_link.toml", "not of this demo", "mend"]);
+    bench.refuses(&["demo", "--out", "."], &["rotary_link.toml", "not of this demo", "help:"]);
     assert_eq!(bench.read("model.toml"), MODEL);
     assert_eq!(bench.read("file"), "mine");
     assert_eq!(bench.read("run1.csv"), recording(1200, 0.0));
@@ -313,7 +313,7 @@ fn a_place_that_nobody_may_write_to() {
     let bench = bench();
     bench.refuses(
         &["calibrate", "model.toml", "run1.csv", "--out", "/proc/greybox"],
-        &["/proc/greybox", "cannot be written", "mend"],
+        &["/proc/greybox", "cannot be written", "help:"],
     );
 }
 
@@ -333,7 +333,7 @@ fn bad_usage() {
 }
 
 #[test]
-fn nothing_free_to_calibrate_is_an_error_with_its_mend() {
+fn nothing_free_to_calibrate_is_an_error_with_its_help() {
     let bench = bench();
     let fixed = MODEL
         .replace("\"N s/m\" }", "\"N s/m\", fixed = true }")
@@ -341,7 +341,7 @@ fn nothing_free_to_calibrate_is_an_error_with_its_mend() {
     bench.write("fixed.toml", &fixed);
     bench.refuses(
         &["calibrate", "fixed.toml", "run1.csv", "--out", "out"],
-        &["every parameter is fixed", "mend"],
+        &["every parameter is fixed", "help:"],
     );
 }
 
@@ -353,7 +353,7 @@ fn a_json_error_has_its_place_in_fields() {
     let json: Value = serde_json::from_str(&outcome.stdout).unwrap();
     let error = &json["error"];
     assert_eq!((error["file"].as_str(), error["line"].as_u64()), (Some("bad.toml"), Some(15)), "{error}");
-    assert!(error["column"].is_u64() && error["mend"].is_string(), "{error}");
+    assert!(error["column"].is_u64() && error["help:"].is_string(), "{error}");
     assert!(outcome.stderr.starts_with("error: "), "{}", outcome.stderr);
 }
 

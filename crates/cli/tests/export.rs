@@ -192,12 +192,12 @@ fn every_language_is_written_to_a_file_or_to_standard_output() {
 }
 
 #[test]
-fn what_cannot_be_exported_is_refused_with_its_mend() {
+fn what_cannot_be_exported_is_refused_with_its_help() {
     let bench = Bench::empty();
     bench.write("m.toml", &EVERYTHING.replace("sign(x')", "sign(delay(x', taf))"));
     bench.refuses(
         &["export", "m.toml", "--to", "python", "--out", "m.py"],
-        &["m.toml: equation \"one\": `sign` cannot be written in Python", "mend: "],
+        &["m.toml: equation \"one\": `sign` cannot be written in Python", "help: "],
     );
     bench.refuses(&["export", "m.toml", "--to", "python", "--bare"], &["`--bare` is for LaTeX"]);
     bench.refuses(&["export", "m.toml", "--to", "latex", "--out", "m.toml"], &["would overwrite this input"]);

@@ -192,12 +192,12 @@ fn folders_that_cannot_be_worked_through() {
     for folder in ["empty", "other"] {
         bench.refuses(
             &["diagnose", "model.toml", folder, "--out", "out"],
-            &[folder, "holds no recording", "mend"],
+            &[folder, "holds no recording", "help:"],
         );
     }
     let mixed = ["diagnose", "model.toml", "runs/monday.csv", "runs", "--out", "out"];
-    bench.refuses(&mixed, &["error: runs: ", "stands alone", "mend"]);
-    bench.refuses(&["diagnose", "model.toml", "runs", "other", "--out", "out"], &["stands alone", "mend"]);
+    bench.refuses(&mixed, &["error: runs: ", "stands alone", "help:"]);
+    bench.refuses(&["diagnose", "model.toml", "runs", "other", "--out", "out"], &["stands alone", "help:"]);
     bench.refuses(
         &[
             "diagnose",
@@ -209,7 +209,7 @@ fn folders_that_cannot_be_worked_through() {
             "--out",
             "out",
         ],
-        &["runs", "every recording of this folder is held out", "mend"],
+        &["runs", "every recording of this folder is held out", "help:"],
     );
     bench.write("bad.csv", "t,f [N],x [mm]\n0.0,1.0,?\n");
     bench.refuses(
@@ -222,10 +222,10 @@ fn folders_that_cannot_be_worked_through() {
     bench.write("results/monday/improved.toml", &bench.read("model.toml"));
     bench.refuses(
         &["diagnose", "results/monday/improved.toml", "runs", "--out", "results"],
-        &["improved.toml", "overwrite", "mend"],
+        &["improved.toml", "overwrite", "help:"],
     );
     bench.write("results/friday", "mine");
-    bench.refuses(&["diagnose", "model.toml", "runs", "--out", "results"], &["results/friday", "mend"]);
+    bench.refuses(&["diagnose", "model.toml", "runs", "--out", "results"], &["results/friday", "help:"]);
     bench.write("runs/monday.CSV", "t,f,x\n");
     bench.refuses(
         &["diagnose", "model.toml", "runs", "--out", "out"],
@@ -255,7 +255,7 @@ fn two_runs_do_not_write_to_one_folder() {
     fs::create_dir(bench.path("out")).unwrap();
     let taken = File::open(bench.path("out")).unwrap();
     taken.lock().unwrap();
-    bench.refuses(&[&DIAGNOSE as &[&str], &["out"]].concat(), &["error: out: another run", "mend"]);
+    bench.refuses(&[&DIAGNOSE as &[&str], &["out"]].concat(), &["error: out: another run", "help:"]);
     assert_eq!(names(&bench.path("out")), [""; 0]);
 }
 

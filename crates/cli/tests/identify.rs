@@ -331,7 +331,7 @@ fn requests_that_cannot_be_met() {
     let cases: [(&[&str], &[&str]); 21] = [
         (&["--inputs", "f"], &["--states"]),
         (&["--states", "", "--inputs", "f"], &["no state is named"]),
-        (&["--states", "z", "--inputs", "f"], &["run.csv", "no channel `z`", "`f`, `x`", "mend"]),
+        (&["--states", "z", "--inputs", "f"], &["run.csv", "no channel `z`", "`f`, `x`", "help:"]),
         (&["--states", "x", "--inputs", "g"], &["run.csv", "no channel `g`"]),
         (&["--states", "x,x", "--inputs", "f"], &["`x` is named twice", "as state and as state"]),
         (&["--states", "x", "--inputs", "x"], &["`x` is named twice", "as state and as input"]),
@@ -345,7 +345,7 @@ fn requests_that_cannot_be_met() {
         (&["--states", "x", "--inputs", "f", "--order", "0"], &["order of the library is 0", "1 to 12"]),
         (&["--states", "x", "--inputs", "f", "--derivatives", "3"], &["leading derivative is 3"]),
         (&["--states", "x", "--inputs", "f", "--library", "cubic"], &["cubic", "tensor, total, separate"]),
-        (&["--states", "x", "--inputs", "f", "--library", "tensor,total"], &["two kinds", "mend"]),
+        (&["--states", "x", "--inputs", "f", "--library", "tensor,total"], &["two kinds", "help:"]),
         (&["--states", "x", "--inputs", "f", "--term", "x*("], &["term `x*(`"]),
         (&["--states", "x", "--inputs", "f", "--term", "q*x"], &["`q` is neither a state nor an input"]),
         (&["--states", "x", "--inputs", "f", "--hold", "cubic"], &["cubic", "zero, linear, band_limited"]),
@@ -358,7 +358,7 @@ fn requests_that_cannot_be_met() {
     bench.refuses(&[&["identify", "model.toml"] as &[&str], &usual].concat(), &["this is a model"]);
     bench.refuses(&[&["identify", "nowhere.csv"] as &[&str], &usual].concat(), &["no such file"]);
     let twice = [&["identify", "run.csv", "--holdout", "run.csv"] as &[&str], &usual].concat();
-    bench.refuses(&twice, &["named twice", "mend"]);
+    bench.refuses(&twice, &["named twice", "help:"]);
 }
 
 #[test]

@@ -225,7 +225,7 @@ fn check_takes_folders_and_finds_clocks_that_disagree() {
     for part in [
         "warning  two_clocks.csv, y: Recorded about 12 samples (0.12 s) later than `x`",
         "The lag is sure: 8 of 8 parts",
-        "mend: If the machine does not explain it, move the column `y` up by 12 rows",
+        "help: If the machine does not explain it, move the column `y` up by 12 rows",
     ] {
         assert!(words.contains(part), "`{part}` is not in: {words}");
     }

@@ -1,4 +1,4 @@
-//! Mechanisms of the user's own: found when they are there, refused with line and mend when they are wrong.
+//! Mechanisms of the user's own: found when they are there, refused with line and fix when they are wrong.
 
 // Helpers of a test file are tests too; the lint configuration knows only the annotated functions.
 #![allow(clippy::unwrap_used)]
@@ -152,7 +152,7 @@ fn a_built_in_file_is_replaced() {
         &[
             "the built-in asymmetric_coulomb_friction.toml",
             "no parameter `fc`",
-            "mend: keep the parameters' names",
+            "help: keep the parameters' names",
         ],
     );
 }
@@ -187,11 +187,11 @@ fn wrong_mechanisms_are_refused_and_nothing_is_written() {
     fs::remove_file(bench.path("mine/belt_friction.toml")).unwrap();
     bench.refuses(
         &diagnose,
-        &["mine: this folder holds no mechanism", "mend: `greybox mechanisms --example`"],
+        &["mine: this folder holds no mechanism", "help: `greybox mechanisms --example`"],
     );
     let to = |folder: &'static str| {
         ["diagnose", "model.toml", "run.csv", "--mechanisms", folder, "--out", "result"]
     };
-    bench.refuses(&to("yours"), &["yours: no such folder", "mend: check the path"]);
+    bench.refuses(&to("yours"), &["yours: no such folder", "help: check the path"]);
     bench.refuses(&to("model.toml"), &["model.toml: this is a file, but `--mechanisms` takes a folder"]);
 }

@@ -87,7 +87,7 @@ fn a_template_is_consistent_with_data_of_its_own() {
 fn a_file_that_is_there_is_not_replaced() {
     let bench = Bench::empty();
     bench.write("m.toml", "mine");
-    bench.refuses(&["new", "servo", "--out", "m.toml"], &["m.toml: this file is there already", "mend: "]);
+    bench.refuses(&["new", "servo", "--out", "m.toml"], &["m.toml: this file is there already", "help: "]);
     assert_eq!(bench.read("m.toml"), "mine");
     bench.refuses(&["new", "serwo"], &["no template called `serwo`", "servo, two_mass_drive"]);
     bench.refuses(&["new"], &["TEMPLATE"]);

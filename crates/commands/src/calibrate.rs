@@ -80,7 +80,7 @@ pub fn has_free_parameter(loaded: &LoadedModel) -> Result<(), Failure> {
             &loaded.path,
             "every parameter is fixed, so there is nothing to calibrate",
         )
-        .mend("take `fixed = true` from the parameters that may move"));
+        .help("take `fixed = true` from the parameters that may move"));
     }
     Ok(())
 }
@@ -140,7 +140,7 @@ fn limit() -> contract::Finding {
         recording: None,
         channel: None,
         message: "the fits ended at their limit of work: the parameters may not be the best ones".to_owned(),
-        mend: Some(
+        help: Some(
             "give it a shorter recording, or fix parameters that the recordings do not show".to_owned(),
         ),
     }
@@ -156,7 +156,7 @@ fn not_converged() -> contract::Finding {
         message: "the fit has not converged: it was still gaining when its steps were used up, and the parameters may \
                   not be the best ones"
             .to_owned(),
-        mend: Some("calibrate the model that was written once more, or fix parameters that the recordings do not show".to_owned()),
+        help: Some("calibrate the model that was written once more, or fix parameters that the recordings do not show".to_owned()),
     }
 }
 

@@ -117,7 +117,7 @@ fn known(recording: &Recording, inputs: &[String]) -> Result<(), Failure> {
     };
     let names: Vec<String> = recording.channels.iter().map(|c| format!("`{}`", c.name)).collect();
     let message = format!("there is no channel `{unknown}`, which `--inputs` names");
-    Err(Failure::file(Path::new(&recording.name), message).mend(format!("name one of {}", told(names))))
+    Err(Failure::file(Path::new(&recording.name), message).help(format!("name one of {}", told(names))))
 }
 
 /// The health of a recording, its channels in the roles that the model gives them.
@@ -228,7 +228,7 @@ fn table(health: &Health) -> String {
     text
 }
 
-/// One note: severity, place, sentence; the mend on a line of its own.
+/// One note: severity, place, sentence; the fix on a line of its own.
 fn in_words(note: &Note) -> String {
     let severity = match note.severity {
         contract::Severity::Info => Severity::Info,
@@ -238,8 +238,8 @@ fn in_words(note: &Note) -> String {
     let severity = severity.to_string();
     let place = if note.place.is_empty() { String::new() } else { format!("{}: ", note.place) };
     let mut text = format!("  {severity:8} {place}{}\n", note.message);
-    if let Some(mend) = &note.mend {
-        let _ = writeln!(text, "           mend: {mend}");
+    if let Some(help) = &note.help {
+        let _ = writeln!(text, "           help: {help}");
     }
     text
 }

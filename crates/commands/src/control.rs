@@ -207,7 +207,7 @@ fn stated(model: &Model) -> Vec<(String, f64)> {
 fn reported(path: &Path, text: &str, model: &Model) -> Result<Vec<(String, f64)>, Failure> {
     let report: Value = serde_json::from_str(text).map_err(|e| {
         Failure::file(path, format!("this is no report: {e}"))
-            .mend("give the report.json of `greybox diagnose`")
+            .help("give the report.json of `greybox diagnose`")
     })?;
     let mechanisms = report["mechanisms"].as_array().into_iter().flatten().map(|m| &m["parameters"]);
     let tables: Vec<&Value> = [&report["parameters"]].into_iter().chain(mechanisms).collect();
@@ -226,7 +226,7 @@ fn reported(path: &Path, text: &str, model: &Model) -> Result<Vec<(String, f64)>
         .collect();
     if found.is_empty() {
         return Err(Failure::file(path, "no interval of this report belongs to a parameter of the model")
-            .mend("give the report.json that was written with the model"));
+            .help("give the report.json that was written with the model"));
     }
     Ok(found)
 }
@@ -237,11 +237,11 @@ fn input(request: &Request, loaded: &LoadedModel) -> Result<String, Failure> {
         (Some(name), _) => Ok(name.clone()),
         (None, [only]) => Ok(only.name.clone()),
         (None, []) => Err(Failure::file(&loaded.path, "the model has no input to command with")
-            .mend("state one under [inputs] and let it act in an equation")),
+            .help("state one under [inputs] and let it act in an equation")),
         (None, several) => {
             let names: Vec<&str> = several.iter().map(|i| i.name.as_str()).collect();
             Err(Failure::file(&loaded.path, format!("the model has the inputs {}", names.join(", ")))
-                .mend("name the one that commands with `--input`; the others are held at zero"))
+                .help("name the one that commands with `--input`; the others are held at zero"))
         }
     }
 }

@@ -1,4 +1,4 @@
-//! The one error of a command: what is wrong, where, and the mend.
+//! The one error of a command: what is wrong, where, and the fix.
 
 use std::fmt::Write as _;
 use std::ops::Range;
@@ -20,13 +20,13 @@ struct Details {
     cause: Cause,
     /// What is wrong, with the file where that is known.
     message: String,
-    mend: Option<String>,
+    help: Option<String>,
     /// Place for machines: `file`, `line`, `column`, `channel`.
     place: Map<String, Value>,
     excerpt: Option<Excerpt>,
 }
 
-/// Who can mend it.
+/// Who can fix it.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 enum Cause {
     /// The caller: exit 2.
@@ -51,7 +51,7 @@ impl Failure {
         Failure(Box::new(Details {
             cause,
             message: plain(&message.into()),
-            mend: None,
+            help: None,
             place: Map::new(),
             excerpt: None,
         }))
@@ -86,10 +86,10 @@ impl Failure {
         Failure::internal("greybox met a fault of its own; please report the lines above")
     }
 
-    /// Adds the mend.
+    /// Adds the fix.
     #[must_use]
-    pub fn mend(mut self, mend: impl Into<String>) -> Failure {
-        self.0.mend = Some(plain(&mend.into()));
+    pub fn help(mut self, help: impl Into<String>) -> Failure {
+        self.0.help = Some(plain(&help.into()));
         self
     }
 
@@ -115,7 +115,7 @@ impl Failure {
     }
 
     /// A fault of a mechanism among `files` (name, text) of `folder`, shown with its source line. The message
-    /// holds its own mend.
+    /// holds its own fix.
     pub fn mechanism(error: &MechanismError, files: &[(String, String)], folder: &Path) -> Failure {
         let Some((name, text)) = files.iter().find(|(name, _)| *name == error.file) else {
             // A built-in file speaks of a kind that a file of the folder has replaced.
@@ -126,7 +126,7 @@ impl Failure {
                     error.file, error.message
                 ),
             )
-            .mend("keep the parameters' names of a built-in mechanism, or give the file another name");
+            .help("keep the parameters' names of a built-in mechanism, or give the file another name");
         };
         let path = folder.join(name);
         let mut failure = Failure::file(&path, &error.message);
@@ -147,7 +147,7 @@ impl Failure {
             Some(file) => Failure::file(Path::new(file), problem),
             None => Failure::input(problem),
         };
-        failure.0.mend = help.map(plain);
+        failure.0.help = help.map(plain);
         failure
     }
 
@@ -155,8 +155,8 @@ impl Failure {
     pub fn all(folder: &Path, message: &str, failures: &[Failure]) -> Failure {
         let told: String = failures
             .iter()
-            .map(|f| match &f.0.mend {
-                Some(mend) => format!("\n  {}\n    mend: {mend}", f.0.message),
+            .map(|f| match &f.0.help {
+                Some(help) => format!("\n  {}\n    help: {help}", f.0.message),
                 None => format!("\n  {}", f.0.message),
             })
             .collect();
@@ -175,7 +175,7 @@ impl Failure {
 
     /// What to do about it, where the message does not say.
     pub fn advice(&self) -> Option<&str> {
-        self.0.mend.as_deref()
+        self.0.help.as_deref()
     }
 
     /// Exit status: 2 for bad input, 1 for a fault of greybox or of the machine.
@@ -197,8 +197,8 @@ impl Failure {
         error.insert("exit_code".to_owned(), json!(self.code()));
         error.insert("message".to_owned(), json!(self.0.message));
         error.extend(self.0.place.clone());
-        if let Some(mend) = &self.0.mend {
-            error.insert("mend".to_owned(), json!(mend));
+        if let Some(help) = &self.0.help {
+            error.insert("help".to_owned(), json!(help));
         }
         json!({ "error": error })
     }
@@ -212,8 +212,8 @@ impl std::fmt::Display for Failure {
             None => String::from(" "),
             Some(excerpt) => excerpt.write(f)?,
         };
-        match &self.0.mend {
-            Some(mend) => writeln!(f, "{gutter} mend: {mend}"),
+        match &self.0.help {
+            Some(help) => writeln!(f, "{gutter} help: {help}"),
             None => Ok(()),
         }
     }
@@ -284,7 +284,7 @@ impl Excerpt {
     }
 }
 
-/// The message holds its own mend.
+/// The message holds its own fix.
 impl From<RecordingError> for Failure {
     fn from(error: RecordingError) -> Failure {
         let place = error.place();
@@ -299,17 +299,17 @@ impl From<RecordingError> for Failure {
     }
 }
 
-/// The message holds its own mend, but for the name that was meant.
+/// The message holds its own fix, but for the name that was meant.
 impl From<RenameError> for Failure {
     fn from(error: RenameError) -> Failure {
         let failure = Failure::input(error.to_string());
         match error {
             RenameError::Unknown { file, channel, available } => {
-                let mend = match nearest(&channel, available.iter().map(String::as_str)) {
+                let help = match nearest(&channel, available.iter().map(String::as_str)) {
                     Some(near) => format!("did you mean `{near}`?"),
                     None => "name one of these after the `=` of `--map`".to_owned(),
                 };
-                failure.at("file", file).at("channel", channel).mend(mend)
+                failure.at("file", file).at("channel", channel).help(help)
             }
             RenameError::Unit { file, channel, .. } | RenameError::Taken { file, name: channel } => {
                 failure.at("file", file).at("channel", channel)
@@ -319,7 +319,7 @@ impl From<RenameError> for Failure {
     }
 }
 
-/// The message holds its own mend.
+/// The message holds its own fix.
 impl From<DataError> for Failure {
     fn from(error: DataError) -> Failure {
         let failure = Failure::input(error.to_string());
@@ -345,7 +345,7 @@ impl From<DiagnoseError> for Failure {
     }
 }
 
-/// The message holds its own mend. A model error here is about equations that greybox wrote, so that there is
+/// The message holds its own fix. A model error here is about equations that greybox wrote, so that there is
 /// no file to point at: what it says of names and units comes from the recordings' headers.
 impl From<IdentifyError> for Failure {
     fn from(error: IdentifyError) -> Failure {
@@ -354,7 +354,7 @@ impl From<IdentifyError> for Failure {
             IdentifyError::Data(DataError::MissingChannel { file, channel, available, .. }) => {
                 let message = format!("there is no channel `{channel}`; the file has {available}");
                 Failure::file(Path::new(&file), message)
-                    .mend("name channels of the recordings after --states and --inputs")
+                    .help("name channels of the recordings after --states and --inputs")
                     .at("channel", channel)
             }
             IdentifyError::Data(error) => error.into(),
@@ -362,8 +362,8 @@ impl From<IdentifyError> for Failure {
                 let failure =
                     Failure::input(format!("the recordings' channels make no equation: {}", error.problem()));
                 match error.help() {
-                    Some(help) => failure.mend(help),
-                    None => failure.mend("check names and units in the headers of the recordings"),
+                    Some(help) => failure.help(help),
+                    None => failure.help("check names and units in the headers of the recordings"),
                 }
             }
             IdentifyError::Twice { name, .. }
@@ -397,11 +397,11 @@ mod tests {
         let text = "\tab\ncd";
         let excerpt = Excerpt::new(text, &(1..6), "f:1:2".into(), 1, 2);
         assert_eq!(excerpt.marked, 1..3);
-        let mut failure = Failure::input("wrong").mend("right");
+        let mut failure = Failure::input("wrong").help("right");
         failure.0.excerpt = Some(excerpt);
         assert_eq!(
             failure.to_string(),
-            "error: wrong\n --> f:1:2\n  |\n1 | \tab\n  | \t^^\n  = mend: right\n"
+            "error: wrong\n --> f:1:2\n  |\n1 | \tab\n  | \t^^\n  = help: right\n"
         );
     }
 

@@ -128,7 +128,7 @@ impl Kind {
     /// The error where a model was to be.
     pub(crate) fn as_model(&self, path: &Path) -> Failure {
         let message = format!("this is {}, but a model (TOML) is needed here", self.what);
-        Failure::file(path, message).mend(format!(
+        Failure::file(path, message).help(format!(
             "write its equations down as a TOML model: {}. `greybox new --list` names models to start from, the page \
              `model-language` of the book has the language; `greybox export` goes the other way, to Python, Modelica and \
              LaTeX",
@@ -143,7 +143,7 @@ impl Kind {
             true => "export the sheet as CSV",
             false => "log the signals, of the machine or of the simulation, into such a file",
         };
-        Failure::file(path, message).mend(format!(
+        Failure::file(path, message).help(format!(
             "greybox reads recordings from CSV (a header row such as `t,u [V],y [m]`), MAT-files and Parquet: {how}"
         ))
     }

@@ -41,7 +41,7 @@ pub fn model(path: &Path) -> Result<LoadedModel, Failure> {
 /// The error where a recording stands in the place of the model.
 fn not_a_model(path: &Path, what: &str) -> Failure {
     Failure::file(path, format!("this is {what}, but a model (TOML) is needed here"))
-        .mend("put the model first and the recordings after it: `MODEL.toml TRAIN.csv`")
+        .help("put the model first and the recordings after it: `MODEL.toml TRAIN.csv`")
 }
 
 /// The model in `text`, which errors say stands at `path`.
@@ -58,14 +58,14 @@ pub fn model_of(text: String, path: &Path) -> Result<LoadedModel, Failure> {
             Err(not_a_model(path, "a recording (CSV)"))
         }
         Err(_) if text.trim().is_empty() => Err(Failure::file(path, "the model file is empty")
-            .mend("write at least [states], [parameters] and [equations]")),
+            .help("write at least [states], [parameters] and [equations]")),
         Err(error) => Err(Failure::model(&error, &text)),
     }
 }
 
 fn read_text(path: &Path) -> Result<String, Failure> {
     if path.is_dir() {
-        return Err(Failure::file(path, "this is a folder, not a model").mend("name one TOML file inside it"));
+        return Err(Failure::file(path, "this is a folder, not a model").help("name one TOML file inside it"));
     }
     text(path)
 }
@@ -76,13 +76,13 @@ fn read_text(path: &Path) -> Result<String, Failure> {
 /// Bad input: no such file, a folder or a device, or a file that is no text.
 pub fn text(path: &Path) -> Result<String, Failure> {
     let unread = |e: io::Error| match e.kind() {
-        ErrorKind::NotFound => Failure::file(path, "no such file").mend("check the path and the spelling"),
-        _ => Failure::file(path, format!("the file cannot be read: {e}")).mend("check its permissions"),
+        ErrorKind::NotFound => Failure::file(path, "no such file").help("check the path and the spelling"),
+        _ => Failure::file(path, format!("the file cannot be read: {e}")).help("check its permissions"),
     };
     let kind = fs::metadata(path).map_err(unread)?.file_type();
     if kind.is_dir() || greybox_recording::is_device(kind) {
         let what = if kind.is_dir() { "folder" } else { "device" };
-        return Err(Failure::file(path, format!("this is a {what}, not a file")).mend("name a file"));
+        return Err(Failure::file(path, format!("this is a {what}, not a file")).help("name a file"));
     }
     let bytes = fs::read(path).map_err(unread)?;
     let line = |at: usize| 1 + bytes[..at].iter().filter(|&&b| b == b'\n').count();
@@ -91,13 +91,13 @@ pub fn text(path: &Path) -> Result<String, Failure> {
             path,
             format!("line {}: the file holds zero bytes, like a binary file", line(at)),
         )
-        .mend("save it again as UTF-8 text"));
+        .help("save it again as UTF-8 text"));
     }
     match std::str::from_utf8(&bytes) {
         Ok(text) => Ok(text.to_owned()),
         Err(e) => {
             Err(Failure::file(path, format!("line {}: the file is not UTF-8 text", line(e.valid_up_to())))
-                .mend("save it again as UTF-8"))
+                .help("save it again as UTF-8"))
         }
     }
 }
@@ -120,12 +120,12 @@ pub struct Mechanisms {
 pub fn mechanisms(folder: &Path) -> Result<Mechanisms, Failure> {
     if folder.is_file() {
         return Err(Failure::file(folder, "this is a file, but `--mechanisms` takes a folder")
-            .mend("name the folder that holds the mechanism files"));
+            .help("name the folder that holds the mechanism files"));
     }
     let files = files_of(folder, &["toml"])?;
     if files.is_empty() {
         return Err(Failure::file(folder, "this folder holds no mechanism (`*.toml`)")
-            .mend("`greybox mechanisms --example` prints one to start from"));
+            .help("`greybox mechanisms --example` prints one to start from"));
     }
     let mut texts = Vec::with_capacity(files.len());
     for path in &files {
@@ -144,7 +144,7 @@ pub fn recordings_of(folder: &Path) -> Result<Vec<PathBuf>, Failure> {
     if recordings.is_empty() {
         let endings = EXTENSIONS.map(|e| format!("`*.{e}`")).join(", ");
         return Err(Failure::file(folder, format!("this folder holds no recording ({endings})"))
-            .mend("name the folder that holds the recordings themselves, or the files one by one"));
+            .help("name the folder that holds the recordings themselves, or the files one by one"));
     }
     Ok(recordings)
 }
@@ -171,9 +171,9 @@ pub fn without_folders(paths: &[PathBuf]) -> Result<Vec<PathBuf>, Failure> {
 pub fn files_of(folder: &Path, extensions: &[&str]) -> Result<Vec<PathBuf>, Failure> {
     let entries = fs::read_dir(folder).map_err(|e| match e.kind() {
         ErrorKind::NotFound => {
-            Failure::file(folder, "no such folder").mend("check the path and the spelling")
+            Failure::file(folder, "no such folder").help("check the path and the spelling")
         }
-        _ => Failure::file(folder, format!("the folder cannot be read: {e}")).mend("check its permissions"),
+        _ => Failure::file(folder, format!("the folder cannot be read: {e}")).help("check its permissions"),
     })?;
     let mut files: Vec<PathBuf> = entries
         .filter_map(|entry| entry.ok().map(|e| e.path()))
@@ -232,7 +232,7 @@ pub fn no_twins<'a>(paths: impl IntoIterator<Item = &'a PathBuf>) -> Result<(), 
                 path,
                 format!("this recording is named twice (also as {})", twin.display()),
             )
-            .mend("name each recording once, either for training or after `--holdout`"));
+            .help("name each recording once, either for training or after `--holdout`"));
         }
         seen.push(path);
     }
@@ -242,7 +242,7 @@ pub fn no_twins<'a>(paths: impl IntoIterator<Item = &'a PathBuf>) -> Result<(), 
 fn unreadable(path: &Path, error: RecordingError) -> Failure {
     if path.is_file() && looks_like_model(path) {
         return Failure::file(path, "this is a model (TOML), but a recording is needed here")
-            .mend("name the model once, before the recordings");
+            .help("name the model once, before the recordings");
     }
     match foreign::of(path) {
         Some(kind) => kind.as_recording(path),
@@ -262,7 +262,7 @@ pub fn blocks(
     let open = |path: &PathBuf| {
         if EXTENSIONS.iter().any(|e| *e != "csv" && has_extension(path, e)) {
             return Err(Failure::file(path, "only CSV files are read in blocks")
-                .mend("leave `--block` out, or export the recording as CSV"));
+                .help("leave `--block` out, or export the recording as CSV"));
         }
         CsvBlocks::open(path, rows).map_err(|error| unreadable(path, error))
     };

@@ -63,8 +63,8 @@ pub(crate) fn findings(model: &Model, recording: &Recording) -> Vec<Finding> {
                 "nominal_diverges",
                 "Run on this recording, the model as given diverges from the measurements.",
             )
-            .mend(match turned(&setup, &moving, f64::INFINITY) {
-                Some(turned) => turned.mend(""),
+            .help(match turned(&setup, &moving, f64::INFINITY) {
+                Some(turned) => turned.help(""),
                 None => "Look at units and values of its parameters: with no single sign reversed does the simulation \
                          follow the recording."
                     .to_owned(),
@@ -87,7 +87,7 @@ pub(crate) fn findings(model: &Model, recording: &Recording) -> Vec<Finding> {
         return found;
     };
     if let Some(finding) = found.iter_mut().find(|f| f.code == SIGN) {
-        finding.mend = Some(turned.mend(" or of this measurement"));
+        finding.help = Some(turned.help(" or of this measurement"));
         return found;
     }
     vec![
@@ -99,7 +99,7 @@ pub(crate) fn findings(model: &Model, recording: &Recording) -> Vec<Finding> {
                 format::percent(error)
             ),
         )
-        .mend(turned.mend("")),
+        .help(turned.help("")),
     ]
 }
 
@@ -117,7 +117,7 @@ struct Turned {
 
 impl Turned {
     /// What to do, with `besides` as one more thing that may be reversed.
-    fn mend(&self, besides: &str) -> String {
+    fn help(&self, besides: &str) -> String {
         let names = self.names.join(" or of ");
         format!(
             "Reverse the sign of {names}{besides}, in its value or where it stands in the equations: so the simulation follows \
@@ -239,8 +239,8 @@ fn motion(data: &Data, run: &FreeRun, c: usize) -> Option<f64> {
 /// What is to be said of a motion `ratio` times as large as the model's.
 fn sized(measurement: &Measurement, stated: bool, ratio: f64) -> Option<Finding> {
     let times = format::significant(ratio.abs(), 2);
-    let on = |code, message: String, mend: String| {
-        Finding::new(Severity::Warning, code, message).on(&measurement.channel).mend(mend).value(ratio, None)
+    let on = |code, message: String, help: String| {
+        Finding::new(Severity::Warning, code, message).on(&measurement.channel).help(help).value(ratio, None)
     };
     if ratio < 0.0 {
         return Some(on(
@@ -257,7 +257,7 @@ fn sized(measurement: &Measurement, stated: bool, ratio: f64) -> Option<Finding>
     let other = "a gear or a gain that the model lacks between what it simulates and what is measured, and the values \
                  of its parameters";
     let unit = &measurement.unit;
-    let mend = match often(unit, ratio).filter(|_| !stated) {
+    let help = match often(unit, ratio).filter(|_| !stated) {
         Some(likely) => format!(
             "The channel states no unit and is taken as {}: is it in {likely}? State it: in the header, \
              `--map \"{1}={1} [{likely}]\"`, or in the model. Else look at {other}.",
@@ -265,7 +265,7 @@ fn sized(measurement: &Measurement, stated: bool, ratio: f64) -> Option<Finding>
         ),
         None => format!("Look at its unit, at {other}."),
     };
-    Some(on("nominal_size", message, mend))
+    Some(on("nominal_size", message, help))
 }
 
 /// The unit in which a channel that is taken as `unit` would be as large as the model says, within a factor of two.
@@ -330,7 +330,7 @@ shaft = "J*theta'' + b*theta' = kt*u"
     fn degrees_taken_as_radians_are_told() {
         let found = told(MODEL, 1f64.to_degrees());
         assert_eq!(found[0].code, "nominal_size");
-        assert!(found[0].mend.as_deref().unwrap().contains("[deg]"), "{found:?}");
+        assert!(found[0].help.as_deref().unwrap().contains("[deg]"), "{found:?}");
         assert_eq!(found.len(), 1);
     }
 
@@ -338,18 +338,18 @@ shaft = "J*theta'' + b*theta' = kt*u"
     fn a_gear_that_the_model_lacks_is_no_unit() {
         let found = told(MODEL, 20.0);
         assert_eq!((found.len(), found[0].code), (1, "nominal_size"));
-        assert!(found[0].mend.as_deref().unwrap().contains("a gear"), "{found:?}");
+        assert!(found[0].help.as_deref().unwrap().contains("a gear"), "{found:?}");
     }
 
-    fn mend(found: &[Finding]) -> &str {
-        found[0].mend.as_deref().unwrap()
+    fn help(found: &[Finding]) -> &str {
+        found[0].help.as_deref().unwrap()
     }
 
     #[test]
     fn a_turned_sign_is_told() {
         let found = told(MODEL, -1.0);
         assert_eq!((found.len(), found[0].code), (1, "nominal_sign"));
-        assert!(mend(&found).contains("the input `u` or of `kt` or of this measurement"), "{found:?}");
+        assert!(help(&found).contains("the input `u` or of `kt` or of this measurement"), "{found:?}");
     }
 
     #[test]
@@ -357,11 +357,11 @@ shaft = "J*theta'' + b*theta' = kt*u"
         let wrong = MODEL.replace("+ b*theta'", "- b*theta'");
         let found = told(&wrong, 1.0);
         assert_eq!((found.len(), found[0].code), (1, "nominal_diverges"));
-        assert!(mend(&found).starts_with("Reverse the sign of `b`, in its value"), "{found:?}");
-        assert!(mend(&found).contains("(nrmse"), "{found:?}");
+        assert!(help(&found).starts_with("Reverse the sign of `b`, in its value"), "{found:?}");
+        assert!(help(&found).contains("(nrmse"), "{found:?}");
         // As a value too.
         let found = told(&MODEL.replace("value = 0.1,", "value = -0.1,"), 1.0);
-        assert!(mend(&found).starts_with("Reverse the sign of `b`, in its value"), "{found:?}");
+        assert!(help(&found).starts_with("Reverse the sign of `b`, in its value"), "{found:?}");
     }
 
     #[test]
@@ -374,7 +374,7 @@ shaft = "J*theta'' + b*theta' = kt*u"
             let short = Recording::from_columns("run.csv", recording.time, recording.channels).unwrap();
             let found = findings(&wrong, &short);
             assert_eq!((found.len(), found[0].code), (1, "nominal_sign"), "{found:?}");
-            assert!(mend(&found).starts_with("Reverse the sign of `b`, in its value"), "{found:?}");
+            assert!(help(&found).starts_with("Reverse the sign of `b`, in its value"), "{found:?}");
         }
     }
 
@@ -383,8 +383,8 @@ shaft = "J*theta'' + b*theta' = kt*u"
         for inertia in ["2e-6", "200"] {
             let wrong = MODEL.replace("value = 0.02,", &format!("value = {inertia},"));
             for finding in told(&wrong, 1.0) {
-                let mend = finding.mend.as_deref().unwrap();
-                assert!(!mend.contains("Reverse the sign"), "{inertia}: {finding:?}");
+                let help = finding.help.as_deref().unwrap();
+                assert!(!help.contains("Reverse the sign"), "{inertia}: {finding:?}");
                 assert_ne!(finding.code, "nominal_sign", "{inertia}");
             }
         }
@@ -393,7 +393,7 @@ shaft = "J*theta'' + b*theta' = kt*u"
         let free = free.replace("b = { value = 0.1, unit = \"N m s/rad\" }\n", "");
         let found = told(&free, 1.0);
         assert_eq!((found.len(), found[0].code), (1, "nominal_diverges"));
-        assert!(mend(&found).starts_with("Look at units and values"), "{found:?}");
+        assert!(help(&found).starts_with("Look at units and values"), "{found:?}");
     }
 
     #[test]

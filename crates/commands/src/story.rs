@@ -75,8 +75,8 @@ pub fn summary(summary: &Summary) -> String {
         write!(text, "\nHeld-out error (nrmse), median and range over the recordings:\n{}", aligned(&rows));
     for failure in &of.failed {
         let _ = writeln!(text, "Note: {} could not be diagnosed: {}", failure.recording, failure.message);
-        if let Some(mend) = &failure.mend {
-            let _ = writeln!(text, "      mend: {mend}");
+        if let Some(help) = &failure.help {
+            let _ = writeln!(text, "      help: {help}");
         }
     }
     text
@@ -197,8 +197,8 @@ pub fn notes(findings: &[Finding]) -> String {
     for note in grouped(findings).iter().filter(|n| n.severity > Severity::Info) {
         let place = if note.place.is_empty() { String::new() } else { format!("{}: ", note.place) };
         let _ = writeln!(text, "Note: {place}{}", note.message);
-        if let Some(mend) = &note.mend {
-            let _ = writeln!(text, "      mend: {mend}");
+        if let Some(help) = &note.help {
+            let _ = writeln!(text, "      help: {help}");
         }
     }
     text
@@ -242,7 +242,7 @@ mod tests {
                   "holdout_source": "run3.csv"},
           "noise_floor": {"theta": 0.015},
           "findings": [{"severity": "warning", "code": "clipping", "recording": "a.csv", "channel": "v",
-                        "message": "clipped.", "mend": "lower the gain."}]}"#;
+                        "message": "clipped.", "help": "lower the gain."}]}"#;
         let text = diagnosis(&Report::from_json(json).unwrap());
         for part in [
             "Coulomb friction is missing in the hub equation; fc = 0.115 ± 0.004 N m; it acts when |θ′| < 0.2",
@@ -252,7 +252,7 @@ mod tests {
             "               nominal  calibrated  improved  noise\n",
             "  held out, θ  –        24.0 %      2.10 %    1.50 %\n",
             "Held out: run3.csv.\n",
-            "Note: a.csv, v: clipped.\n      mend: lower the gain.\n",
+            "Note: a.csv, v: clipped.\n      help: lower the gain.\n",
         ] {
             assert!(text.contains(part), "`{part}` is not in:\n{text}");
         }

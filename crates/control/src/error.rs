@@ -143,7 +143,7 @@ pub enum ControlError {
         what: String,
         /// As given.
         value: f64,
-        /// The mend.
+        /// The fix.
         wanted: &'static str,
     },
     /// The limits of the actuator leave no room.
@@ -168,7 +168,7 @@ pub enum ControlError {
     },
     /// The equations are not finite where they must be.
     #[error(
-        "the plant's equations are not finite at x = {state:?}: stay away from it, or mend the model there"
+        "the plant's equations are not finite at x = {state:?}: stay away from it, or correct the model there"
     )]
     NotFinite {
         /// The state.

@@ -1,4 +1,4 @@
-//! What cannot be controlled is refused, with the mend.
+//! What cannot be controlled is refused, with the fix.
 
 use crate::common::{CART, PENDULUM, load};
 use greybox_control::{

@@ -62,8 +62,8 @@ fn oscillation(which: Which, seconds: f64, seed: u64) -> Result<Oscillation, Fai
 enum Operation {
     /// Eq 3.10 at every tenth sample of one window over the recording, initial condition of x‴ left in (E13).
     Printed,
-    /// The same with E13 mended.
-    Mended,
+    /// The same with E13 corrected.
+    Corrected,
     /// Windows of 1 s every 10 ms with the kernel t²(T − t)².
     Windows,
 }
@@ -93,7 +93,7 @@ fn duffing_rows(r: &Oscillation, order: i32, operation: Operation) -> Result<Row
     };
     let mut rows = match operation {
         Operation::Printed => growing(Initial::Separate)?,
-        Operation::Mended => growing(Initial::FirstSample)?,
+        Operation::Corrected => growing(Initial::FirstSample)?,
         Operation::Windows => {
             let kernel = Kernel::new(2, 3, 1000, DT)?.with_initial(Initial::FirstSample);
             greybox_algebraic::rows(&kernel, &columns, 10)?
@@ -367,7 +367,7 @@ fn joint_stability() -> Result<(Vec<Root>, f64, Critical), Failure> {
 
 fn main() -> Result<(), Failure> {
     for (operation, seconds) in
-        [(Operation::Printed, 5.0), (Operation::Mended, 5.0), (Operation::Windows, 10.0)]
+        [(Operation::Printed, 5.0), (Operation::Corrected, 5.0), (Operation::Windows, 10.0)]
     {
         println!("== Delayed Duffing, {operation:?}, {seconds} s, seed 0");
         let search = duffing_search(operation, seconds, 6, 0)?;

@@ -105,7 +105,7 @@ fn printed_signals_give_the_delay_of_the_thesis() {
         let rows = |r: &Duffing| literal(r, 4, initial);
         (rows(&Duffing::training(5.0, noise, seed)), rows(&Duffing::test(5.0, noise, seed)))
     };
-    // Without noise the truncation alone leaves 0.149, with E13 mended 0.155.
+    // Without noise the truncation alone leaves 0.149, with E13 corrected 0.155.
     for (initial, expected) in [(Initial::Separate, 0.149), (Initial::FirstSample, 0.155)] {
         let (train, test) = rows(0.0, 0, initial);
         let search = algorithm_2(&train, &test, 4, &Options::thesis(2, 0));

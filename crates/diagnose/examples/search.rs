@@ -4,10 +4,10 @@
 use std::sync::Arc;
 
 use greybox_calibrate::{Data, Setup, free_parameters};
-use greybox_diagnose::{Observer, Stage, Weighed, evidence::Evidence, library, search};
+use greybox_diagnose::{ProgressListener, Stage, Weighed, evidence::Evidence, library, search};
 
 struct Talk(std::time::Instant, Arc<greybox_calibrate::Work>);
-impl Observer for Talk {
+impl ProgressListener for Talk {
     fn stage(&self, stage: Stage) {
         println!("{:7.2} {:7.2} G {stage:?}", self.0.elapsed().as_secs_f64(), self.1.done() as f64 / 1e9);
     }
@@ -23,7 +23,12 @@ impl Observer for Talk {
     fn tried(&self, kind: &str, expression: &str, e: &Evidence) {
         println!(
             "            {kind:26} {expression:40} score {:9.1} drop {:.4} cv {:.4} t {:.1} + {:.2} focus {:.2}",
-            e.score, e.drop, e.held_out, e.t, e.improving, e.focus
+            e.score,
+            e.drop,
+            e.cross_validation_gain,
+            e.t,
+            e.improved_fold_fraction,
+            e.improvement_concentration
         );
     }
     fn screened(&self, ranking: &[(&str, f64)]) {
@@ -85,7 +90,7 @@ fn main() -> Result<(), Box<dyn std::error::Error>> {
         }
     }
     for f in [&found.calibrated, &found.improved] {
-        let s = greybox_diagnose::surface::test(&f.setup, &f.level, &found.scale, &f.fit.point);
+        let s = greybox_diagnose::discrepancy::test(&f.setup, &f.level, &found.scale, &f.fit.point);
         println!("free shapes {:?}", s.map(|s| (s.gain, s.t)));
     }
     println!("{:7.2} done", talk.0.elapsed().as_secs_f64());

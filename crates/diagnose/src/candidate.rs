@@ -1,6 +1,6 @@
 //! A mechanism at a place: what it adds to the model.
 
-use greybox_calibrate::{Free, Prior};
+use greybox_calibrate::{FreeParameter, Prior};
 use greybox_model::{Equation, Expr, Model, Parameter, State, Unit};
 
 use crate::library::{Mechanism, On, arbitrary};
@@ -361,7 +361,7 @@ impl Candidate {
     }
 
     /// The mechanism's parameters as unknowns of a fit; `scales[i]` is the size of inner parameter i.
-    pub fn free(&self, mechanism: &Mechanism, first: usize, scales: &[f64]) -> Vec<Free> {
+    pub fn free(&self, mechanism: &Mechanism, first: usize, scales: &[f64]) -> Vec<FreeParameter> {
         let positive = |n: &str| mechanism.positive.iter().any(|p| p == n);
         mechanism
             .parameters()
@@ -382,7 +382,7 @@ impl Candidate {
                     Some(_) => Prior::Normal { mean: 0.0, std: 1.0 },
                     None => Prior::Flat,
                 };
-                Some(Free { index: first + at, prior, lower, upper })
+                Some(FreeParameter { index: first + at, prior, lower, upper })
             })
             .collect()
     }

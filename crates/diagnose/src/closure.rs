@@ -21,13 +21,13 @@ use greybox_calibrate::{Point, Setup, Work};
 use rayon::prelude::*;
 
 use crate::candidate::Candidate;
-use crate::evidence::{Evidence, least_kappa, price};
+use crate::evidence::{Evidence, least_effective_sample_ratio, price};
 use crate::library::Shape;
 use crate::place::own_coordinates;
 use crate::screen::{Held, Scored, Together, reselect, screen, screen_set, screen_shapes, shift_without};
 use crate::search::{
-    Accepted, Fitted, Found, Law, MISFIT, MOST_SAMPLES, Part, SAME_HOLD, Search, UNDECIDED, WHITE, is_same,
-    laws, limits, next_scale, odds, same_level, whole,
+    FittedModel, Found, Law, MISFIT, MOST_SAMPLES, MechanismTerm, SAME_HOLD, Search, SelectedTerm, UNDECIDED,
+    WHITE, is_same, laws, limits, next_scale, odds, same_level, whole,
 };
 use crate::turns::Turns;
 use crate::uncertainty::Uncertainty;
@@ -66,7 +66,7 @@ impl Search<'_> {
     /// A closure that begins with the model `from`, in the place of what a search `found`. `None` where no term is worth its
     /// odds, of a model whose laws [mix](Self::mixes) equations, and where it comes to what others `visited`. What the recordings
     /// say for its parts is left open: [`accepted`](Self::accepted) is asked for the closure that is handed back.
-    pub(crate) fn closure(&self, found: &Found, from: &Fitted, visited: &mut Visited) -> Option<Found> {
+    pub(crate) fn closure(&self, found: &Found, from: &FittedModel, visited: &mut Visited) -> Option<Found> {
         if from.parts.iter().any(|part| self.mixes(&part.candidate)) {
             return None;
         }
@@ -76,17 +76,17 @@ impl Search<'_> {
         let shapes: Vec<Candidate> = self.allowed().filter(|c| self.is_shape(c)).cloned().collect();
         // With a limit of work of its own.
         let work = Arc::new(Work::of_fits_within(self.most_work));
-        self.observer.begins(&work);
+        self.listener.begins(&work);
         let is_spent = || work.done() > self.most_work || work.is_given_up();
         let setup = Setup { noise: None, work: work.clone(), ..from.setup.clone() };
-        let mut current = Fitted { setup, ..from.clone() };
+        let mut current = FittedModel { setup, ..from.clone() };
         let mut scale = found.scale.clone();
         let mut lengths = self.lengths().to_vec();
         lengths.extend(lengths.last().is_some_and(|last| 2 * last < whole(nominal)).then(|| whole(nominal)));
         // Free shapes once formulas are at their end. (From short segments again they cost as much as everything before.)
         let formulas = lengths.iter().map(|&length| (length, false));
         let rest = lengths.last().map(|&length| (length, true));
-        let has_shape = |model: &Fitted| model.parts.iter().any(|part| self.is_shape(&part.candidate));
+        let has_shape = |model: &FittedModel| model.parts.iter().any(|part| self.is_shape(&part.candidate));
         let mut formula = None;
         for (step, (length, is_rest)) in formulas.chain(rest).enumerate() {
             if is_rest {
@@ -103,15 +103,15 @@ impl Search<'_> {
             // At the shortest, from the measurements: what long segments believe is in doubt.
             let points = if length == lengths[0] { vec![measured] } else { vec![stitched, measured] };
             let fit = setup.fit(&level, &scale, &points, limits(25));
-            current = Fitted { level, fit, ..current };
+            current = FittedModel { level, fit, ..current };
             let mut seen: Vec<Vec<Candidate>> = Vec::new();
             loop {
                 scale = next_scale(&current.fit, &scale, &nominal.data.sigma);
                 self.method(&mut current, &scale);
                 current = self.refit(&current, &scale, 10);
                 seen.push(candidates(&current));
-                let is_new = |model: &Fitted| !seen.iter().any(|s| is_same(s, &candidates(model)));
-                let settled = |more: Option<Fitted>, terms: &[Candidate]| {
+                let is_new = |model: &FittedModel| !seen.iter().any(|s| is_same(s, &candidates(model)));
+                let settled = |more: Option<FittedModel>, terms: &[Candidate]| {
                     self.settled(&current, more?, odds(terms.len()), &scale).filter(is_new)
                 };
                 // (Without a shape the formula is at its end.)
@@ -123,7 +123,7 @@ impl Search<'_> {
                     // A law with more to fit is tried where it promises more than they keep.
                     let kept = plain.as_ref().map_or(0.0, |plain| 1.0 - plain.rss() / current.rss());
                     let rich = settled(self.with_one(&current, &rich, kept, &scale), &rich);
-                    let told = |model: &Fitted| self.robust(&current, model, &scale);
+                    let told = |model: &FittedModel| self.robust(&current, model, &scale);
                     let both = [plain, rich].into_iter().flatten();
                     both.max_by(|a, b| told(a).total_cmp(&told(b)))
                 };
@@ -141,7 +141,7 @@ impl Search<'_> {
                 current = self.redecide_holds(&next, &scale, SAME_HOLD);
             }
             if !is_rest && !visited.insert(step, candidates(&current)) {
-                self.observer.begins(&nominal.work);
+                self.listener.begins(&nominal.work);
                 return None;
             }
         }
@@ -151,7 +151,7 @@ impl Search<'_> {
             (current, scale) = formula;
         }
         // What is left is work of the search again.
-        self.observer.begins(&nominal.work);
+        self.listener.begins(&nominal.work);
         if current.parts.is_empty() || is_same(&candidates(&current), &candidates(from)) {
             return None;
         }
@@ -190,7 +190,7 @@ impl Search<'_> {
 
     /// What the recordings say for each part of a closure, and what the search that `found` some of them could not tell from
     /// these.
-    pub(crate) fn accepted(&self, found: &Found, closure: &Found) -> Vec<Accepted> {
+    pub(crate) fn accepted(&self, found: &Found, closure: &Found) -> Vec<SelectedTerm> {
         let (closure, scale) = (&closure.improved, &closure.scale);
         let of = |index: usize| {
             let candidate = closure.parts[index].candidate.clone();
@@ -200,14 +200,20 @@ impl Search<'_> {
             let mut rivals = known.map_or(Vec::new(), |known| known.rivals.clone());
             rivals.retain(|r| r.equivalent && closure.parts.iter().all(|p| p.candidate != r.candidate));
             rivals.iter_mut().for_each(|r| r.evidence.score = score);
-            Accepted { candidate, evidence: Evidence { score, ..Evidence::NONE }, rivals }
+            SelectedTerm { candidate, evidence: Evidence { score, ..Evidence::NONE }, rivals }
         };
         (0..closure.parts.len()).into_par_iter().map(of).collect()
     }
 
     /// What is known of a model with `more`, where that changes anything and for the better: the end of a round. `odds` are
     /// those against what the round chose.
-    fn settled(&self, current: &Fitted, more: Fitted, odds: f64, scale: &[f64]) -> Option<Fitted> {
+    fn settled(
+        &self,
+        current: &FittedModel,
+        more: FittedModel,
+        odds: f64,
+        scale: &[f64],
+    ) -> Option<FittedModel> {
         let settled = self.known_alone(more, odds, scale);
         let is_closer = settled.rss().total_cmp(&current.rss()).is_lt();
         (is_closer || settled.parts.len() < current.parts.len()).then_some(settled)
@@ -215,7 +221,13 @@ impl Search<'_> {
 
     /// The model with one law beside it: of those that explain most to first order, and more than this share, the one that
     /// is worth most.
-    fn with_one(&self, base: &Fitted, terms: &[Candidate], more: f64, scale: &[f64]) -> Option<Fitted> {
+    fn with_one(
+        &self,
+        base: &FittedModel,
+        terms: &[Candidate],
+        more: f64,
+        scale: &[f64],
+    ) -> Option<FittedModel> {
         let open = open(base, terms);
         if open.is_empty() {
             return None;
@@ -227,8 +239,8 @@ impl Search<'_> {
             let alone = Together { gain: one.gain, shift: one.shift.clone(), members: vec![one] };
             self.extend_by(base, &open, &alone, &STARTS, scale, STEPS_OF_A_TRIAL)
         });
-        let told = |model: Fitted| (self.robust(base, &model, scale), model);
-        let mut tried: Vec<(f64, Fitted)> = tried.map(told).collect();
+        let told = |model: FittedModel| (self.robust(base, &model, scale), model);
+        let mut tried: Vec<(f64, FittedModel)> = tried.map(told).collect();
         tried.sort_by(|a, b| b.0.total_cmp(&a.0));
         tried.truncate(FINALISTS);
         let fitted = tried.into_par_iter().map(|(_, model)| self.refit(&model, scale, STEPS));
@@ -237,7 +249,13 @@ impl Search<'_> {
     }
 
     /// The model with up to `most` terms beside it, those that explain most together.
-    fn larger(&self, base: &Fitted, terms: &[Candidate], most: usize, scale: &[f64]) -> Option<Fitted> {
+    fn larger(
+        &self,
+        base: &FittedModel,
+        terms: &[Candidate],
+        most: usize,
+        scale: &[f64],
+    ) -> Option<FittedModel> {
         let open = open(base, terms);
         let (setup, point) = (&base.setup, &base.fit.point);
         let together = screen_set(setup, self.library, &open, &base.level, scale, point, most)?;
@@ -246,10 +264,10 @@ impl Search<'_> {
 
     /// The model with a law of free shape, where that is worth the odds against one of them: of those that are likeliest to
     /// first order, the one that is worth most.
-    fn shaped(&self, base: &Fitted, shapes: &[Candidate], scale: &[f64]) -> Option<Fitted> {
+    fn shaped(&self, base: &FittedModel, shapes: &[Candidate], scale: &[f64]) -> Option<FittedModel> {
         let open = open(base, shapes);
         let (setup, level, point) = (&base.setup, &base.level, &base.fit.point);
-        let weight = least_kappa(setup, level, scale, point);
+        let weight = least_effective_sample_ratio(setup, level, scale, point);
         let mut likeliest = screen_shapes(setup, self.library, &open, level, scale, point, weight);
         likeliest.truncate(SHAPES);
         let tried = likeliest.par_iter().filter_map(|shape| {
@@ -265,11 +283,12 @@ impl Search<'_> {
     /// The model with its newest part, a law of free shape, without the formula of the same variable in the same place, unless
     /// each of its terms is worth the odds: it was pieced together where a shape was lacking. (One by one its terms may not go.
     /// They compensate each other.)
-    fn alone(&self, shaped: Fitted, odds: f64, scale: &[f64]) -> Fitted {
+    fn alone(&self, shaped: FittedModel, odds: f64, scale: &[f64]) -> FittedModel {
         let Some((shape, others)) = shaped.parts.split_last() else { return shaped };
-        let law = |part: &Part| &self.library[part.candidate.mechanism];
-        let does_its_work =
-            |part: &Part| part.candidate.place == shape.candidate.place && law(shape).is_shape_of(law(part));
+        let law = |part: &MechanismTerm| &self.library[part.candidate.mechanism];
+        let does_its_work = |part: &MechanismTerm| {
+            part.candidate.place == shape.candidate.place && law(shape).is_shape_of(law(part))
+        };
         let formula: Vec<usize> = (0..others.len()).filter(|&i| does_its_work(&others[i])).collect();
         if formula.is_empty() {
             return shaped;
@@ -283,7 +302,7 @@ impl Search<'_> {
 
     /// The model with the size of its newest part, a law of free shape, where its changes of slope are one in the mean square: an
     /// estimate that suits what it describes now (one step of expectation and maximisation, without the variances).
-    fn resized(&self, model: &Fitted, scale: &[f64]) -> Option<Fitted> {
+    fn resized(&self, model: &FittedModel, scale: &[f64]) -> Option<FittedModel> {
         let part = model.parts.last()?;
         let law = &self.library[part.candidate.mechanism];
         let index = |plain: &str| {
@@ -307,7 +326,7 @@ impl Search<'_> {
 
     /// The model with other terms for those that it holds, where they do the same work for less: fewer coefficients, or laws
     /// of lower rank, a linear spring for a sine, a named law for a term without a name.
-    fn reselected(&self, model: &Fitted, terms: &[Candidate], scale: &[f64]) -> Option<Fitted> {
+    fn reselected(&self, model: &FittedModel, terms: &[Candidate], scale: &[f64]) -> Option<FittedModel> {
         let (setup, point) = (&model.setup, &model.fit.point);
         let held: Vec<Held> = model
             .parts
@@ -335,7 +354,7 @@ impl Search<'_> {
         let other = self.exchanged(model, terms, &positions, &together, scale)?;
         // (First order may have promised too much.)
         let cost =
-            |model: &Fitted| model.rss() + model.parts.iter().map(|p| price(&p.candidate)).sum::<f64>();
+            |model: &FittedModel| model.rss() + model.parts.iter().map(|p| price(&p.candidate)).sum::<f64>();
         (cost(&other) < cost(model) && self.admissible(&other, scale))
             .then(|| self.known_alone(other, odds(terms.len()), scale))
     }
@@ -344,12 +363,12 @@ impl Search<'_> {
     /// its free parameters, and everything else where it goes with them.
     fn exchanged(
         &self,
-        model: &Fitted,
+        model: &FittedModel,
         terms: &[Candidate],
         positions: &[usize],
         together: &Together,
         scale: &[f64],
-    ) -> Option<Fitted> {
+    ) -> Option<FittedModel> {
         let (setup, point) = (&model.setup, &model.fit.point);
         let mut shifted = point.parameters.clone();
         let others = (0..setup.free.len()).filter(|i| !positions.contains(i)).map(|i| &setup.free[i]);
@@ -371,7 +390,7 @@ impl Search<'_> {
 
     /// The model without what the recordings do not tell: as long as the term that they determine least is not worth the
     /// odds, it goes.
-    fn known_alone(&self, model: Fitted, odds: f64, scale: &[f64]) -> Fitted {
+    fn known_alone(&self, model: FittedModel, odds: f64, scale: &[f64]) -> FittedModel {
         let mut model = model;
         while !model.parts.is_empty() {
             let known = self.known(&model, &Uncertainty::of(&model, scale).widths());
@@ -385,7 +404,7 @@ impl Search<'_> {
     }
 
     /// The model without these parts, from where the others go, to first order, when they do.
-    fn less(&self, model: &Fitted, parts: &[usize], scale: &[f64]) -> Option<Fitted> {
+    fn less(&self, model: &FittedModel, parts: &[usize], scale: &[f64]) -> Option<FittedModel> {
         let (setup, point) = (&model.setup, &model.fit.point);
         // By parameter of these parts, whether it vanishes with the force. (Constants mean nothing without it.)
         let own: Vec<(usize, bool)> = parts
@@ -424,8 +443,9 @@ impl Search<'_> {
         // (Of two laws that do as well the plainer one has the name.)
         let complexity = |c: &Candidate| self.library[c.mechanism].complexity();
         rich.retain(|c| complexity(c) <= complexity(candidate));
-        let does_as_well =
-            |other: Option<Fitted>| other.is_some_and(|other| self.robust(&other, model, scale) < UNDECIDED);
+        let does_as_well = |other: Option<FittedModel>| {
+            other.is_some_and(|other| self.robust(&other, model, scale) < UNDECIDED)
+        };
         does_as_well(self.larger(&less, &plain, AT_ONCE, scale))
             || does_as_well(self.with_one(&less, &rich, 0.0, scale))
     }
@@ -434,10 +454,10 @@ impl Search<'_> {
     /// more parameters, and how far it scores above them, which may only imitate it. `None` where there is no such law.
     pub(crate) fn unnamed_above(
         &self,
-        model: &Fitted,
+        model: &FittedModel,
         parts: &[usize],
         scale: &[f64],
-    ) -> Option<(f64, Part)> {
+    ) -> Option<(f64, MechanismTerm)> {
         let nominal = &self.nominal().model;
         let own: Vec<&Candidate> = parts.iter().map(|&i| &model.parts[i].candidate).collect();
         let complexity = |c: &Candidate| self.library[c.mechanism].complexity();
@@ -457,7 +477,7 @@ impl Search<'_> {
             less = self.less(&less, &[part], scale)?;
         }
         let others = [self.larger(&less, &plain, 1, scale), self.with_one(&less, &rich, 0.0, scale)];
-        let score = |of: &Fitted| self.robust(&less, of, scale);
+        let score = |of: &FittedModel| self.robust(&less, of, scale);
         let scored = others.into_iter().flatten().map(|other| (score(&other), other));
         let (best, mut other) = scored.max_by(|a, b| a.0.total_cmp(&b.0))?;
         Some((best - score(model), other.parts.pop()?))
@@ -483,19 +503,20 @@ impl Search<'_> {
     }
 }
 
-fn candidates(fitted: &Fitted) -> Vec<Candidate> {
+fn candidates(fitted: &FittedModel) -> Vec<Candidate> {
     fitted.parts.iter().map(|part| part.candidate.clone()).collect()
 }
 
 /// The terms that a model does not hold.
-fn open(model: &Fitted, terms: &[Candidate]) -> Vec<Candidate> {
+fn open(model: &FittedModel, terms: &[Candidate]) -> Vec<Candidate> {
     let is_held = |c: &&Candidate| model.parts.iter().any(|p| p.candidate == **c);
     terms.iter().filter(|c| !is_held(c)).cloned().collect()
 }
 
 /// Whether more than white noise is left.
-fn leaves_something(fitted: &Fitted, scale: &[f64]) -> bool {
-    fitted.misfit(scale) > LEFT || least_kappa(&fitted.setup, &fitted.level, scale, &fitted.fit.point) < WHITE
+fn leaves_something(fitted: &FittedModel, scale: &[f64]) -> bool {
+    fitted.misfit(scale) > LEFT
+        || least_effective_sample_ratio(&fitted.setup, &fitted.level, scale, &fitted.fit.point) < WHITE
 }
 
 #[cfg(test)]
@@ -580,7 +601,7 @@ second = "n*y'' + c*y' + l*(y - x) = 0"
         let start = Point { parameters: setup.values(), starts: setup.starts(&level, &setup.values()) };
         let fit = setup.fit(&level, &setup.data.spread, &[start], limits(30));
         let scale = next_scale(&fit, &setup.data.spread, &setup.data.sigma);
-        let calibrated = Fitted { setup, parts: Vec::new(), level, fit };
+        let calibrated = FittedModel { setup, parts: Vec::new(), level, fit };
         Found {
             improved: calibrated.clone(),
             calibrated,
@@ -597,7 +618,7 @@ second = "n*y'' + c*y' + l*(y - x) = 0"
     /// Kind, equation and coefficient of each term, sorted.
     fn terms(found: &Found, library: &[Mechanism], model: &Model) -> Vec<(String, String, f64)> {
         let fitted = &found.improved;
-        let of = |part: &crate::search::Part| {
+        let of = |part: &crate::search::MechanismTerm| {
             let index = fitted.setup.model.parameter(&part.instance.names[0]).unwrap();
             let kind = library[part.candidate.mechanism].kind.clone();
             let equations = part.candidate.place.equations(model).join(" ");
@@ -652,7 +673,7 @@ second = "n*y'' + c*y' + l*(y - x) = 0"
             let fitted = closed.improved;
             let value =
                 |name: &String| fitted.fit.point.parameters[fitted.setup.model.parameter(name).unwrap()];
-            let law = |part: &crate::search::Part| {
+            let law = |part: &crate::search::MechanismTerm| {
                 let values: Vec<f64> = part.instance.names.iter().map(value).collect();
                 let place = part.candidate.place.equations(&search.nominal().model).join(" ");
                 (library[part.candidate.mechanism].kind.clone(), place, values)
@@ -696,7 +717,7 @@ second = "n*y'' + c*y' + l*(y - x) = 0"
                 let start = calibrated.fit.point.parameters.iter().copied().chain(kinds.iter().map(|_| 0.1));
                 search.reassembled_from(&calibrated, &laws, vec![start.collect()], &scale, STEPS).unwrap()
             };
-            let told = |model: Fitted| {
+            let told = |model: FittedModel| {
                 terms(&Found { improved: model, ..nothing(&search) }, &library, &search.nominal().model)
             };
             let other =

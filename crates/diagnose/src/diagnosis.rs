@@ -5,32 +5,32 @@ use std::ops::Deref;
 use std::sync::Arc;
 
 use greybox_calibrate::{
-    Criterion, Data, DataError, Ending, Fit, FreeRun, Horizon, Level, Limits, Point, Score, Setup,
+    Criterion, Data, DataError, Ending, Fit, FreeRun, Horizon, Limits, Point, Score, Segmentation, Setup,
     SetupError, Work, free_parameters, window_length, window_of,
 };
 use greybox_model::{Expr, Func, Hold, Model};
 use greybox_recording::Recording;
 use rayon::prelude::*;
 
-use crate::along::Along;
 use crate::candidate::{Candidate, Instance};
 use crate::closure::Visited;
-use crate::evidence::{Evidence, fall, kappa};
+use crate::discrepancy::{Discrepancy, held_out};
+use crate::evidence::{Evidence, cross_validation_improvement, effective_sample_ratio};
 use crate::library::{Mechanism, MechanismError, built_in};
 use crate::locate::{Location, force, locate};
 use crate::place::{Motion, Place};
 use crate::plausibility::Deviation;
 use crate::proposal::{Gate, Proposal, Rejected};
 use crate::search::{
-    Fitted, Found, MISFIT, MOST_WORK, Part, Rival, Search, UNDECIDED, log_likelihood_gain, raw_rms, raw_rss,
-    rms,
+    FittedModel, Found, MISFIT, MOST_WORK, MechanismTerm, Rival, Search, UNDECIDED, log_likelihood_gain,
+    raw_rms, raw_rss, rms,
 };
 use crate::shapes::Variable;
-use crate::surface::{Surface, held_out};
+use crate::trajectory::TrajectoryEval;
 use crate::twins::{Twin, twins};
 use crate::uncertainty::Uncertainty;
 use crate::validate::Gain;
-use crate::{Observer, Stage};
+use crate::{ProgressListener, Stage};
 
 /// Share of each recording held out when no recording is.
 pub const HELD_OUT_SHARE: f64 = 0.2;
@@ -233,7 +233,7 @@ fn distinct(mut alternatives: Vec<Alternative>, kind: &str, site: &Site) -> Vec<
 
 /// A mechanism that was found.
 #[derive(Debug, Clone)]
-pub struct Finding {
+pub struct IdentifiedMechanism {
     /// Kind.
     pub kind: String,
     /// Family of the kind.
@@ -271,7 +271,7 @@ pub struct Finding {
     pub curve: Option<Curve>,
 }
 
-impl Finding {
+impl IdentifiedMechanism {
     /// As it stands in the model that is handed back, where that is not the one that was fitted.
     fn stands_as(&mut self, instance: &Instance, model: &Model, is_shape: bool) {
         let at = |name: &String| model.parameter(name);
@@ -365,9 +365,9 @@ pub struct Diagnosis {
     /// cannot tell.
     pub criterion: Criterion,
     /// Mechanisms, largest share first.
-    pub mechanisms: Vec<Finding>,
+    pub mechanisms: Vec<IdentifiedMechanism>,
     /// What `improved` holds that is not believed to be what is missing, largest share first.
-    pub candidates: Vec<Finding>,
+    pub candidates: Vec<IdentifiedMechanism>,
     /// How far the candidates can be trusted; `None` where there are none.
     pub proposal: Option<Proposal>,
     /// The closure that was tried and is not handed back; `None` where none was found, or it is.
@@ -409,7 +409,7 @@ pub fn diagnose(
     train: &[Recording],
     holdout: &[Recording],
     options: &Options,
-    observer: &dyn Observer,
+    listener: &dyn ProgressListener,
 ) -> Result<Diagnosis, DiagnoseError> {
     let library = match &options.library {
         Some(library) => library.clone(),
@@ -418,14 +418,14 @@ pub fn diagnose(
     let Layout { train, holdout, source } = layout(model, train, holdout)?;
     let laid_out = Setup::new(model, train.clone(), free_parameters(model))?;
     let nominal = Setup { work: Arc::new(Work::of_fits_within(options.work)), ..laid_out };
-    observer.begins(&nominal.work);
-    let mut search = Search::new(nominal.clone(), &library, observer);
+    listener.begins(&nominal.work);
+    let mut search = Search::new(nominal.clone(), &library, listener);
     search.most_work = options.work;
     let found = match options.terms_only {
-        true => alone(&nominal, false, options.work, observer),
+        true => alone(&nominal, false, options.work, listener),
         false => search.run(),
     };
-    conclude(&nominal, holdout, source, &library, &search, found, options, observer)
+    conclude(&nominal, holdout, source, &library, &search, found, options, listener)
 }
 
 /// Training and held-out data.
@@ -496,10 +496,10 @@ fn conclude(
     search: &Search<'_>,
     found: Found,
     options: &Options,
-    observer: &dyn Observer,
+    listener: &dyn ProgressListener,
 ) -> Result<Diagnosis, DiagnoseError> {
     let train = nominal.data.clone();
-    observer.stage(Stage::Simulating);
+    listener.stage(Stage::Simulating);
     // The model that fits best knows best how errors grow.
     let judge = Judge::of(&found.improved, &residual_scale(&found.improved, &found.scale));
     let window = judge.window;
@@ -507,7 +507,7 @@ fn conclude(
     // The search fits the baseline with a scale that its mechanisms made small, and only where it goes on with it. What is
     // compared with is the best that the equations can do alone.
     let has_parts = !found.improved.parts.is_empty();
-    let alone = has_parts.then(|| alone(nominal, false, options.work, &Untold(observer)));
+    let alone = has_parts.then(|| alone(nominal, false, options.work, &WorkOnlyListener(listener)));
     let baseline_of = |found: &Found| Baseline::of(found, &values, &judge);
     let (mut baseline, (alone, polished)) = rayon::join(
         || baseline_of(&found),
@@ -546,7 +546,7 @@ fn conclude(
     } else {
         baseline.polished.clone()
     };
-    let judged_of = |found: &Found, polished: &Polished, named: &dyn Fn(&Part) -> bool| {
+    let judged_of = |found: &Found, polished: &WholeRecordFit, named: &dyn Fn(&MechanismTerm) -> bool| {
         let scale = residual_scale(&polished.fitted, &found.scale);
         Judged::of(search, found, &polished.fitted, &scale, (&baseline.polished.fitted, named), library)
     };
@@ -561,9 +561,10 @@ fn conclude(
         false => Vec::new(),
     };
     // Of laws that are not believed together those stand that another comparison has named.
-    let believed = |judged: &Judged, found: &Found, fitted: &Fitted| -> Vec<bool> {
+    let believed = |judged: &Judged, found: &Found, fitted: &FittedModel| -> Vec<bool> {
         let all = judged.verdict == Verdict::MissingPhysics;
-        let stands = |part: &Part| found.errs && agreed.contains(&named_as(part, library, &nominal.model));
+        let stands =
+            |part: &MechanismTerm| found.errs && agreed.contains(&named_as(part, library, &nominal.model));
         let parts = fitted.parts.iter().zip(&judged.named);
         parts.map(|(part, named)| (all && *named) || stands(part)).collect()
     };
@@ -574,7 +575,7 @@ fn conclude(
         let closed = Closed::of(search, &found, &polished, &baseline, &judge);
         // What reaches the noise leaves no error of the model to be believed beside.
         if errs && !options.terms_only && !closed.as_ref().is_ok_and(|closed| closed.leaves_noise) {
-            let in_both = |part: &Part| agreed.contains(&named_as(part, library, &nominal.model));
+            let in_both = |part: &MechanismTerm| agreed.contains(&named_as(part, library, &nominal.model));
             let standing = (&found, &polished);
             let explored = explored(search, standing, in_both, names, &baseline, &judge);
             if let Some(Explored { found: other, polished: simulates, named }) = explored {
@@ -602,19 +603,22 @@ fn conclude(
         };
         limited |= found.limited;
     }
-    let Polished { fitted: improved, origin } = &polished;
+    let WholeRecordFit { fitted: improved, origin } = &polished;
     let scale = residual_scale(improved, &found.scale);
-    let Baseline { polished: Polished { fitted: calibrated, origin: own }, scale: calibrated_scale, .. } =
-        &baseline;
+    let Baseline {
+        polished: WholeRecordFit { fitted: calibrated, origin: own },
+        scale: calibrated_scale,
+        ..
+    } = &baseline;
     let calibrated_widths = Uncertainty::of(own, calibrated_scale).widths();
     let uncertainty = Uncertainty::of(origin, &scale);
     let improved_widths = uncertainty.widths();
-    let value_of = |f: &Fitted, widths: &[f64], index: usize| {
+    let value_of = |f: &FittedModel, widths: &[f64], index: usize| {
         let value = f.fit.point.parameters[index];
         let width = f.setup.free.iter().position(|x| x.index == index).map(|i| widths[i]);
         Estimate { value, ci95: width.map(|w| (value - w, value + w)) }
     };
-    let final_model = |f: &Fitted| {
+    let final_model = |f: &FittedModel| {
         let mut model = f.setup.model.clone();
         for (p, v) in model.parameters.iter_mut().zip(&f.fit.point.parameters) {
             p.value = *v;
@@ -674,7 +678,7 @@ fn conclude(
     // Mechanisms, remainder, verdict.
     let believed = believed(&judged, &found, improved);
     let verdict = if believed.contains(&true) { Verdict::MissingPhysics } else { judged.verdict };
-    let Judged { shares, left, surface, alone, without, full, base, doubts, .. } = judged;
+    let Judged { shares, left, discrepancy, alone, without, full, base, doubts, .. } = judged;
     let share = |rss: f64| (rss / base.max(1e-300)).clamp(0.0, 1.0);
     let significant = found.errs || left.significant(improved.parts.len()) || verdict == Verdict::Unexplained;
     let mut mechanisms =
@@ -721,30 +725,30 @@ fn conclude(
     }
     let proposal = believed.contains(&false).then(|| {
         let parameters = &improved.fit.point.parameters;
-        let along = Along::simulated(&improved.setup, &train_role.improved.run.x, parameters);
-        let held_out = Along::simulated(&held, &holdout_role.improved.run.x, parameters);
+        let along = TrajectoryEval::simulated(&improved.setup, &train_role.improved.run.x, parameters);
+        let held_out = TrajectoryEval::simulated(&held, &holdout_role.improved.run.x, parameters);
         let proposed = improved.parts.iter().zip(&believed).filter(|part| !part.1);
-        let proposed: Vec<&Part> = proposed.map(|(part, _)| part).collect();
+        let proposed: Vec<&MechanismTerm> = proposed.map(|(part, _)| part).collect();
         let errors = (baseline.errors(&judge), &judge.errors(&polished, &scale)[..]);
         Proposal::of(improved, &proposed, library, (&along, &held_out), errors, &uncertainty)
     });
-    let mut mechanisms: Vec<(Finding, bool)> = mechanisms.into_iter().zip(believed).collect();
+    let mut mechanisms: Vec<(IdentifiedMechanism, bool)> = mechanisms.into_iter().zip(believed).collect();
     mechanisms.sort_by(|a, b| b.0.share_explained.total_cmp(&a.0.share_explained));
     let unexplained = verdict != Verdict::MissingPhysics && !improved.parts.is_empty();
     // What is not believed explains nothing: all that the equations lack is what is missing. (Where too little is
     // known of the noise for that, what those mechanisms leave over shows the place.)
-    let lacks = if unexplained { self::surface(calibrated, calibrated_scale) } else { None };
+    let lacks = if unexplained { self::discrepancy(calibrated, calibrated_scale) } else { None };
     let remainder = match lacks {
         Some(lacks) => remainder(calibrated, Some(lacks), significant, 1.0),
         None => {
             let all = if unexplained { share(base - full) } else { 0.0 };
             // What a closure leaves shows nothing of what it models: that has the closure's own variable.
             let own = if unexplained && found.closed { only_variable(improved, library) } else { None };
-            let surface = surface.map(|left| match own {
-                Some(variable) => Surface { variable: Some((variable, left.gain)), ..left },
+            let discrepancy = discrepancy.map(|left| match own {
+                Some(variable) => Discrepancy { variable: Some((variable, left.gain)), ..left },
                 None => left,
             });
-            let left = remainder(improved, surface, significant, share(full));
+            let left = remainder(improved, discrepancy, significant, share(full));
             Remainder { share_of_residual: (all + left.share_of_residual).min(1.0), ..left }
         }
     };
@@ -795,7 +799,7 @@ fn conclude(
 
 /// For each part that is named, the law without a name that does its work, or that of all parts together, better. (Beside an
 /// error of the model and in a closure, such laws were among the candidates.)
-fn outdone(search: &Search<'_>, found: &Found, verdict: Verdict) -> Vec<Option<Part>> {
+fn outdone(search: &Search<'_>, found: &Found, verdict: Verdict) -> Vec<Option<MechanismTerm>> {
     let parts: Vec<usize> = (0..found.improved.parts.len()).collect();
     if verdict != Verdict::MissingPhysics || found.errs || found.closed {
         return vec![None; parts.len()];
@@ -809,7 +813,7 @@ fn outdone(search: &Search<'_>, found: &Found, verdict: Verdict) -> Vec<Option<P
 }
 
 /// The name of a part and the equations that it enters.
-fn named_as(part: &Part, library: &[Mechanism], nominal: &Model) -> (String, Vec<String>) {
+fn named_as(part: &MechanismTerm, library: &[Mechanism], nominal: &Model) -> (String, Vec<String>) {
     let kind = library[part.candidate.mechanism].kind.clone();
     (kind, part.candidate.place.equations(nominal))
 }
@@ -821,8 +825,8 @@ struct Judged {
     named: Vec<bool>,
     /// Share of the calibrated model's misfit that each part explains.
     shares: Vec<f64>,
-    left: Left,
-    surface: Option<Surface>,
+    left: ResidualDiagnostics,
+    discrepancy: Option<Discrepancy>,
     /// Residual sum of squares with each part alone, without each, with all, with none.
     alone: Vec<f64>,
     without: Vec<f64>,
@@ -837,22 +841,22 @@ impl Judged {
     fn of(
         search: &Search<'_>,
         found: &Found,
-        improved: &Fitted,
+        improved: &FittedModel,
         scale: &[f64],
-        (calibrated, named): (&Fitted, &dyn Fn(&Part) -> bool),
+        (calibrated, named): (&FittedModel, &dyn Fn(&MechanismTerm) -> bool),
         library: &[Mechanism],
     ) -> Judged {
         // Where nothing was found, what the search's own noise model leaves white.
-        let surface = if found.improved.parts.is_empty() && found.improved.setup.noise.is_some() {
-            surface(&found.improved, &found.scale)
+        let discrepancy = if found.improved.parts.is_empty() && found.improved.setup.noise.is_some() {
+            discrepancy(&found.improved, &found.scale)
         } else {
-            surface(improved, scale)
+            discrepancy(improved, scale)
         };
         // Two refits, for those tests that need them.
         let comparable = LazyCell::new(|| search.comparable(found));
         let full: f64 = raw_rss(improved, &found.scale).iter().sum();
         let base = search.rss_at(calibrated, improved, &found.scale);
-        let left = Left::of(improved, found, &comparable, surface.as_ref(), base);
+        let left = ResidualDiagnostics::of(improved, found, &comparable, discrepancy.as_ref(), base);
         let without: Vec<f64> = (0..improved.parts.len())
             .into_par_iter()
             .map(|i| search.rss_without(improved, &[i], calibrated, &found.scale).unwrap_or(base))
@@ -882,28 +886,30 @@ impl Judged {
         });
         let named: Vec<bool> = improved.parts.iter().map(named).collect();
         let by_name: f64 = shares.iter().zip(&named).filter(|s| *s.1).map(|s| s.0).sum();
-        let is_patchwork = || is_patchwork(improved, &shares, library, left.steady, redundant);
+        let is_series_expansion = || is_series_expansion(improved, &shares, library, left.steady, redundant);
         let verdict = match left.verdict(improved.parts.len()) {
             _ if !named.contains(&true) && !improved.parts.is_empty() => Verdict::Unexplained,
             // (The exploration has held free shapes against its laws.)
-            _ if found.errs && (by_name < EXPLAINED || is_patchwork()) => Verdict::Unexplained,
+            _ if found.errs && (by_name < EXPLAINED || is_series_expansion()) => Verdict::Unexplained,
             // (Of a closure the names have been held against all other terms.)
             _ if found.errs || found.closed => Verdict::MissingPhysics,
             Verdict::MissingPhysics
-                if is_imitation || is_patchwork() || is_rivalled(&comparable, &found.scale, library) =>
+                if is_imitation
+                    || is_series_expansion()
+                    || beaten_by_discrepancy(&comparable, &found.scale, library) =>
             {
                 Verdict::Unexplained
             }
             verdict => verdict,
         };
-        Judged { verdict, named, shares, left, surface, alone, without, full, base, doubts }
+        Judged { verdict, named, shares, left, discrepancy, alone, without, full, base, doubts }
     }
 }
 
 /// A closure that can be handed back, in the place of what stands.
 struct Closed {
     found: Found,
-    polished: Polished,
+    polished: WholeRecordFit,
     /// How its simulations of the training recordings are judged.
     misfit: f64,
     /// Whether they leave no more than noise.
@@ -916,7 +922,7 @@ impl Closed {
     fn of(
         search: &Search<'_>,
         found: &Found,
-        polished: &Polished,
+        polished: &WholeRecordFit,
         baseline: &Baseline,
         judge: &Judge,
     ) -> Result<Closed, Option<Rejected>> {
@@ -974,7 +980,7 @@ impl Closed {
         }
     }
 
-    fn new(found: Found, polished: Polished, judge: &Judge) -> Closed {
+    fn new(found: Found, polished: WholeRecordFit, judge: &Judge) -> Closed {
         let fitted = &polished.fitted;
         let scale = residual_scale(fitted, &found.scale);
         let scores = judge.scores(&fitted.setup, &fitted.fit.point.parameters, &scale);
@@ -985,8 +991,8 @@ impl Closed {
 
     /// Whether it simulates the training recordings better than what stands, and predicts what was left out of its fit
     /// better: beyond chance where that has names, on the whole where it is a proposal as well.
-    fn outdoes(&self, (found, polished): (&Found, &Polished), has_names: bool, judge: &Judge) -> bool {
-        let errors = |found: &Found, polished: &Polished| {
+    fn outdoes(&self, (found, polished): (&Found, &WholeRecordFit), has_names: bool, judge: &Judge) -> bool {
+        let errors = |found: &Found, polished: &WholeRecordFit| {
             judge.errors(polished, &residual_scale(&polished.fitted, &found.scale))
         };
         let scale = residual_scale(&polished.fitted, &found.scale);
@@ -1015,8 +1021,8 @@ impl Closed {
 /// better.
 fn explored(
     search: &Search<'_>,
-    (found, polished): (&Found, &Polished),
-    agreed: impl Fn(&Part) -> bool,
+    (found, polished): (&Found, &WholeRecordFit),
+    agreed: impl Fn(&MechanismTerm) -> bool,
     names: bool,
     baseline: &Baseline,
     judge: &Judge,
@@ -1033,12 +1039,12 @@ fn explored(
     let own = polish(&adopted.improved, &adopted.scale, judge);
     let own = defend(search, &mut adopted, own, baseline, judge, false);
     let (parts, standing) = (&own.fitted.parts, &polished.fitted.parts);
-    let known = |part: &Part| standing.iter().any(|p| p.candidate == part.candidate);
+    let known = |part: &MechanismTerm| standing.iter().any(|p| p.candidate == part.candidate);
     let is_same = parts.len() == standing.len() && parts.iter().all(known);
     if parts.is_empty() || names && is_same {
         return None;
     }
-    let misfit = |p: &Polished, scale: &[f64]| {
+    let misfit = |p: &WholeRecordFit, scale: &[f64]| {
         let scale = residual_scale(&p.fitted, scale);
         judge.misfit(&p.fitted.setup, &p.fitted.fit.point.parameters, &scale)
     };
@@ -1053,12 +1059,12 @@ fn explored(
 /// What an exploration hands back.
 struct Explored {
     found: Found,
-    polished: Polished,
+    polished: WholeRecordFit,
     /// The candidates whose names the data hold.
     named: Vec<Candidate>,
 }
 
-fn residual_scale(fitted: &Fitted, scale: &[f64]) -> Vec<f64> {
+fn residual_scale(fitted: &FittedModel, scale: &[f64]) -> Vec<f64> {
     if fitted.setup.noise.is_some() {
         return scale.to_vec(); // that of the innovations
     }
@@ -1066,55 +1072,55 @@ fn residual_scale(fitted: &Fitted, scale: &[f64]) -> Vec<f64> {
 }
 
 /// Hears of the work, which it may give up, and of nothing else.
-struct Untold<'a>(&'a dyn Observer);
+struct WorkOnlyListener<'a>(&'a dyn ProgressListener);
 
-impl Observer for Untold<'_> {
+impl ProgressListener for WorkOnlyListener<'_> {
     fn begins(&self, work: &Arc<Work>) {
         self.0.begins(work);
     }
 }
 
 /// A search that changes parameters, and the holds of inputs if it may, and nothing else.
-fn alone(nominal: &Setup, keep_holds: bool, most_work: u64, observer: &dyn Observer) -> Found {
+fn alone(nominal: &Setup, keep_holds: bool, most_work: u64, listener: &dyn ProgressListener) -> Found {
     // With a limit of work of its own.
     let alone = Setup { work: Arc::new(Work::of_fits_within(most_work)), ..nominal.clone() };
-    observer.begins(&alone.work);
-    let mut search = Search::new(alone, &[], observer);
+    listener.begins(&alone.work);
+    let mut search = Search::new(alone, &[], listener);
     search.keep_holds = keep_holds;
     search.most_work = most_work;
     let found = search.run();
-    observer.begins(&nominal.work);
+    listener.begins(&nominal.work);
     found
 }
 
 /// A fit in segments, at parameters that a fit of whole pieces may have found.
 #[derive(Debug, Clone)]
-struct Polished {
-    fitted: Fitted,
+struct WholeRecordFit {
+    fitted: FittedModel,
     /// The fit that found the parameters. Their intervals are taken here: the free starts of segments know less of
     /// the parameters than whole pieces do.
-    origin: Fitted,
+    origin: FittedModel,
 }
 
-impl Polished {
-    fn kept(fitted: Fitted) -> Polished {
-        Polished { origin: fitted.clone(), fitted }
+impl WholeRecordFit {
+    fn kept(fitted: FittedModel) -> WholeRecordFit {
+        WholeRecordFit { origin: fitted.clone(), fitted }
     }
 
     /// `fitted` at the parameters of `whole`, its segments' starts refitted.
-    fn at(fitted: &Fitted, level: Level, whole: Fit, scale: &[f64]) -> Polished {
+    fn at(fitted: &FittedModel, level: Segmentation, whole: Fit, scale: &[f64]) -> WholeRecordFit {
         let free = Setup { free: Vec::new(), ..fitted.setup.clone() };
         let point =
             Point { parameters: whole.point.parameters.clone(), starts: fitted.fit.point.starts.clone() };
         let fit = free.fit(&fitted.level, scale, &[point], Limits { iterations: 8, tolerance: 1e-6 });
-        let origin = Fitted { level, fit: whole, ..fitted.clone() };
-        Polished { fitted: Fitted { fit, ..fitted.clone() }, origin }
+        let origin = FittedModel { level, fit: whole, ..fitted.clone() };
+        WholeRecordFit { fitted: FittedModel { fit, ..fitted.clone() }, origin }
     }
 }
 
 /// The equations as they are, with the parameters that simulate the training recordings best in free run.
 struct Baseline {
-    polished: Polished,
+    polished: WholeRecordFit,
     /// Its residual.
     scale: Vec<f64>,
     /// How its simulations are judged ([`Criterion::misfit`]).
@@ -1145,7 +1151,7 @@ impl Baseline {
             let as_given = Point { parameters: nominal.to_vec(), starts: setup.starts(&level, nominal) };
             let held = Limits { iterations: 0, ..HORIZON };
             let fit = setup.fit(&level, &own, &[as_given], held);
-            polished = Polished::at(fitted, level, fit, &found.scale);
+            polished = WholeRecordFit::at(fitted, level, fit, &found.scale);
         }
         let scale = residual_scale(&polished.fitted, &found.scale);
         let misfit = judge.misfit(setup, &polished.fitted.fit.point.parameters, &scale);
@@ -1163,7 +1169,7 @@ struct Judge {
 
 impl Judge {
     /// By what a fitted model says of the machine.
-    fn of(fitted: &Fitted, scale: &[f64]) -> Judge {
+    fn of(fitted: &FittedModel, scale: &[f64]) -> Judge {
         let setup = &fitted.setup;
         let durations: Vec<f64> =
             setup.data.pieces.iter().map(|p| p.len.saturating_sub(1) as f64 * p.dt).collect();
@@ -1174,7 +1180,7 @@ impl Judge {
     }
 
     /// Errors on what is left out of the fit, fold by fold.
-    fn errors(&self, polished: &Polished, scale: &[f64]) -> Vec<f64> {
+    fn errors(&self, polished: &WholeRecordFit, scale: &[f64]) -> Vec<f64> {
         crate::validate::errors(&polished.origin, scale, self.criterion, self.window)
     }
 
@@ -1194,7 +1200,7 @@ impl Judge {
 
 /// Whether free runs leave no more than noise: in each channel at most [`MISFIT`] of its white noise, or a residual that passes
 /// for coloured noise.
-fn leaves_noise(scores: &[Score], fitted: &Fitted, scale: &[f64]) -> bool {
+fn leaves_noise(scores: &[Score], fitted: &FittedModel, scale: &[f64]) -> bool {
     let coloured = crate::search::coloured_channels(fitted, scale);
     let over = scores.iter().zip(&fitted.setup.data.sigma).map(|(s, sigma)| s.rmse / sigma);
     over.zip(coloured).all(|(over, coloured)| coloured || over <= MISFIT)
@@ -1202,7 +1208,13 @@ fn leaves_noise(scores: &[Score], fitted: &Fitted, scale: &[f64]) -> bool {
 
 /// A model refitted at growing horizons from each of these points of its level: of all fits, and the model as it is, the
 /// one that is judged best.
-fn best_horizon(fitted: &Fitted, points: &[Point], own: &[f64], scale: &[f64], judge: &Judge) -> Polished {
+fn best_horizon(
+    fitted: &FittedModel,
+    points: &[Point],
+    own: &[f64],
+    scale: &[f64],
+    judge: &Judge,
+) -> WholeRecordFit {
     let setup = &fitted.setup;
     let misfit = |point: &Point| judge.misfit(setup, &point.parameters, own);
     let grown = |point: &Point| -> Vec<(f64, Horizon)> {
@@ -1225,9 +1237,9 @@ fn best_horizon(fitted: &Fitted, points: &[Point], own: &[f64], scale: &[f64], j
                     fit = further;
                 }
             }
-            Polished::at(fitted, level, fit, scale)
+            WholeRecordFit::at(fitted, level, fit, scale)
         }
-        None => Polished::kept(fitted.clone()),
+        None => WholeRecordFit::kept(fitted.clone()),
     }
 }
 
@@ -1244,11 +1256,11 @@ const FURTHER: Limits = Limits { iterations: 100, tolerance: 1e-6 };
 fn defend(
     search: &Search<'_>,
     found: &mut Found,
-    polished: Polished,
+    polished: WholeRecordFit,
     baseline: &Baseline,
     judge: &Judge,
     named: bool,
-) -> Polished {
+) -> WholeRecordFit {
     let gates = Gates::new(search, baseline, judge, named);
     let mut polished = polished;
     loop {
@@ -1327,7 +1339,7 @@ impl<'a> Gates<'a> {
     /// parameter then goes to zero: gravity for the spring of a linearised pendulum.)
     fn of_a_closure(
         search: &'a Search<'a>,
-        stands: &Fitted,
+        stands: &FittedModel,
         baseline: &'a Baseline,
         judge: &'a Judge,
     ) -> Gates<'a> {
@@ -1337,7 +1349,7 @@ impl<'a> Gates<'a> {
     }
 
     /// The first gate that the model fails at, if it does.
-    fn failure(&self, polished: &Polished, scale: &[f64]) -> Option<Failure> {
+    fn failure(&self, polished: &WholeRecordFit, scale: &[f64]) -> Option<Failure> {
         let (search, fitted) = (self.search, &polished.fitted);
         let own = residual_scale(fitted, scale);
         let scores = self.judge.scores(&fitted.setup, &fitted.fit.point.parameters, &own);
@@ -1368,7 +1380,7 @@ impl<'a> Gates<'a> {
 }
 
 /// The improved model refitted at growing horizons.
-fn polish(fitted: &Fitted, scale: &[f64], judge: &Judge) -> Polished {
+fn polish(fitted: &FittedModel, scale: &[f64], judge: &Judge) -> WholeRecordFit {
     let own = residual_scale(fitted, scale);
     best_horizon(fitted, std::slice::from_ref(&fitted.fit.point), &own, scale, judge)
 }
@@ -1376,7 +1388,7 @@ fn polish(fitted: &Fitted, scale: &[f64], judge: &Judge) -> Polished {
 /// Residual sum of squares with each part alone, refitted; `without` is that without each part, `base` that without all.
 fn rss_alone(
     search: &Search<'_>,
-    (calibrated, improved): (&Fitted, &Fitted),
+    (calibrated, improved): (&FittedModel, &FittedModel),
     scale: &[f64],
     without: &[f64],
     base: f64,
@@ -1430,10 +1442,10 @@ fn divided(lost: &[f64], gained: &[f64], all: f64) -> Vec<f64> {
 
 /// A figure that follows from a mechanism's parameters, with its interval by the delta method.
 fn figure(
-    improved: &Fitted,
+    improved: &FittedModel,
     uncertainty: &Uncertainty,
     mechanism: &Mechanism,
-    part: &crate::search::Part,
+    part: &crate::search::MechanismTerm,
     e: &greybox_model::Expr,
 ) -> Option<Estimate> {
     let model = &improved.setup.model;
@@ -1465,8 +1477,8 @@ fn figure(
 /// still explain something (`remains`), each a considerable part of what is missing, or the two `redundant`: nearly
 /// superfluous beside each other. (Beside a law that explains nearly everything, small corrections are what a real
 /// machine has.)
-fn is_patchwork(
-    improved: &Fitted,
+fn is_series_expansion(
+    improved: &FittedModel,
     shares: &[f64],
     library: &[Mechanism],
     remains: bool,
@@ -1499,7 +1511,7 @@ fn is_patchwork(
     };
     // What it adds depends on nothing: a constant force, or the offset of an input.
     let model = &improved.setup.model;
-    let is_constant = |part: &Part| {
+    let is_constant = |part: &MechanismTerm| {
         let law = &part.instance.expression;
         let input = match &part.candidate.place {
             Place::Input(i) => Some(&*model.inputs[*i].name),
@@ -1532,8 +1544,8 @@ fn is_patchwork(
 /// Whether a law stands beside another one of the same variables on the same motion: two shapes of a
 /// restoring force may well be one shape that the library lacks. Beside a small correction, the law that
 /// explains nearly everything stands.
-fn is_shared(improved: &Fitted, shares: &[f64], index: usize) -> bool {
-    let of = |part: &Part| match &part.candidate.place {
+fn is_shared(improved: &FittedModel, shares: &[f64], index: usize) -> bool {
+    let of = |part: &MechanismTerm| match &part.candidate.place {
         Place::Motion(m) => {
             let mut variables: Vec<(String, u8)> = Vec::new();
             part.instance.expression.walk(&mut |e| {
@@ -1558,8 +1570,8 @@ fn is_shared(improved: &Fitted, shares: &[f64], index: usize) -> bool {
 
 /// Whether a mechanism is one of three or more in one equation, each a considerable part of what is missing: so
 /// many together follow nearly anything.
-fn is_crowded(improved: &Fitted, shares: &[f64], index: usize, nominal: &Model) -> bool {
-    let equations = |part: &Part| part.candidate.place.equations(nominal);
+fn is_crowded(improved: &FittedModel, shares: &[f64], index: usize, nominal: &Model) -> bool {
+    let equations = |part: &MechanismTerm| part.candidate.place.equations(nominal);
     let considerable = || improved.parts.iter().zip(shares).filter(|(_, share)| **share > CORRECTION);
     shares[index] > CORRECTION
         && equations(&improved.parts[index])
@@ -1571,15 +1583,19 @@ fn is_crowded(improved: &Fitted, shares: &[f64], index: usize, nominal: &Model) 
 /// calibrated model's residual, and steadily so, or as much where the mechanisms need a memory and the shapes need
 /// none. A law
 /// of the library is at least as good as a free shape of its variables; what imitates another law is not.
-fn is_rivalled((base, improved): &(Fitted, Fitted), scale: &[f64], library: &[Mechanism]) -> bool {
-    let Some(free) = surface(base, scale).filter(|s| s.t > STEADY_SHAPE) else { return false };
+fn beaten_by_discrepancy(
+    (base, improved): &(FittedModel, FittedModel),
+    scale: &[f64],
+    library: &[Mechanism],
+) -> bool {
+    let Some(free) = discrepancy(base, scale).filter(|s| s.t > STEADY_SHAPE) else { return false };
     // On the same folds as the free shapes: how much blocks tell of each other depends on where they are cut.
     let point = &improved.fit.point;
     let Some(errors) = held_out(&improved.setup, &improved.level, scale, point, free.block) else {
         return false;
     };
     let named = 1.0 - errors.iter().sum::<f64>() / free.without.max(1e-300);
-    let (_, t) = fall(&errors, &free.errors);
+    let (_, t) = cross_validation_improvement(&errors, &free.errors);
     let remembers = improved.parts.iter().all(|part| {
         let mut delayed = false;
         part.instance.expression.walk(&mut |e| delayed |= matches!(e, Expr::Call(Func::Delay, _)));
@@ -1611,7 +1627,7 @@ const PATCHES: usize = 3;
 const REDUNDANT: f64 = 4.0;
 
 /// What the improved model leaves over.
-struct Left {
+struct ResidualDiagnostics {
     /// Largest residual RMS over the noise.
     misfit: f64,
     /// A channel's residual is well above the noise, correlated, and no coloured noise.
@@ -1628,25 +1644,25 @@ struct Left {
     explained: f64,
 }
 
-impl Left {
+impl ResidualDiagnostics {
     fn of(
-        improved: &Fitted,
+        improved: &FittedModel,
         found: &Found,
-        comparable: &impl Deref<Target = (Fitted, Fitted)>,
-        surface: Option<&Surface>,
+        comparable: &impl Deref<Target = (FittedModel, FittedModel)>,
+        discrepancy: Option<&Discrepancy>,
         base: f64,
-    ) -> Left {
+    ) -> ResidualDiagnostics {
         let scale = &found.scale;
         let sigma = &improved.setup.data.sigma;
         let rms = raw_rms(improved, scale);
         let coloured = crate::search::coloured_channels(improved, scale);
         let misfit = rms.iter().zip(sigma).map(|(r, s)| r / s).fold(0.0, f64::max);
-        let kappas = kappa(&improved.setup, &improved.level, scale, &improved.fit.point);
+        let ratios = effective_sample_ratio(&improved.setup, &improved.level, scale, &improved.fit.point);
         let slow = (0..rms.len()).any(|c| {
             let over = rms[c] / sigma[c];
-            !coloured[c] && (over > MISFIT || (over > SLOW_MISFIT && kappas[c] < SLOW))
+            !coloured[c] && (over > MISFIT || (over > SLOW_MISFIT && ratios[c] < SLOW))
         });
-        let shape = surface.filter(|s| s.t > 2.5).map_or(0.0, |s| s.gain);
+        let shape = discrepancy.filter(|s| s.t > 2.5).map_or(0.0, |s| s.gain);
         // The floor is the noise where it is white, the residual itself where it passes for noise.
         let counts = &improved.fit.count;
         let floor: f64 = (0..rms.len())
@@ -1659,8 +1675,9 @@ impl Left {
         let mut explained = 1.0 - (full - floor).max(0.0) / (base - floor).max(1e-300);
         let whitened = found.improved.setup.noise.is_some();
         // Free shapes' gain in log-likelihood, by what independent samples there are.
-        let likelier =
-            surface.filter(|s| s.t > STEADY_DOUBT && s.samples as f64 * s.kappa * s.gain > LIKELIER);
+        let likelier = discrepancy.filter(|s| {
+            s.t > STEADY_DOUBT && s.samples as f64 * s.effective_sample_ratio * s.gain > LIKELIER
+        });
         let hidden = likelier.is_some();
         let steady = likelier.is_some_and(|s| s.t > STEADY_SHAPE);
         let predictable = likelier.filter(|s| whitened && s.t > STEADY_INNOVATIONS);
@@ -1673,7 +1690,7 @@ impl Left {
             let named = log_likelihood_gain(before, after, scale) / seen;
             explained = named / (named - (1.0 - free.gain).max(1e-9).ln()).max(1e-300);
         }
-        Left { misfit, slow, shape, hidden, steady, innovations, explained }
+        ResidualDiagnostics { misfit, slow, shape, hidden, steady, innovations, explained }
     }
 
     /// Whether something is missing beyond the mechanisms found.
@@ -1713,12 +1730,12 @@ const BELOW_NOISE: f64 = 0.8;
 const SLOW_MISFIT: f64 = 1.2;
 const SLOW: f64 = 0.05;
 
-fn surface(fitted: &Fitted, scale: &[f64]) -> Option<Surface> {
-    crate::surface::test(&fitted.setup, &fitted.level, scale, &fitted.fit.point)
+fn discrepancy(fitted: &FittedModel, scale: &[f64]) -> Option<Discrepancy> {
+    crate::discrepancy::test(&fitted.setup, &fitted.level, scale, &fitted.fit.point)
 }
 
 fn findings(
-    improved: &Fitted,
+    improved: &FittedModel,
     found: &Found,
     nominal: &Model,
     library: &[Mechanism],
@@ -1726,14 +1743,14 @@ fn findings(
     shares: &[f64],
     train: &Role,
     uncertainty: &Uncertainty,
-) -> Vec<Finding> {
+) -> Vec<IdentifiedMechanism> {
     let widths = uncertainty.widths();
     let mut setup = improved.setup.clone();
     for (p, v) in setup.model.parameters.iter_mut().zip(&improved.fit.point.parameters) {
         p.value = *v;
     }
-    let along = Along::simulated(&setup, &train.improved.run.x, &improved.fit.point.parameters);
-    let hats = Along::smoothed(&setup, &improved.level, scale, &improved.fit.point);
+    let along = TrajectoryEval::simulated(&setup, &train.improved.run.x, &improved.fit.point.parameters);
+    let smoothed_states = TrajectoryEval::smoothed(&setup, &improved.level, scale, &improved.fit.point);
     improved
         .parts
         .iter()
@@ -1840,7 +1857,7 @@ fn findings(
                     }
                 }
             }
-            Finding {
+            IdentifiedMechanism {
                 kind: mechanism.kind.clone(),
                 family: mechanism.family.clone(),
                 signature: mechanism.about.signature.clone(),
@@ -1860,7 +1877,7 @@ fn findings(
                     ..locate(&setup, &along, mechanism, &part.instance)
                 },
                 evidence,
-                curve: curve(&setup, &hats, mechanism, &part.instance, &part.candidate.place),
+                curve: curve(&setup, &smoothed_states, mechanism, &part.instance, &part.candidate.place),
             }
         })
         .collect()
@@ -1887,7 +1904,7 @@ fn declare_twins(
 /// the smoothed measurements; for plots only).
 fn curve(
     setup: &Setup,
-    hats: &Along<'_>,
+    smoothed_states: &TrajectoryEval<'_>,
     mechanism: &Mechanism,
     instance: &crate::candidate::Instance,
     place: &Place,
@@ -1901,9 +1918,9 @@ fn curve(
         }
         _ => return None,
     };
-    let x = hats.eval(std::slice::from_ref(&variable), &[])?.pop()?;
-    let f = force(setup, hats, mechanism, instance)?;
-    let left = left_over(setup, hats, equation)?;
+    let x = smoothed_states.eval(std::slice::from_ref(&variable), &[])?.pop()?;
+    let f = force(setup, smoothed_states, mechanism, instance)?;
+    let left = left_over(setup, smoothed_states, equation)?;
     let mut points = Vec::new();
     let mut law = Vec::new();
     for ((x, f), left) in x.iter().zip(&f).zip(&left) {
@@ -1924,7 +1941,11 @@ fn curve(
 }
 
 /// Residual of an equation along the smoothed measurements, SI: what the improved model still lacks.
-pub fn left_over(setup: &Setup, hats: &Along<'_>, equation: usize) -> Option<Vec<Vec<f64>>> {
+pub fn left_over(
+    setup: &Setup,
+    smoothed_states: &TrajectoryEval<'_>,
+    equation: usize,
+) -> Option<Vec<Vec<f64>>> {
     let residual = setup.model.equations[equation].residual();
     // The highest derivatives come from the smoothed measurements, too.
     let highest: Vec<(&str, u8)> =
@@ -1932,11 +1953,11 @@ pub fn left_over(setup: &Setup, hats: &Along<'_>, equation: usize) -> Option<Vec
     let (mass, rest) = residual.affine_in(&highest)?;
     let mut exprs = mass;
     exprs.push(rest);
-    let mut values = hats.eval(&exprs, &[])?;
+    let mut values = smoothed_states.eval(&exprs, &[])?;
     let mut total = values.pop()?;
     for (j, column) in values.iter().enumerate() {
         for (p, (t, c)) in total.iter_mut().zip(column).enumerate() {
-            match &setup.hats.highest[p][j] {
+            match &setup.smoothed_states.highest[p][j] {
                 Some(z) => {
                     for ((t, c), z) in t.iter_mut().zip(c).zip(z) {
                         *t += c * z;
@@ -1951,8 +1972,8 @@ pub fn left_over(setup: &Setup, hats: &Along<'_>, equation: usize) -> Option<Vec
 }
 
 /// What the forces of a model's parts depend on, where that is one motion.
-fn only_variable(improved: &Fitted, library: &[Mechanism]) -> Option<Variable> {
-    let acts = |part: &&Part| !library[part.candidate.mechanism].is_constant();
+fn only_variable(improved: &FittedModel, library: &[Mechanism]) -> Option<Variable> {
+    let acts = |part: &&MechanismTerm| !library[part.candidate.mechanism].is_constant();
     let parts: Vec<&Candidate> = improved.parts.iter().filter(acts).map(|part| &part.candidate).collect();
     let motion = parts.first()?.motion()?;
     let is_only = parts.iter().all(|c| matches!(&c.place, Place::Motion(own) if own == motion));
@@ -1965,16 +1986,21 @@ fn only_variable(improved: &Fitted, library: &[Mechanism]) -> Option<Variable> {
     }
 }
 
-fn remainder(improved: &Fitted, surface: Option<Surface>, significant: bool, left: f64) -> Remainder {
+fn remainder(
+    improved: &FittedModel,
+    discrepancy: Option<Discrepancy>,
+    significant: bool,
+    left: f64,
+) -> Remainder {
     let model = &improved.setup.model;
     let mut location = Location::default();
     let mut shape = None;
-    let share = surface.as_ref().map_or(0.0, |s| s.gain.clamp(0.0, 1.0) * left.min(1.0));
+    let share = discrepancy.as_ref().map_or(0.0, |s| s.gain.clamp(0.0, 1.0) * left.min(1.0));
     let force = |m: &Motion| match Place::Motion(m.clone()).moves(model) {
         true => "a force",
         false => "a term",
     };
-    if significant && let Some(Surface { variable: Some((variable, _)), .. }) = &surface {
+    if significant && let Some(Discrepancy { variable: Some((variable, _)), .. }) = &discrepancy {
         let (motion, text) = match variable {
             Variable::Position(m) => {
                 (m, m.position.as_ref().map(|e| format!("{} that depends on {e}", force(m))))
@@ -2047,14 +2073,14 @@ pub fn calibrate(
     model: &Model,
     train: &[Recording],
     holdout: &[Recording],
-    observer: &dyn Observer,
+    listener: &dyn ProgressListener,
 ) -> Result<Calibration, DiagnoseError> {
     let Layout { train, holdout, source } = layout(model, train, holdout)?;
     let nominal = Setup::new(model, train.clone(), free_parameters(model))?;
-    let found = alone(&nominal, true, MOST_WORK, observer);
+    let found = alone(&nominal, true, MOST_WORK, listener);
     let judge = Judge::of(&found.calibrated, &residual_scale(&found.calibrated, &found.scale));
     let window = judge.window;
-    let Baseline { polished: Polished { fitted, origin }, scale, .. } =
+    let Baseline { polished: WholeRecordFit { fitted, origin }, scale, .. } =
         Baseline::of(&found, &nominal.values(), &judge);
     let widths = Uncertainty::of(&origin, &scale).widths();
     let values = &fitted.fit.point.parameters;
@@ -2129,13 +2155,13 @@ mod tests {
             let laws = [(candidate, values.to_vec(), vec![1.0; values.len()])];
             search.reassembled_from(calibrated, &laws, vec![parameters], scale, steps).unwrap()
         };
-        let gate = |model: Fitted, baseline: &Baseline| {
+        let gate = |model: FittedModel, baseline: &Baseline| {
             let gates = Gates::of_a_closure(&search, calibrated, baseline, &judge);
             gates.failure(&polish(&model, scale, &judge), scale).map(|failure| failure.gate)
         };
-        let as_it_is = |model: Fitted, baseline: &Baseline| {
+        let as_it_is = |model: FittedModel, baseline: &Baseline| {
             let gates = Gates::of_a_closure(&search, calibrated, baseline, &judge);
-            gates.failure(&Polished::kept(model), scale).map(|failure| failure.gate)
+            gates.failure(&WholeRecordFit::kept(model), scale).map(|failure| failure.gate)
         };
         let law = with("quadratic_stiffness", &[9.0], 20);
         assert_eq!(gate(law.clone(), &baseline()), None);

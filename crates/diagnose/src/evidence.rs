@@ -27,7 +27,7 @@
 //! |s|²/c − ln |V| besides ([`Smoothness`]). A law that is right only here and there, or whose gain
 //! a slow misfit makes, has a large c, however large the gain.
 
-use greybox_calibrate::{Level, Point, Setup, qr};
+use greybox_calibrate::{Point, Segmentation, Setup, qr};
 
 use crate::screen::project;
 
@@ -53,16 +53,16 @@ pub struct Evidence {
     /// Relative drop of the residual sum of squares.
     pub drop: f64,
     /// Relative drop of the held-out sum of squares.
-    pub held_out: f64,
+    pub cross_validation_gain: f64,
     /// Mean over standard error of the folds' drops.
     pub t: f64,
     /// Share of the folds that improve.
-    pub improving: f64,
+    pub improved_fold_fraction: f64,
     /// Smallest κ over the channels.
-    pub kappa: f64,
+    pub effective_sample_ratio: f64,
     /// Of all changes in the blocks' sums of squares, the share that is for the better: near one where an
     /// effect acts rarely and nothing else suffers for it.
-    pub focus: f64,
+    pub improvement_concentration: f64,
     /// The residuals were whitened.
     pub whitened: bool,
 }
@@ -73,17 +73,17 @@ impl Evidence {
         score: 0.0,
         akaike: 0.0,
         drop: 0.0,
-        held_out: 0.0,
+        cross_validation_gain: 0.0,
         t: 0.0,
-        improving: 0.0,
-        kappa: 1.0,
-        focus: 0.0,
+        improved_fold_fraction: 0.0,
+        effective_sample_ratio: 1.0,
+        improvement_concentration: 0.0,
         whitened: false,
     };
 }
 
 /// κ per channel: information per sample of an autocorrelated residual.
-pub fn kappa(setup: &Setup, level: &Level, scale: &[f64], point: &Point) -> Vec<f64> {
+pub fn effective_sample_ratio(setup: &Setup, level: &Segmentation, scale: &[f64], point: &Point) -> Vec<f64> {
     let rows = setup.with_problem(level, scale, |p| p.rows(point, false, None));
     (0..setup.system.ny)
         .map(|c| {
@@ -116,12 +116,17 @@ pub fn kappa(setup: &Setup, level: &Level, scale: &[f64], point: &Point) -> Vec<
 }
 
 /// The smallest κ over the channels.
-pub fn least_kappa(setup: &Setup, level: &Level, scale: &[f64], point: &Point) -> f64 {
-    kappa(setup, level, scale, point).into_iter().fold(1.0, f64::min)
+pub fn least_effective_sample_ratio(
+    setup: &Setup,
+    level: &Segmentation,
+    scale: &[f64],
+    point: &Point,
+) -> f64 {
+    effective_sample_ratio(setup, level, scale, point).into_iter().fold(1.0, f64::min)
 }
 
 /// Held-out errors by fold at the optimum of a fit.
-pub fn folds(setup: &Setup, level: &Level, scale: &[f64], point: &Point) -> Folds {
+pub fn folds(setup: &Setup, level: &Segmentation, scale: &[f64], point: &Point) -> Folds {
     let (nx, ny, np) = (setup.system.nx, setup.system.ny, setup.free.len());
     let rows = setup.with_problem(level, scale, |p| p.rows(point, true, None));
     let total: usize = level.segments.iter().map(|s| s.range.len()).sum();
@@ -207,7 +212,7 @@ pub struct Inflation {
 }
 
 /// What a comparison knows of each of the two models.
-pub struct Side {
+pub struct ComparedModel {
     /// Residual sum of squares per channel (innovations, where the residual is whitened).
     pub rss: Vec<f64>,
     /// Parameters beyond the nominal ones.
@@ -243,7 +248,7 @@ pub(crate) fn price(k: f64, information: f64) -> f64 {
 }
 
 /// Sum over the folds by which held-out errors fall, and the mean of the falls over its standard error.
-pub fn fall(from: &[f64], to: &[f64]) -> (f64, f64) {
+pub fn cross_validation_improvement(from: &[f64], to: &[f64]) -> (f64, f64) {
     let differences: Vec<f64> = from.iter().zip(to).map(|(a, b)| a - b).collect();
     let (k, sum) = (differences.len().max(1) as f64, differences.iter().sum::<f64>());
     let mean = sum / k;
@@ -252,7 +257,12 @@ pub fn fall(from: &[f64], to: &[f64]) -> (f64, f64) {
 }
 
 /// Σ n_c w_c ln(RSS_old/RSS_new) over the channels, and Σ n_c w_c.
-fn gain(old: &Side, new: &Side, count: &[usize], weight: impl Fn(usize) -> f64) -> (f64, f64) {
+fn gain(
+    old: &ComparedModel,
+    new: &ComparedModel,
+    count: &[usize],
+    weight: impl Fn(usize) -> f64,
+) -> (f64, f64) {
     let (mut gain, mut information) = (0.0, 0.0);
     for c in 0..count.len() {
         let n = count[c] as f64 * weight(c);
@@ -266,14 +276,15 @@ fn gain(old: &Side, new: &Side, count: &[usize], weight: impl Fn(usize) -> f64) 
 
 /// The adjusted score of the richer model (`new`) over the simpler (`old`), both fitted with the same scale: `robust` in the
 /// formula of [this module](self). `inflation` is that of what `new` has beyond `old`.
-pub fn robust(old: &Side, new: &Side, count: &[usize], inflation: Inflation) -> f64 {
+pub fn robust(old: &ComparedModel, new: &ComparedModel, count: &[usize], inflation: Inflation) -> f64 {
     let (gain, information) = gain(old, new, count, |_| 1.0 / inflation.factor);
     let freedom = inflation.freedom;
     let told = match freedom.is_finite() && gain > 0.0 {
         true => (freedom + inflation.parameters) * (gain / freedom).ln_1p(),
         false => gain,
     };
-    let cost = |side: &Side| price(side.parameters, information) + side.shapes.price(inflation.factor);
+    let cost =
+        |side: &ComparedModel| price(side.parameters, information) + side.shapes.price(inflation.factor);
     let dearer = cost(new) - cost(old);
     told - dearer - 2.0 * (new.surcharge - old.surcharge)
 }
@@ -281,16 +292,16 @@ pub fn robust(old: &Side, new: &Side, count: &[usize], inflation: Inflation) -> 
 /// Weighs the richer model (`new`) against the simpler (`old`), both fitted with the same scale, by what the samples tell and
 /// by the errors of either on folds.
 pub fn weigh(
-    (old, old_folds): (&Side, &Folds),
-    (new, new_folds): (&Side, &Folds),
+    (old, old_folds): (&ComparedModel, &Folds),
+    (new, new_folds): (&ComparedModel, &Folds),
     count: &[usize],
-    kappa: &[f64],
+    effective_sample_ratio: &[f64],
     whitened: bool,
 ) -> Evidence {
-    let (gain, effective) = gain(old, new, count, |c| kappa[c]);
+    let (gain, effective) = gain(old, new, count, |c| effective_sample_ratio[c]);
     let gain = gain - 2.0 * (new.surcharge - old.surcharge);
     let (before, after): (f64, f64) = (old.rss.iter().sum(), new.rss.iter().sum());
-    let (fallen, t) = fall(&old_folds.sse, &new_folds.sse);
+    let (fallen, t) = cross_validation_improvement(&old_folds.sse, &new_folds.sse);
     let better = old_folds.sse.iter().zip(&new_folds.sse).filter(|(a, b)| *a - *b > 0.0).count();
     let changes = || old_folds.blocks.iter().zip(&new_folds.blocks).map(|(a, b)| a - b);
     let all: f64 = changes().map(f64::abs).sum();
@@ -298,21 +309,21 @@ pub fn weigh(
         score: gain + price(old.parameters, effective) - price(new.parameters, effective),
         akaike: gain + 2.0 * (old.parameters - new.parameters),
         drop: 1.0 - after / before.max(1e-300),
-        held_out: fallen / old_folds.sse.iter().sum::<f64>().max(1e-300),
+        cross_validation_gain: fallen / old_folds.sse.iter().sum::<f64>().max(1e-300),
         t,
-        improving: better as f64 / old_folds.sse.len().max(1) as f64,
-        kappa: kappa.iter().copied().fold(1.0, f64::min),
-        focus: changes().map(|d| d.max(0.0)).sum::<f64>() / all.max(1e-300),
+        improved_fold_fraction: better as f64 / old_folds.sse.len().max(1) as f64,
+        effective_sample_ratio: effective_sample_ratio.iter().copied().fold(1.0, f64::min),
+        improvement_concentration: changes().map(|d| d.max(0.0)).sum::<f64>() / all.max(1e-300),
         whitened,
     }
 }
 
 #[cfg(test)]
 mod tests {
-    use super::{Folds, Inflation, Side, Smoothness, price, robust, weigh};
+    use super::{ComparedModel, Folds, Inflation, Smoothness, price, robust, weigh};
 
-    fn side(rss: f64, parameters: f64) -> Side {
-        Side { rss: vec![rss], parameters, surcharge: 0.0, shapes: Smoothness::default() }
+    fn side(rss: f64, parameters: f64) -> ComparedModel {
+        ComparedModel { rss: vec![rss], parameters, surcharge: 0.0, shapes: Smoothness::default() }
     }
 
     #[test]
@@ -352,14 +363,15 @@ mod tests {
         );
         // Of three strengths Student's ratio has three dimensions; a prior's price falls with what the residual is worth.
         let three = Inflation { factor: 2.0, freedom: 39.0, parameters: 3.0 };
-        let shaped = Side { shapes: Smoothness { squares: 8.0, certainty: 5.0 }, ..side(1000.0, 1.0) };
+        let shaped =
+            ComparedModel { shapes: Smoothness { squares: 8.0, certainty: 5.0 }, ..side(1000.0, 1.0) };
         let expected = 42.0 * (1.0 + gain / 78.0).ln() - price(1.0, 500.0) - (4.0 + 5.0);
         assert!((robust(&side(1200.0, 0.0), &shaped, &[1000], three) - expected).abs() < 1e-9);
         // What is worse is no better for it, and a surcharge is paid.
         let plain = Inflation { factor: 1.0, freedom: 39.0, parameters: 1.0 };
         let worse = robust(&side(1000.0, 0.0), &side(1100.0, 1.0), &[1000], plain);
         assert!(worse < -90.0, "{worse}");
-        let dear = Side { surcharge: 3.0, ..side(1000.0, 1.0) };
+        let dear = ComparedModel { surcharge: 3.0, ..side(1000.0, 1.0) };
         assert!((of(1.0, 39.0) - robust(&side(1200.0, 0.0), &dear, &[1000], plain) - 6.0).abs() < 1e-9);
     }
 

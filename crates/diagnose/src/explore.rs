@@ -24,19 +24,19 @@ use std::ops::Range;
 use std::sync::Arc;
 
 use greybox_calibrate::stochastic::{Filter, Fitted as Filtered, Pass, RANGE, Stochastic};
-use greybox_calibrate::{Level, Point, Prior, Setup, Work, qr};
+use greybox_calibrate::{Point, Prior, Segmentation, Setup, Work, qr};
 use greybox_simulate::SignalLanes;
 use rayon::prelude::*;
 
 use self::beside::Beside;
-use crate::along::Along;
 use crate::candidate::Candidate;
 use crate::library::First;
-use crate::screen::{Gram, Lanes, Scored, first_states, lanes, scored};
-use crate::search::{Fitted, Law, Part, Search, carried, laws};
+use crate::screen::{CandidateResponses, Gram, Scored, first_states, lanes, scored};
+use crate::search::{FittedModel, Law, MechanismTerm, Search, carried, laws};
 use crate::shapes::log_sum;
 use crate::spectra::Spectra;
-use crate::{Observer, Stage};
+use crate::trajectory::TrajectoryEval;
+use crate::{ProgressListener, Stage};
 
 /// Probability from which a family of laws is named.
 const NAMED: f64 = 0.95;
@@ -85,7 +85,7 @@ enum Known {
 #[derive(Debug, Clone)]
 pub(crate) struct Hypothesis {
     /// The laws as they stand in the model.
-    pub(crate) parts: Vec<Part>,
+    pub(crate) parts: Vec<MechanismTerm>,
     /// What is known of the parameters of each before the data.
     known: Vec<Vec<Known>>,
     /// The fit.
@@ -94,7 +94,7 @@ pub(crate) struct Hypothesis {
 
 /// A hypothesis to be fitted.
 struct Draft {
-    parts: Vec<Part>,
+    parts: Vec<MechanismTerm>,
     known: Vec<Vec<Known>>,
     start: Stochastic,
 }
@@ -180,7 +180,7 @@ impl Hypothesis {
 #[derive(Debug, Clone)]
 pub(crate) struct Other {
     /// The law as it would stand in the model.
-    pub(crate) part: Part,
+    pub(crate) part: MechanismTerm,
     /// Its probability.
     pub(crate) probability: f64,
     /// The data cannot separate the two.
@@ -239,7 +239,7 @@ impl<'a, 'b> Explorer<'a, 'b> {
         // With a limit of work of its own.
         let most_work = search.most_work / SHARE_OF_WORK;
         let work = Arc::new(Work::of_fits_within(most_work));
-        search.observer.begins(&work);
+        search.listener.begins(&work);
         let machine = Setup { noise: None, work, ..machine.clone() };
         let filter = Filter::new(&machine);
         Explorer {
@@ -254,8 +254,8 @@ impl<'a, 'b> Explorer<'a, 'b> {
         }
     }
 
-    fn observer(&self) -> &dyn Observer {
-        self.search.observer
+    fn listener(&self) -> &dyn ProgressListener {
+        self.search.listener
     }
 
     fn evidence(&self, h: &Hypothesis) -> f64 {
@@ -299,7 +299,7 @@ impl<'a, 'b> Explorer<'a, 'b> {
     }
 
     /// Segments over all data, with the starts that a hypothesis gives them.
-    fn level(&self, h: &Hypothesis) -> (Level, Point) {
+    fn level(&self, h: &Hypothesis) -> (Segmentation, Point) {
         let at = h.at();
         let level = at.setup.level(SEGMENTS);
         let starts = at.setup.starts(&level, &at.parameters);
@@ -313,7 +313,7 @@ impl<'a, 'b> Explorer<'a, 'b> {
         let setup = &at.setup;
         let (level, point) = self.level(h);
         let scale = at.errors.noise();
-        let (along, forces) = Along::observed(setup, &level, &scale, &point);
+        let (along, forces) = TrajectoryEval::observed(setup, &level, &scale, &point);
         let spectra = Spectra::new(setup, &level, &scale, &point, &along, &forces);
         let lanes = lanes(setup, library, open, &along, &spectra);
         let blocks: Vec<_> = lanes.variants.iter().map(|v| v.columns.clone()).collect();
@@ -330,20 +330,20 @@ impl<'a, 'b> Explorer<'a, 'b> {
         let setup = &machine.at().setup;
         let (level, point) = self.level(machine);
         let scale = &setup.data.spread;
-        let (along, forces) = Along::observed(setup, &level, scale, &point);
+        let (along, forces) = TrajectoryEval::observed(setup, &level, scale, &point);
         let spectra = Spectra::new(setup, &level, scale, &point, &along, &forces);
         let lanes = lanes(setup, self.search.library, candidates, &along, &spectra);
         let total = totals(setup, &along);
         (0..candidates.len()).map(|c| self.prior_of(c, &lanes, &total)).collect()
     }
 
-    fn prior_of(&self, index: usize, lanes: &Lanes, total: &Totals) -> Vec<Known> {
+    fn prior_of(&self, index: usize, lanes: &CandidateResponses, total: &Totals) -> Vec<Known> {
         let mechanism = &self.search.library[self.search.candidates()[index].mechanism];
         let variants = || lanes.variants.iter().filter(|v| v.candidate == index);
         // Of a strength: the widest of what any choice of the inner parameters says.
         let width = |i: usize| {
             variants()
-                .filter(|v| v.secant.is_none())
+                .filter(|v| v.finite_difference.is_none())
                 .filter_map(|v| v.columns.clone().nth(i))
                 .map(|column| total.width(lanes, column))
                 .filter(|w| w.is_finite() && *w > 0.0)
@@ -369,7 +369,7 @@ impl<'a, 'b> Explorer<'a, 'b> {
     }
 
     /// What another search found, as a hypothesis.
-    fn adopted(&self, machine: &Hypothesis, other: &Fitted) -> Option<Hypothesis> {
+    fn adopted(&self, machine: &Hypothesis, other: &FittedModel) -> Option<Hypothesis> {
         if other.parts.is_empty() {
             return None;
         }
@@ -438,7 +438,7 @@ impl<'a, 'b> Explorer<'a, 'b> {
             Vec::new()
         } else {
             let (level, point) = self.level(h);
-            let along = Along::smoothed(&at.setup, &level, &at.errors.noise(), &point);
+            let along = TrajectoryEval::smoothed(&at.setup, &level, &at.errors.noise(), &point);
             first_states(&at.setup, mechanism, candidate, &along)?
         };
         let mut laws = h.laws();
@@ -460,7 +460,7 @@ impl<'a, 'b> Explorer<'a, 'b> {
             parameters
         };
         let mut points = vec![point(&s.values, None), point(&s.values, Some(&s.shift))];
-        points.extend(s.faint.iter().map(|faint| point(faint, None)));
+        points.extend(s.reduced_start.iter().map(|reduced_start| point(reduced_start, None)));
         points.extend(s.others.iter().map(|(_, values, shift)| point(values, Some(shift))));
         let mut best = f64::NEG_INFINITY;
         let mut likeliest = None;
@@ -480,7 +480,7 @@ impl<'a, 'b> Explorer<'a, 'b> {
         let scored = self.proposals(h, open);
         let mut short = self.search.short_list(open, &scored, 0.0, SHORT_LIST, 0);
         short.truncate(most);
-        self.observer().stage(Stage::Fitting { candidates: short.len() });
+        self.listener().stage(Stage::Fitting { candidates: short.len() });
         let trial = |s: &&Scored| self.fit(self.extended_by(h, &open[s.candidate], s)?, steps);
         short.par_iter().filter_map(trial).collect()
     }
@@ -519,7 +519,7 @@ impl<'a, 'b> Explorer<'a, 'b> {
         let all = self.search.candidates().iter();
         let open: Vec<Candidate> =
             all.filter(|c| !taken(c) && !self.search.is_bound_to_a_clock(c)).cloned().collect();
-        self.observer().stage(Stage::Screening { candidates: open.len(), found: base.parts.len() });
+        self.listener().stage(Stage::Screening { candidates: open.len(), found: base.parts.len() });
         let trials = self.trials(base, &open, SHORT_LIST, FIRST_STEPS);
         let (trials, _) = self.likeliest(trials, FINALISTS);
         let (best, others) = self.likeliest(self.refined(trials, MORE_STEPS), BEST);
@@ -601,8 +601,8 @@ impl<'a, 'b> Explorer<'a, 'b> {
 
     /// Explores from parameters of the machine that another search found, and what it found beside them; `None` where the
     /// filter cannot follow the machine.
-    pub(crate) fn explore(mut self, found: &[f64], others: &[&Fitted]) -> Option<Posterior> {
-        self.observer().stage(Stage::Calibrating);
+    pub(crate) fn explore(mut self, found: &[f64], others: &[&FittedModel]) -> Option<Posterior> {
+        self.listener().stage(Stage::Calibrating);
         self.inflation = self.filter.strides().len() as f64;
         let machine = self.machine_alone(found)?;
         self.priors = self.all_priors(&machine);
@@ -800,7 +800,7 @@ struct Totals {
 
 impl Totals {
     /// The strength at which a column is as large as all that acts where it does.
-    fn width(&self, lanes: &Lanes, column: usize) -> f64 {
+    fn width(&self, lanes: &CandidateResponses, column: usize) -> f64 {
         let Some(first) = lanes.signals.first() else { return f64::INFINITY };
         // Of one lane in a table of each piece.
         let rms = |of: &dyn Fn(&SignalLanes) -> Option<&Vec<f64>>, lane: usize| -> f64 {
@@ -838,7 +838,7 @@ impl Totals {
 }
 
 /// How large all is that acts on a machine.
-fn totals(setup: &Setup, along: &Along<'_>) -> Totals {
+fn totals(setup: &Setup, along: &TrajectoryEval<'_>) -> Totals {
     let spread = |series: &mut dyn Iterator<Item = &Vec<f64>>| -> f64 {
         series.map(|v| greybox_calibrate::spread(v)).fold(0.0, f64::max)
     };
@@ -921,7 +921,7 @@ mass = "m*x'' + k*x = f"
         let search = Search::new(setup.clone(), library, &crate::Quiet);
         let posterior = Explorer::new(&search, setup).explore(&setup.values(), &[]).unwrap();
         assert!(!posterior.limited);
-        let kind = |p: &Part| library[p.candidate.mechanism].kind.clone();
+        let kind = |p: &MechanismTerm| library[p.candidate.mechanism].kind.clone();
         posterior.chosen.parts.iter().map(kind).zip(posterior.beliefs.iter().map(|b| b.named)).collect()
     }
 
@@ -1023,11 +1023,11 @@ mass = "m*x'' + k*x = f"
             }
         };
         let (level, point) = explorer.level(&machine);
-        let along = Along::smoothed(&machine.at().setup, &level, &setup.data.spread, &point);
+        let along = TrajectoryEval::smoothed(&machine.at().setup, &level, &setup.data.spread, &point);
         let force = along.total_forces()[0];
         assert!((width("constant_offset") / force - 1.0).abs() < 0.05);
         assert!((width("coulomb_friction") / force - 1.0).abs() < 0.05);
-        let rate = &machine.at().setup.hats.states[0][1].clone().unwrap();
+        let rate = &machine.at().setup.smoothed_states.states[0][1].clone().unwrap();
         let rms = (rate.iter().map(|v| v * v).sum::<f64>() / rate.len() as f64).sqrt();
         assert!((width("viscous_friction") * rms / force - 1.0).abs() < 0.1);
     }

@@ -5,10 +5,10 @@
 #[doc = include_str!("../README.md")]
 struct Readme;
 
-pub mod along;
 pub mod candidate;
 mod closure;
 pub mod diagnosis;
+pub mod discrepancy;
 pub mod evidence;
 mod explore;
 pub mod library;
@@ -21,8 +21,8 @@ pub mod search;
 pub mod shapes;
 pub mod smoother;
 pub mod spectra;
-pub mod surface;
 mod temperature;
+pub mod trajectory;
 mod turns;
 mod twins;
 mod uncertainty;
@@ -80,7 +80,7 @@ pub struct Weighed<'a> {
 }
 
 /// Watches a diagnosis. It never steers it, but may end it: by giving the work up, and by unwinding.
-pub trait Observer: Sync {
+pub trait ProgressListener: Sync {
     /// The work begins; it may be [given up](Work::give_up), after which it ends soon.
     fn begins(&self, _work: &Arc<Work>) {}
     /// A stage begins.
@@ -95,6 +95,6 @@ pub trait Observer: Sync {
     fn dropped(&self, _kind: &str) {}
 }
 
-/// An observer that does nothing.
+/// A listener that does nothing.
 pub struct Quiet;
-impl Observer for Quiet {}
+impl ProgressListener for Quiet {}

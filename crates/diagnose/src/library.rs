@@ -423,11 +423,11 @@ pub struct MechanismError {
     pub file: String,
     /// Line of the file, where the fault is in one; the first is 1.
     pub line: Option<usize>,
-    /// What is wrong and the mend.
+    /// What is wrong and the fix.
     pub message: String,
 }
 
-/// A fault: the key it is at (the section, the key in it), and what is wrong with the mend.
+/// A fault: the key it is at (the section, the key in it), and what is wrong with the fix.
 struct Fault {
     section: String,
     key: String,
@@ -563,7 +563,7 @@ impl Mechanism {
     /// Reads a mechanism file.
     ///
     /// # Errors
-    /// [`MechanismError`] names the file, the line, and what is wrong with the mend. What depends on other
+    /// [`MechanismError`] names the file, the line, and what is wrong with the fix. What depends on other
     /// files (`refines`, `doubts`, `[equals]`, `[special_case]`) is checked by [`combine`].
     pub fn from_toml(text: &str, file: &str) -> Result<Mechanism, MechanismError> {
         let raw: File = toml::from_str(text).map_err(|e| MechanismError {
@@ -1598,7 +1598,7 @@ mod tests {
 
     /// Every way to be wrong, the line it is found on (three stand before the text), and what must be said.
     #[test]
-    fn wrong_files_are_refused_with_line_and_mend() {
+    fn wrong_files_are_refused_with_line_and_help() {
         let state = "force = \"k*z\"\nlinear = [\"k\"]\n[states.z]\n";
         let first = "force = \"fc*sign(d')\"\nlinear = [\"a\"]\n";
         let rows: &[(&str, usize, &str)] = &[

@@ -9,10 +9,10 @@
 use greybox_calibrate::{Setup, qr};
 use greybox_model::Expr;
 
-use crate::along::Along;
 use crate::candidate::Instance;
 use crate::library::{Mechanism, On};
 use crate::place::Place;
+use crate::trajectory::TrajectoryEval;
 
 /// Location of a mechanism.
 #[derive(Debug, Clone, PartialEq, Default)]
@@ -31,7 +31,12 @@ pub struct Location {
 const MOST_WINDOWS: usize = 200;
 
 /// Locates an instance along simulated states.
-pub fn locate(setup: &Setup, along: &Along<'_>, mechanism: &Mechanism, instance: &Instance) -> Location {
+pub fn locate(
+    setup: &Setup,
+    along: &TrajectoryEval<'_>,
+    mechanism: &Mechanism,
+    instance: &Instance,
+) -> Location {
     let candidate = &instance.candidate;
     let names: Vec<String> = mechanism.parameters().map(str::to_string).collect();
     let rename = |n: &str| {
@@ -134,7 +139,7 @@ pub fn locate(setup: &Setup, along: &Along<'_>, mechanism: &Mechanism, instance:
 /// The mechanism's force (or its change of an input or measurement) per piece.
 pub fn force(
     setup: &Setup,
-    along: &Along<'_>,
+    along: &TrajectoryEval<'_>,
     mechanism: &Mechanism,
     instance: &Instance,
 ) -> Option<Vec<Vec<f64>>> {

@@ -8,7 +8,7 @@
 //! chi-squared distribution with k degrees of freedom. A law that describes something else draws parameters away to make up for
 //! what it does; the right one lets them go back.
 
-use greybox_calibrate::{Free, Prior};
+use greybox_calibrate::{FreeParameter, Prior};
 use statrs::distribution::{ChiSquared, ContinuousCDF};
 
 /// How seldom true values would be stated so badly that parameters are called implausible.
@@ -25,8 +25,8 @@ pub(crate) struct Deviation {
 
 impl Deviation {
     /// Of these values of all parameters, of which the first `own` are the machine's.
-    pub(crate) fn of(free: &[Free], own: usize, parameters: &[f64]) -> Deviation {
-        let of = |f: &Free| match f.prior {
+    pub(crate) fn of(free: &[FreeParameter], own: usize, parameters: &[f64]) -> Deviation {
+        let of = |f: &FreeParameter| match f.prior {
             Prior::Normal { .. } => Some(f.prior.at(parameters[f.index]).0.powi(2)),
             Prior::Flat | Prior::Cauchy { .. } => None,
         };
@@ -52,9 +52,10 @@ mod tests {
     use rand::SeedableRng;
     use rand_distr::{Distribution, StandardNormal};
 
-    fn stated(count: usize) -> Vec<Free> {
+    fn stated(count: usize) -> Vec<FreeParameter> {
         let prior = |i: usize| Prior::Normal { mean: i as f64, std: 0.1 + i as f64 };
-        let free = |i| Free { index: i, prior: prior(i), lower: f64::NEG_INFINITY, upper: f64::INFINITY };
+        let free =
+            |i| FreeParameter { index: i, prior: prior(i), lower: f64::NEG_INFINITY, upper: f64::INFINITY };
         (0..count).map(free).collect()
     }
 
@@ -64,7 +65,7 @@ mod tests {
         let none = Deviation { squares: 0.0, stated: 0 };
         for count in [1, 4] {
             let free = stated(count);
-            let draw = |f: &Free, rng: &mut rand_pcg::Pcg64| match f.prior {
+            let draw = |f: &FreeParameter, rng: &mut rand_pcg::Pcg64| match f.prior {
                 Prior::Normal { mean, std } => {
                     let z: f64 = StandardNormal.sample(rng);
                     mean + std * z

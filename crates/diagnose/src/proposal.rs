@@ -9,10 +9,10 @@
 use greybox_calibrate::Data;
 use greybox_model::Expr;
 
-use crate::along::Along;
 use crate::library::Mechanism;
 use crate::locate::{extent, time_of};
-use crate::search::{Fitted, Part, Search};
+use crate::search::{FittedModel, MechanismTerm, Search};
+use crate::trajectory::TrajectoryEval;
 use crate::uncertainty::Uncertainty;
 use crate::validate;
 
@@ -109,9 +109,9 @@ pub struct RejectedLaw {
 
 impl Rejected {
     /// The laws of a model that fails at a gate.
-    pub(crate) fn at(gate: Gate, search: &Search<'_>, fitted: &Fitted) -> Rejected {
+    pub(crate) fn at(gate: Gate, search: &Search<'_>, fitted: &FittedModel) -> Rejected {
         let tables = search.tabulated(fitted).map(|(_, instances)| instances);
-        let law = |(i, part): (usize, &Part)| RejectedLaw {
+        let law = |(i, part): (usize, &MechanismTerm)| RejectedLaw {
             kind: search.library[part.candidate.mechanism].kind.clone(),
             equations: part.candidate.place.equations(&search.nominal().model),
             expression: tables.as_ref().map_or(&part.instance, |tables| &tables[i]).expression.to_string(),
@@ -124,10 +124,10 @@ impl Proposal {
     /// Of the `proposed` parts of `improved`, whose parameters are as uncertain as said. States are those that it simulates
     /// of the training and of the held-out recordings; `calibrated` and `own` are the logarithms of the errors on each fold.
     pub(crate) fn of(
-        improved: &Fitted,
-        proposed: &[&Part],
+        improved: &FittedModel,
+        proposed: &[&MechanismTerm],
         library: &[Mechanism],
-        (train, held_out): (&Along<'_>, &Along<'_>),
+        (train, held_out): (&TrajectoryEval<'_>, &TrajectoryEval<'_>),
         (calibrated, own): (&[f64], &[f64]),
         uncertainty: &Uncertainty,
     ) -> Proposal {
@@ -144,7 +144,7 @@ impl Proposal {
         let folds = folds.map(|(left_out, errors)| Fold::of(data, &left_out, errors));
         // (The changes of a shape's slope are no figures of their own.)
         let formulas = proposed.iter().filter(|part| library[part.candidate.mechanism].shape.is_none());
-        let formulas: Vec<&Part> = formulas.copied().collect();
+        let formulas: Vec<&MechanismTerm> = formulas.copied().collect();
         let correlations = correlations(improved, &formulas, uncertainty);
         Proposal { ranges, outside, folds: folds.collect(), correlations }
     }
@@ -176,7 +176,7 @@ impl Fold {
 }
 
 /// The variables that the force of a part depends on: positions and rates.
-fn variables_of(improved: &Fitted, part: &Part, library: &[Mechanism]) -> Vec<Expr> {
+fn variables_of(improved: &FittedModel, part: &MechanismTerm, library: &[Mechanism]) -> Vec<Expr> {
     let mechanism = &library[part.candidate.mechanism];
     let model = &improved.setup.model;
     let of = |name: &str, primes: u8| {
@@ -192,11 +192,15 @@ fn variables_of(improved: &Fitted, part: &Part, library: &[Mechanism]) -> Vec<Ex
 }
 
 /// Ranges of the variables, and the share of the held-out samples where one of them is outside its own.
-fn ranges(variables: &[Expr], train: &Along<'_>, held_out: &Along<'_>) -> (Vec<Range>, f64) {
+fn ranges(
+    variables: &[Expr],
+    train: &TrajectoryEval<'_>,
+    held_out: &TrajectoryEval<'_>,
+) -> (Vec<Range>, f64) {
     let mut ranges = Vec::new();
     let mut any_outside: Vec<bool> = Vec::new();
     for variable in variables {
-        let values = |along: &Along<'_>| along.eval(std::slice::from_ref(variable), &[])?.pop();
+        let values = |along: &TrajectoryEval<'_>| along.eval(std::slice::from_ref(variable), &[])?.pop();
         let (Some(train), Some(held_out)) = (values(train), values(held_out)) else { continue };
         let (low, high) = extent(&train);
         let is_outside: Vec<bool> =
@@ -214,7 +218,11 @@ fn share(are: &[bool]) -> f64 {
 }
 
 /// For each parameter of the parts the parameter of the machine whose estimate is most correlated with its own.
-fn correlations(improved: &Fitted, parts: &[&Part], uncertainty: &Uncertainty) -> Vec<(String, Correlated)> {
+fn correlations(
+    improved: &FittedModel,
+    parts: &[&MechanismTerm],
+    uncertainty: &Uncertainty,
+) -> Vec<(String, Correlated)> {
     let setup = &improved.setup;
     let name = |free: usize| &setup.model.parameters[setup.free[free].index].name;
     let laws: Vec<&String> = improved.parts.iter().flat_map(|part| &part.instance.names).collect();

@@ -16,17 +16,17 @@
 use std::ops::Range;
 use std::sync::Arc;
 
-use greybox_calibrate::{Free, Level, Point, SegmentRows, Setup, qr};
+use greybox_calibrate::{FreeParameter, Point, SegmentRows, Segmentation, Setup, qr};
 use greybox_model::{Equation, Expr, Hold, Input, Measurement, Model, Parameter, State, System, Unit};
 use greybox_simulate::{Environment, Method, Seeds, Signal, SignalLanes, integrate};
 use rayon::prelude::*;
 
-use crate::along::Along;
 use crate::candidate::Candidate;
 use crate::library::{Mechanism, Scale};
 use crate::place::Place;
 use crate::shapes::evidence;
 use crate::spectra::Spectra;
+use crate::trajectory::TrajectoryEval;
 
 /// One candidate with one choice of its inner parameters, as columns of the regression.
 pub struct Variant {
@@ -40,7 +40,7 @@ pub struct Variant {
     pub columns: Range<usize>,
     /// The single column is the whole change (an input transformed), its coefficient 1 when the inner
     /// values are right; `Some(true)` when the coefficient may rescale the inner value.
-    pub secant: Option<bool>,
+    pub finite_difference: Option<bool>,
 }
 
 impl Variant {
@@ -69,7 +69,7 @@ pub struct Scored {
     /// Sizes of the inner parameters.
     pub scales: Vec<f64>,
     /// A tenth of the effect, from where a fit can go on when the first order promised too much.
-    pub faint: Option<Vec<f64>>,
+    pub reduced_start: Option<Vec<f64>>,
     /// The next best choices of the inner parameters: (gain, values, shift).
     pub others: Vec<(f64, Vec<f64>, Vec<f64>)>,
 }
@@ -86,7 +86,7 @@ pub enum Component {
 }
 
 /// Exogenous signals of a set of candidates.
-pub struct Lanes {
+pub struct CandidateResponses {
     /// Per piece.
     pub signals: Vec<Arc<SignalLanes>>,
     /// Each column is the sum of these lanes.
@@ -99,7 +99,7 @@ pub struct Lanes {
 pub fn inner_scales(
     mechanism: &Mechanism,
     candidate: &Candidate,
-    along: &Along<'_>,
+    along: &TrajectoryEval<'_>,
     setup: &Setup,
 ) -> Option<Vec<f64>> {
     let keep = |n: &str| n.to_string();
@@ -152,9 +152,9 @@ pub fn lanes(
     setup: &Setup,
     library: &[Mechanism],
     candidates: &[Candidate],
-    along: &Along<'_>,
+    along: &TrajectoryEval<'_>,
     spectra: &Spectra<'_>,
-) -> Lanes {
+) -> CandidateResponses {
     let made: Vec<Vec<(Variant, Vec<Vec<Component>>)>> = candidates
         .par_iter()
         .enumerate()
@@ -176,7 +176,7 @@ pub fn lanes(
         variant.columns = from..columns.len();
         variants.push(variant);
     }
-    Lanes { signals: signals(setup, &components), columns, variants }
+    CandidateResponses { signals: signals(setup, &components), columns, variants }
 }
 
 /// What a simulation adds, one lane for each component; per piece.
@@ -227,7 +227,7 @@ pub fn effect(
     setup: &Setup,
     mechanism: &Mechanism,
     candidate: &Candidate,
-    along: &Along<'_>,
+    along: &TrajectoryEval<'_>,
     values: &[f64],
 ) -> Option<Vec<Component>> {
     Law::new(setup, mechanism, candidate, along)?.components(values)
@@ -239,7 +239,7 @@ fn variants(
     mechanism: &Mechanism,
     candidate: &Candidate,
     index: usize,
-    along: &Along<'_>,
+    along: &TrajectoryEval<'_>,
     spectra: &Spectra<'_>,
 ) -> Vec<(Variant, Vec<Vec<Component>>)> {
     let mut out = Vec::new();
@@ -251,7 +251,7 @@ fn variants(
     for inner in grid(mechanism, candidate, &scales, spectra) {
         let count = mechanism.linear.len();
         let column = |linear: &[f64], inner: &[f64]| law.components(&mechanism.values(linear, inner)?);
-        let mut secant = None;
+        let mut finite_difference = None;
         let columns: Option<Vec<Vec<Component>>> = if count == 0 {
             let whole = column(&[], &inner);
             let size = |c: &Option<Vec<Component>>| c.as_deref().map_or(0.0, largest);
@@ -261,7 +261,7 @@ fn variants(
             if size(&whole) == 0.0 {
                 continue;
             }
-            secant = Some(vanishes);
+            finite_difference = Some(vanishes);
             whole.map(|c| vec![c])
         } else {
             (0..count)
@@ -272,14 +272,15 @@ fn variants(
                 .collect()
         };
         let Some(columns) = columns else { continue };
-        let variant = Variant { candidate: index, inner, scales: scales.clone(), columns: 0..0, secant };
+        let variant =
+            Variant { candidate: index, inner, scales: scales.clone(), columns: 0..0, finite_difference };
         out.push((variant, columns));
     }
     out
 }
 
 /// How often the motion turns round, small tremors not counted.
-fn reversals(candidate: &Candidate, along: &Along<'_>) -> usize {
+fn reversals(candidate: &Candidate, along: &TrajectoryEval<'_>) -> usize {
     let rate = candidate.motion().and_then(|m| m.rate.clone());
     let Some(rate) = rate.and_then(|e| along.eval(&[e], &[])?.pop()) else { return 0 };
     let n = rate.iter().map(Vec::len).sum::<usize>().max(1) as f64;
@@ -310,11 +311,11 @@ struct Law<'a> {
     setup: &'a Setup,
     mechanism: &'a Mechanism,
     candidate: &'a Candidate,
-    along: &'a Along<'a>,
+    along: &'a TrajectoryEval<'a>,
     /// The law less what it stands in for, the reaction; parameters marked.
     change: Vec<Expr>,
     marked: Vec<String>,
-    memory: Option<Recall>,
+    memory: Option<MechanismSimulator>,
     /// For a parameter: derivative of each equation's residual, along the states.
     slopes: Vec<(usize, Vec<Vec<f64>>)>,
 }
@@ -324,7 +325,7 @@ impl<'a> Law<'a> {
         setup: &'a Setup,
         mechanism: &'a Mechanism,
         candidate: &'a Candidate,
-        along: &'a Along<'a>,
+        along: &'a TrajectoryEval<'a>,
     ) -> Option<Law<'a>> {
         let model = &setup.model;
         // The file's own names may also be names of the model: mark them.
@@ -339,7 +340,7 @@ impl<'a> Law<'a> {
         let memory = if mechanism.states.is_empty() {
             None
         } else {
-            Some(Recall::new(setup, mechanism, candidate, along)?)
+            Some(MechanismSimulator::new(setup, mechanism, candidate, along)?)
         };
         let mut slopes = Vec::new();
         if let Place::Parameter(p) = &candidate.place {
@@ -413,7 +414,7 @@ fn unit(n: usize, at: usize) -> Vec<f64> {
 
 /// A mechanism with states, simulated with the motion that drives it given: a small model whose inputs are
 /// the placeholders along the machine's states and whose output is the law.
-struct Recall {
+struct MechanismSimulator {
     system: System,
     /// One environment per piece.
     environments: Vec<Environment>,
@@ -421,8 +422,13 @@ struct Recall {
     starts: Vec<Vec<f64>>,
 }
 
-impl Recall {
-    fn new(setup: &Setup, mechanism: &Mechanism, candidate: &Candidate, along: &Along<'_>) -> Option<Recall> {
+impl MechanismSimulator {
+    fn new(
+        setup: &Setup,
+        mechanism: &Mechanism,
+        candidate: &Candidate,
+        along: &TrajectoryEval<'_>,
+    ) -> Option<MechanismSimulator> {
         let keep = |n: &str| n.to_string();
         // Every placeholder in use becomes an input.
         let laws: Vec<&Expr> = std::iter::once(&mechanism.law).chain(&mechanism.reaction).collect();
@@ -508,7 +514,7 @@ impl Recall {
             })
             .collect();
         let starts = memory_starts(setup, mechanism, candidate, along, &model)?;
-        Some(Recall { system, environments, starts })
+        Some(MechanismSimulator { system, environments, starts })
     }
 
     /// The law (and the reaction) per piece.
@@ -535,7 +541,7 @@ fn memory_starts(
     setup: &Setup,
     mechanism: &Mechanism,
     candidate: &Candidate,
-    along: &Along<'_>,
+    along: &TrajectoryEval<'_>,
     model: &Model,
 ) -> Option<Vec<Vec<f64>>> {
     let keep = |n: &str| n.to_string();
@@ -560,7 +566,7 @@ pub fn first_states(
     setup: &Setup,
     mechanism: &Mechanism,
     candidate: &Candidate,
-    along: &Along<'_>,
+    along: &TrajectoryEval<'_>,
 ) -> Option<Vec<Vec<f64>>> {
     let mut model = setup.model.clone();
     let values = vec![1.0; mechanism.parameters().count()];
@@ -727,7 +733,7 @@ impl Gram {
     }
 
     /// Adds what is known of the parameters at these values, where a row's square is worth `weight` of the priors'.
-    pub fn add_priors(&mut self, free: &[Free], parameters: &[f64], weight: f64) {
+    pub fn add_priors(&mut self, free: &[FreeParameter], parameters: &[f64], weight: f64) {
         for (i, f) in free.iter().enumerate() {
             let (g, slope) = f.prior.at(parameters[f.index]);
             self.jj[i * self.np + i] += slope * slope / weight;
@@ -741,7 +747,7 @@ impl Gram {
 /// mutual products are wanted.
 pub fn gram(
     setup: &Setup,
-    level: &Level,
+    level: &Segmentation,
     scale: &[f64],
     point: &Point,
     signals: &[Arc<SignalLanes>],
@@ -992,11 +998,11 @@ fn lanes_at(
     setup: &Setup,
     library: &[Mechanism],
     candidates: &[Candidate],
-    level: &Level,
+    level: &Segmentation,
     scale: &[f64],
     point: &Point,
-) -> Lanes {
-    let (along, forces) = Along::observed(setup, level, scale, point);
+) -> CandidateResponses {
+    let (along, forces) = TrajectoryEval::observed(setup, level, scale, point);
     let spectra = Spectra::new(setup, level, scale, point, &along, &forces);
     lanes(setup, library, candidates, &along, &spectra)
 }
@@ -1006,10 +1012,10 @@ fn variants_at(
     setup: &Setup,
     library: &[Mechanism],
     candidates: &[Candidate],
-    level: &Level,
+    level: &Segmentation,
     scale: &[f64],
     point: &Point,
-) -> (Lanes, Gram) {
+) -> (CandidateResponses, Gram) {
     let lanes = lanes_at(setup, library, candidates, level, scale, point);
     let blocks: Vec<Range<usize>> = lanes.variants.iter().map(|v| v.columns.clone()).collect();
     let gram = gram(setup, level, scale, point, &lanes.signals, &lanes.columns, blocks);
@@ -1021,10 +1027,10 @@ fn responses(
     setup: &Setup,
     library: &[Mechanism],
     candidates: &[Candidate],
-    level: &Level,
+    level: &Segmentation,
     scale: &[f64],
     point: &Point,
-) -> (Lanes, Gram) {
+) -> (CandidateResponses, Gram) {
     let lanes = lanes_at(setup, library, candidates, level, scale, point);
     let whole = 0..lanes.columns.len();
     let gram = gram(setup, level, scale, point, &lanes.signals, &lanes.columns, vec![whole]);
@@ -1036,7 +1042,7 @@ fn responses(
 struct Regressions<'a> {
     library: &'a [Mechanism],
     candidates: &'a [Candidate],
-    lanes: Lanes,
+    lanes: CandidateResponses,
     np: usize,
     /// What the parameters do for each column, and for the residual.
     solved: Vec<Vec<f64>>,
@@ -1055,7 +1061,7 @@ impl<'a> Regressions<'a> {
         setup: &Setup,
         library: &'a [Mechanism],
         candidates: &'a [Candidate],
-        level: &Level,
+        level: &Segmentation,
         scale: &[f64],
         point: &Point,
     ) -> Regressions<'a> {
@@ -1066,7 +1072,7 @@ impl<'a> Regressions<'a> {
     fn of(
         library: &'a [Mechanism],
         candidates: &'a [Candidate],
-        lanes: Lanes,
+        lanes: CandidateResponses,
         gram: &Gram,
     ) -> Regressions<'a> {
         let n = lanes.columns.len();
@@ -1081,7 +1087,7 @@ impl<'a> Regressions<'a> {
     /// Which of a variant's coefficients cannot be negative.
     fn positive(&self, v: &Variant) -> Vec<bool> {
         let mechanism = &self.library[self.candidates[v.candidate].mechanism];
-        match v.secant {
+        match v.finite_difference {
             Some(_) => vec![true],
             None => mechanism.linear.iter().map(|l| mechanism.positive.contains(l)).collect(),
         }
@@ -1114,7 +1120,7 @@ impl<'a> Regressions<'a> {
     /// A variant with these coefficients of its columns.
     fn member(&self, variant: &Variant, c: &[f64], gain: f64) -> Option<Scored> {
         let mechanism = &self.library[self.candidates[variant.candidate].mechanism];
-        let values = match variant.secant {
+        let values = match variant.finite_difference {
             None => mechanism.values(c, &variant.inner),
             Some(true) if c[0] < 3.0 => mechanism.values(&[], &variant.scaled(mechanism, c[0])),
             Some(_) => mechanism.values(&[], &variant.inner),
@@ -1125,7 +1131,7 @@ impl<'a> Regressions<'a> {
             values,
             shift: vec![0.0; self.np],
             scales: variant.scales.clone(),
-            faint: None,
+            reduced_start: None,
             others: Vec::new(),
         })
     }
@@ -1154,7 +1160,7 @@ pub fn screen_pairs(
     setup: &Setup,
     library: &[Mechanism],
     candidates: &[Candidate],
-    level: &Level,
+    level: &Segmentation,
     scale: &[f64],
     point: &Point,
     most: usize,
@@ -1210,7 +1216,7 @@ pub fn screen_set(
     setup: &Setup,
     library: &[Mechanism],
     candidates: &[Candidate],
-    level: &Level,
+    level: &Segmentation,
     scale: &[f64],
     point: &Point,
     most: usize,
@@ -1250,7 +1256,7 @@ pub(crate) fn screen_shapes(
     setup: &Setup,
     library: &[Mechanism],
     candidates: &[Candidate],
-    level: &Level,
+    level: &Segmentation,
     scale: &[f64],
     point: &Point,
     weight: f64,
@@ -1293,7 +1299,7 @@ pub(crate) fn screen_shapes(
             values,
             shift: shift.clone(),
             scales: variant.scales.clone(),
-            faint: None,
+            reduced_start: None,
             others: Vec::new(),
         };
         Some((evidence, Together { members: vec![scored], gain, shift }))
@@ -1329,7 +1335,7 @@ pub(crate) fn reselect(
     setup: &Setup,
     library: &[Mechanism],
     candidates: &[Candidate],
-    level: &Level,
+    level: &Segmentation,
     scale: &[f64],
     point: &Point,
     held: &[Held],
@@ -1345,7 +1351,7 @@ pub(crate) fn reselect(
         lanes
             .variants
             .iter()
-            .position(|v| v.candidate == candidate && v.columns.len() == 1 && v.secant.is_none())
+            .position(|v| v.candidate == candidate && v.columns.len() == 1 && v.finite_difference.is_none())
     };
     let chosen: Vec<usize> = held.iter().map(|h| single(h.candidate)).collect::<Option<_>>()?;
     let did: Vec<(usize, f64)> =
@@ -1390,7 +1396,7 @@ pub(crate) fn reselect(
 /// First-order shift of the other free parameters when those at these positions go to zero from `values`.
 pub fn shift_without(
     setup: &Setup,
-    level: &Level,
+    level: &Segmentation,
     scale: &[f64],
     point: &Point,
     gone: &[(usize, f64)],
@@ -1404,7 +1410,7 @@ pub fn screen(
     setup: &Setup,
     library: &[Mechanism],
     candidates: &[Candidate],
-    level: &Level,
+    level: &Segmentation,
     scale: &[f64],
     point: &Point,
 ) -> Vec<Scored> {
@@ -1413,28 +1419,33 @@ pub fn screen(
 }
 
 /// What the inner products say of every candidate, best first.
-pub fn scored(library: &[Mechanism], candidates: &[Candidate], lanes: &Lanes, gram: &Gram) -> Vec<Scored> {
+pub fn scored(
+    library: &[Mechanism],
+    candidates: &[Candidate],
+    lanes: &CandidateResponses,
+    gram: &Gram,
+) -> Vec<Scored> {
     let mut found: Vec<Vec<Scored>> = vec![Vec::new(); candidates.len()];
     for (index, variant) in lanes.variants.iter().enumerate() {
         let candidate = &candidates[variant.candidate];
         let mechanism = &library[candidate.mechanism];
-        let positive: Vec<bool> = if variant.secant.is_some() {
+        let positive: Vec<bool> = if variant.finite_difference.is_some() {
             vec![true]
         } else {
             mechanism.linear.iter().map(|n| mechanism.positive.contains(n)).collect()
         };
         let Some(regressed) = gram.regress(index, &positive, 0.0) else { continue };
-        let mut faint = None;
-        let (gain, values) = match variant.secant {
+        let mut reduced_start = None;
+        let (gain, values) = match variant.finite_difference {
             None => {
                 let tenth: Vec<f64> = regressed.coefficients.iter().map(|c| 0.1 * c).collect();
-                faint = mechanism.values(&tenth, &variant.inner);
+                reduced_start = mechanism.values(&tenth, &variant.inner);
                 (regressed.gain, mechanism.values(&regressed.coefficients, &variant.inner))
             }
             Some(scalable) => {
                 let c = regressed.coefficients[0];
                 if scalable {
-                    faint = mechanism.values(&[], &variant.scaled(mechanism, 0.2 * c.min(1.0)));
+                    reduced_start = mechanism.values(&[], &variant.scaled(mechanism, 0.2 * c.min(1.0)));
                 }
                 if scalable && c < 3.0 {
                     (regressed.gain, mechanism.values(&[], &variant.scaled(mechanism, c)))
@@ -1455,7 +1466,7 @@ pub fn scored(library: &[Mechanism], candidates: &[Candidate], lanes: &Lanes, gr
             values,
             shift: regressed.shift,
             scales: variant.scales.clone(),
-            faint,
+            reduced_start,
             others: Vec::new(),
         });
     }

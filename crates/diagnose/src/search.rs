@@ -5,23 +5,28 @@ use std::cell::LazyCell;
 use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, Ordering};
 
-use greybox_calibrate::{Ending, Fit, Free, Level, Limits, Point, Setup, Work, free_parameters, qr};
+use greybox_calibrate::{
+    Ending, Fit, FreeParameter, Limits, Point, Segmentation, Setup, Work, free_parameters, qr,
+};
 use greybox_model::system::CompileError;
 use greybox_model::{Hold, Model};
 use rayon::prelude::*;
 
-use crate::along::Along;
 use crate::candidate::{Candidate, Instance, candidates};
-use crate::evidence::{Evidence, Side, Smoothness, folds, kappa, least_kappa, robust, weigh};
+use crate::evidence::{
+    ComparedModel, Evidence, Smoothness, effective_sample_ratio, folds, least_effective_sample_ratio, robust,
+    weigh,
+};
 use crate::explore::{Belief, Explorer, Hypothesis, Posterior};
 use crate::library::Mechanism;
 use crate::place::{Place, places};
 use crate::plausibility::Deviation;
 use crate::screen::{Scored, Together, first_states, first_values, inner_scales, screen, screen_pairs};
 use crate::temperature::AnyScale;
+use crate::trajectory::TrajectoryEval;
 use crate::uncertainty::Uncertainty;
 use crate::validate::{Gain, errors};
-use crate::{Observer, Stage, Weighed};
+use crate::{ProgressListener, Stage, Weighed};
 
 /// Number of segments of the first and last level, where nothing else decides.
 const SEGMENTS: (usize, usize) = (60, 4);
@@ -112,7 +117,7 @@ const LEAST_SHARE: f64 = 7e-4;
 
 /// A mechanism in a model, with the sizes its inner parameters are searched at.
 #[derive(Debug, Clone, PartialEq)]
-pub struct Part {
+pub struct MechanismTerm {
     /// What and where.
     pub candidate: Candidate,
     /// As it stands in the model.
@@ -130,9 +135,9 @@ pub(crate) fn is_same(a: &[Candidate], b: &[Candidate]) -> bool {
 }
 
 /// The laws of a model with the values that its parameters give them.
-pub(crate) fn laws(parts: &[Part], model: &Model, parameters: &[f64]) -> Vec<Law> {
+pub(crate) fn laws(parts: &[MechanismTerm], model: &Model, parameters: &[f64]) -> Vec<Law> {
     let value = |name: &String| model.parameter(name).map(|i| parameters[i]);
-    let law = |part: &Part| {
+    let law = |part: &MechanismTerm| {
         let values = part.instance.names.iter().filter_map(value).collect();
         (part.candidate.clone(), values, part.scales.clone())
     };
@@ -141,18 +146,18 @@ pub(crate) fn laws(parts: &[Part], model: &Model, parameters: &[f64]) -> Vec<Law
 
 /// A model fitted at a level.
 #[derive(Debug, Clone)]
-pub struct Fitted {
+pub struct FittedModel {
     /// Model, data, free parameters.
     pub setup: Setup,
     /// Mechanisms beyond the nominal equations.
-    pub parts: Vec<Part>,
+    pub parts: Vec<MechanismTerm>,
     /// The segments.
-    pub level: Level,
+    pub level: Segmentation,
     /// The fit; its `rss` is in units of the scale it was fitted with.
     pub fit: Fit,
 }
 
-impl Fitted {
+impl FittedModel {
     /// Residual sum of squares over all channels, in units of the fit's scale.
     pub(crate) fn rss(&self) -> f64 {
         self.fit.rss.iter().sum()
@@ -163,15 +168,18 @@ impl Fitted {
         rms(&self.fit, scale).iter().zip(&self.setup.data.sigma).map(|(r, s)| r / s).fold(0.0, f64::max)
     }
 
-    /// Whether a residual with information `kappa` per sample is white, and no larger than the noise.
-    fn is_white(&self, kappa: f64, scale: &[f64]) -> bool {
-        kappa > WHITE && self.misfit(scale) < STUCK
+    /// Whether a residual with this ratio of independent samples is white, and no larger than the noise.
+    fn is_white(&self, effective_sample_ratio: f64, scale: &[f64]) -> bool {
+        effective_sample_ratio > WHITE && self.misfit(scale) < STUCK
     }
 
     /// Whether nothing is left over but white noise, for which no noise model had to stand in.
     pub fn leaves_white_noise(&self, scale: &[f64]) -> bool {
         self.setup.noise.is_none()
-            && self.is_white(least_kappa(&self.setup, &self.level, scale, &self.fit.point), scale)
+            && self.is_white(
+                least_effective_sample_ratio(&self.setup, &self.level, scale, &self.fit.point),
+                scale,
+            )
     }
 }
 
@@ -190,7 +198,7 @@ pub struct Rival {
 
 /// An accepted mechanism with the evidence for it.
 #[derive(Debug, Clone)]
-pub struct Accepted {
+pub struct SelectedTerm {
     /// What and where.
     pub candidate: Candidate,
     /// Evidence when it was accepted.
@@ -202,11 +210,11 @@ pub struct Accepted {
 /// Result of the search.
 pub struct Found {
     /// The nominal equations with fitted parameters, at the last level.
-    pub calibrated: Fitted,
+    pub calibrated: FittedModel,
     /// With the mechanisms.
-    pub improved: Fitted,
+    pub improved: FittedModel,
     /// Evidence for each part of `improved`, in the same order.
-    pub accepted: Vec<Accepted>,
+    pub accepted: Vec<SelectedTerm>,
     /// Holds that explain the recording better than the stated ones: (input, stated, better).
     pub better_holds: Vec<(usize, Hold, Hold)>,
     /// Residual scale of the improved model per channel, SI.
@@ -214,7 +222,7 @@ pub struct Found {
     /// The work ran out before the search had come to its end.
     pub limited: bool,
     /// With the best single candidate, and the best pair, of the last round that found nothing to be believed.
-    pub rejected: Vec<Fitted>,
+    pub rejected: Vec<FittedModel>,
     /// The mechanisms are believed beside an error of the model, by their posterior probability.
     pub errs: bool,
     /// The improved model is a closure: a sum of terms that is proposed as a whole.
@@ -226,7 +234,7 @@ pub struct Search<'a> {
     /// The mechanisms.
     pub library: &'a [Mechanism],
     /// Watches.
-    pub observer: &'a dyn Observer,
+    pub listener: &'a dyn ProgressListener,
     /// Never try another hold than the stated ones.
     pub keep_holds: bool,
     /// Work ([`greybox_calibrate::Work`]) after which nothing more is looked for.
@@ -271,7 +279,7 @@ fn lengths(setup: &Setup) -> Vec<usize> {
 }
 
 /// Samples of the longest segment.
-fn longest(level: &Level) -> usize {
+fn longest(level: &Segmentation) -> usize {
     level.segments.iter().map(|s| s.range.len()).max().unwrap_or(0)
 }
 
@@ -299,7 +307,7 @@ pub(crate) fn carried(from: &Setup, old: &[f64], to: &Setup, fresh: &[f64], unkn
 /// Start values for another model of the same data; new states get those of `fresh`, per piece.
 fn transfer(
     from: &Setup,
-    level: &Level,
+    level: &Segmentation,
     starts: &[Vec<f64>],
     to: &Setup,
     fresh: &[Vec<f64>],
@@ -310,9 +318,9 @@ fn transfer(
 }
 
 /// The same segments with the priors of another model's states.
-pub(crate) fn same_level(setup: &Setup, level: &Level) -> Level {
+pub(crate) fn same_level(setup: &Setup, level: &Segmentation) -> Segmentation {
     let priors = level.segments.iter().map(|s| setup.start_prior(s.piece, s.range.start)).collect();
-    Level { segments: level.segments.clone(), priors }
+    Segmentation { segments: level.segments.clone(), priors }
 }
 
 /// Residual RMS per channel in SI.
@@ -331,7 +339,7 @@ pub fn next_scale(fit: &Fit, scale: &[f64], sigma: &[f64]) -> Vec<f64> {
 
 impl<'a> Search<'a> {
     /// Prepares the search for a laid-out nominal model.
-    pub fn new(nominal: Setup, library: &'a [Mechanism], observer: &'a dyn Observer) -> Search<'a> {
+    pub fn new(nominal: Setup, library: &'a [Mechanism], listener: &'a dyn ProgressListener) -> Search<'a> {
         let places = places(&nominal.model);
         let mut all = candidates(&nominal.model, library, &places);
         let samples: usize = nominal.data.lengths().iter().sum();
@@ -350,7 +358,7 @@ impl<'a> Search<'a> {
         let lengths = lengths(&nominal);
         Search {
             library,
-            observer,
+            listener,
             keep_holds: false,
             most_work: MOST_WORK,
             limited: AtomicBool::new(false),
@@ -383,7 +391,7 @@ impl<'a> Search<'a> {
     }
 
     /// How far the machine's own parameters are from what the model states of them.
-    pub(crate) fn deviation(&self, fitted: &Fitted) -> Deviation {
+    pub(crate) fn deviation(&self, fitted: &FittedModel) -> Deviation {
         let machine = self.nominal.model.parameters.len();
         Deviation::of(&fitted.setup.free, machine, &fitted.fit.point.parameters)
     }
@@ -395,12 +403,12 @@ impl<'a> Search<'a> {
         parameters: &[f64],
         parts: &[Law],
         from: &Setup,
-    ) -> Result<(Setup, Vec<Part>), CompileError> {
+    ) -> Result<(Setup, Vec<MechanismTerm>), CompileError> {
         let mut model: Model = self.nominal.model.clone();
         for (input, hold) in model.inputs.iter_mut().zip(holds) {
             input.hold = *hold;
         }
-        let mut free: Vec<Free> = free_parameters(&self.nominal.model);
+        let mut free: Vec<FreeParameter> = free_parameters(&self.nominal.model);
         for (p, v) in model.parameters.iter_mut().zip(parameters) {
             p.value = *v;
         }
@@ -410,9 +418,10 @@ impl<'a> Search<'a> {
             let first = model.parameters.len();
             let instance = candidate.insert(&mut model, mechanism, values);
             free.extend(candidate.free(mechanism, first, scales));
-            out.push(Part { candidate: candidate.clone(), instance, scales: scales.clone() });
+            out.push(MechanismTerm { candidate: candidate.clone(), instance, scales: scales.clone() });
         }
-        let memory: Vec<String> = out.iter().flat_map(|p: &Part| p.instance.states.clone()).collect();
+        let memory: Vec<String> =
+            out.iter().flat_map(|p: &MechanismTerm| p.instance.states.clone()).collect();
         let setup = from.with_model(model, free)?;
         // The names come from the model itself.
         let setup = setup.with_carried(&memory).unwrap_or(setup);
@@ -421,8 +430,8 @@ impl<'a> Search<'a> {
 
     /// A model whose free shapes are tables, with the numbers of their functions, and the instances of its parts in it. `None`
     /// where it has none.
-    pub(crate) fn tabulated(&self, fitted: &Fitted) -> Option<(Model, Vec<Instance>)> {
-        let law = |part: &Part| &self.library[part.candidate.mechanism];
+    pub(crate) fn tabulated(&self, fitted: &FittedModel) -> Option<(Model, Vec<Instance>)> {
+        let law = |part: &MechanismTerm| &self.library[part.candidate.mechanism];
         if !fitted.parts.iter().any(|part| law(part).shape.is_some()) {
             return None;
         }
@@ -449,12 +458,12 @@ impl<'a> Search<'a> {
     }
 
     /// The laws of a fitted model with their present values.
-    pub(crate) fn laws(&self, fitted: &Fitted) -> Vec<Law> {
+    pub(crate) fn laws(&self, fitted: &FittedModel) -> Vec<Law> {
         laws(&fitted.parts, &fitted.setup.model, &fitted.fit.point.parameters)
     }
 
     /// An integration method whose error is a fiftieth of the residual.
-    pub(crate) fn method(&self, fitted: &mut Fitted, scale: &[f64]) {
+    pub(crate) fn method(&self, fitted: &mut FittedModel, scale: &[f64]) {
         for (p, v) in fitted.setup.model.parameters.iter_mut().zip(&fitted.fit.point.parameters) {
             p.value = *v;
         }
@@ -463,34 +472,40 @@ impl<'a> Search<'a> {
     }
 
     /// The model fitted at another level, from the stitched trajectory or the measurements.
-    fn relevel(&self, fitted: &Fitted, level: Level, scale: &[f64], iterations: usize) -> Fitted {
+    fn relevel(
+        &self,
+        fitted: &FittedModel,
+        level: Segmentation,
+        scale: &[f64],
+        iterations: usize,
+    ) -> FittedModel {
         let level = same_level(&fitted.setup, &level);
         let fit = fitted.setup.lengthen(&fitted.level, &fitted.fit.point, &level, scale, limits(iterations));
-        Fitted { level, fit, ..fitted.clone() }
+        FittedModel { level, fit, ..fitted.clone() }
     }
 
-    pub(crate) fn refit(&self, fitted: &Fitted, scale: &[f64], iterations: usize) -> Fitted {
+    pub(crate) fn refit(&self, fitted: &FittedModel, scale: &[f64], iterations: usize) -> FittedModel {
         let point = fitted.fit.point.clone();
         let fit = fitted.setup.fit(&fitted.level, scale, &[point], limits(iterations));
-        Fitted { fit, ..fitted.clone() }
+        FittedModel { fit, ..fitted.clone() }
     }
 
     /// Fits `base` plus several candidates, the parameters as they are: from the values of all together, by each of these
     /// `factors` (how much of the strengths, how much of the shift of the parameters that goes with them).
     pub(crate) fn extend_by(
         &self,
-        base: &Fitted,
+        base: &FittedModel,
         open: &[Candidate],
         together: &Together,
         factors: &[(f64, f64)],
         scale: &[f64],
         iterations: usize,
-    ) -> Option<Fitted> {
+    ) -> Option<FittedModel> {
         let n0 = self.nominal.model.parameters.len();
         let old = &base.fit.point;
         let mut parts = self.laws(base);
         let mut fresh: Vec<Vec<f64>> = vec![Vec::new(); base.setup.data.pieces.len()];
-        let along = LazyCell::new(|| Along::smoothed(&base.setup, &base.level, scale, old));
+        let along = LazyCell::new(|| TrajectoryEval::smoothed(&base.setup, &base.level, scale, old));
         for member in &together.members {
             let candidate = &open[member.candidate];
             let mechanism = &self.library[candidate.mechanism];
@@ -518,37 +533,37 @@ impl<'a> Search<'a> {
         };
         let points: Vec<Point> = factors.iter().map(point).collect();
         let fit = setup.fit(&level, scale, &points, limits(iterations));
-        let fitted = Fitted { setup, parts, level, fit };
+        let fitted = FittedModel { setup, parts, level, fit };
         (fitted.fit.cost.is_finite() && self.admissible(&fitted, scale)).then_some(fitted)
     }
 
     /// Fits `base` plus two candidates, from the values that they have together.
     fn extend_by_pair(
         &self,
-        base: &Fitted,
+        base: &FittedModel,
         open: &[Candidate],
         pair: &Together,
         scale: &[f64],
-    ) -> Option<Fitted> {
+    ) -> Option<FittedModel> {
         self.extend_by(base, open, pair, &[(1.0, 0.0)], scale, 20)
     }
 
     /// Complexity of all mechanisms of a model.
-    fn complexity(&self, fitted: &Fitted) -> f64 {
+    fn complexity(&self, fitted: &FittedModel) -> f64 {
         fitted.parts.iter().map(|p| self.library[p.candidate.mechanism].complexity()).sum()
     }
 
     /// Whether every mechanism's requirements on its parameters hold, and no inertia is negative.
-    pub(crate) fn admissible(&self, fitted: &Fitted, scale: &[f64]) -> bool {
+    pub(crate) fn admissible(&self, fitted: &FittedModel, scale: &[f64]) -> bool {
         self.is_admissible(&fitted.parts, &fitted.setup, &fitted.level, &fitted.fit.point, scale)
     }
 
     /// The same of parts in a model at a point of a level.
     pub(crate) fn is_admissible(
         &self,
-        parts: &[Part],
+        parts: &[MechanismTerm],
         setup: &Setup,
-        level: &Level,
+        level: &Segmentation,
         point: &Point,
         scale: &[f64],
     ) -> bool {
@@ -557,7 +572,7 @@ impl<'a> Search<'a> {
     }
 
     /// Whether a mechanism's requirements on its parameters hold at these values of the model's.
-    fn allows(&self, part: &Part, setup: &Setup, parameters: &[f64]) -> bool {
+    fn allows(&self, part: &MechanismTerm, setup: &Setup, parameters: &[f64]) -> bool {
         let mechanism = &self.library[part.candidate.mechanism];
         let value = |n: &str| {
             let i = mechanism.parameters().position(|p| p == n)?;
@@ -585,7 +600,7 @@ impl<'a> Search<'a> {
 
     /// When no single candidate is believable and yet something is missing: the best pairs of those that
     /// only pay together.
-    fn pair_round(&self, calibrated: &mut Fitted, state: &mut State) -> bool {
+    fn pair_round(&self, calibrated: &mut FittedModel, state: &mut SearchState) -> bool {
         if state.current.parts.len() + 2 > MOST_MECHANISMS || state.misfit() < PAIR_MISFIT {
             return false;
         }
@@ -602,15 +617,15 @@ impl<'a> Search<'a> {
             &current.fit.point,
             PAIRS,
         );
-        self.observer.stage(Stage::Fitting { candidates: pairs.len() });
-        let trials: Vec<Fitted> =
+        self.listener.stage(Stage::Fitting { candidates: pairs.len() });
+        let trials: Vec<FittedModel> =
             pairs.par_iter().filter_map(|p| self.extend_by_pair(&current, &open, p, &scale)).collect();
         let Some(best) = trials.into_iter().min_by(|a, b| a.rss().total_cmp(&b.rss())) else {
             return false;
         };
         // (Beside a single candidate that was not believed either.)
         state.rejected.push(best.clone());
-        let control = self.control(&current, &best, &scale);
+        let control = self.refit_baseline(&current, &best, &scale);
         let evidence = self.weigh(&control, &best, &scale);
         let share = (control.rss() - best.rss()) / calibrated_rss(calibrated, &scale).max(1e-300);
         let first = current.parts.is_empty();
@@ -622,14 +637,18 @@ impl<'a> Search<'a> {
         let believable = samples >= PAIR_SAMPLES
             && evidence.score > self.threshold(2)
             && members.iter().all(|part| {
-                self.believable(&evidence, &self.library[part.candidate.mechanism], share, first, false)
+                self.accepts(&evidence, &self.library[part.candidate.mechanism], share, first, false)
             });
         self.tell((&control, &best), &kinds, &evidence, &scale, believable);
         if !believable {
             return false;
         }
         for part in members {
-            state.accepted.push(Accepted { candidate: part.candidate.clone(), evidence, rivals: Vec::new() });
+            state.accepted.push(SelectedTerm {
+                candidate: part.candidate.clone(),
+                evidence,
+                rivals: Vec::new(),
+            });
         }
         state.current = best;
         self.settle(state);
@@ -639,12 +658,12 @@ impl<'a> Search<'a> {
     /// Fits `base` plus one candidate.
     fn extend(
         &self,
-        base: &Fitted,
+        base: &FittedModel,
         candidate: &Candidate,
         scored: &Scored,
         scale: &[f64],
         iterations: usize,
-    ) -> Option<Fitted> {
+    ) -> Option<FittedModel> {
         let n0 = self.nominal.model.parameters.len();
         let mut parts = self.laws(base);
         parts.push((candidate.clone(), scored.values.clone(), scored.scales.clone()));
@@ -663,7 +682,7 @@ impl<'a> Search<'a> {
         let fresh = if mechanism.states.is_empty() {
             Vec::new()
         } else {
-            let along = Along::smoothed(&base.setup, &base.level, scale, &base.fit.point);
+            let along = TrajectoryEval::smoothed(&base.setup, &base.level, scale, &base.fit.point);
             first_states(&base.setup, mechanism, candidate, &along)?
         };
         let level = same_level(&setup, &base.level);
@@ -673,9 +692,9 @@ impl<'a> Search<'a> {
             let tolerance: Vec<f64> = scale.iter().map(|s| 0.05 * s).collect();
             setup.choose_method(&tolerance, longest(&level));
         }
-        let mut hats = setup.starts(&level, &shifted);
+        let mut starts = setup.starts(&level, &shifted);
         // What the mechanism remembers has its own likely start.
-        for (h, k) in hats.iter_mut().zip(&kept) {
+        for (h, k) in starts.iter_mut().zip(&kept) {
             for (j, state) in setup.model.states.iter().enumerate() {
                 if base.setup.model.state(&state.name).is_none() {
                     let at = setup.system.offsets[j]..setup.system.offsets[j] + state.order;
@@ -686,11 +705,11 @@ impl<'a> Search<'a> {
         let mut points = vec![
             Point { parameters: shifted.clone(), starts: kept.clone() },
             Point { parameters: plain, starts: kept.clone() },
-            Point { parameters: shifted, starts: hats },
+            Point { parameters: shifted, starts },
         ];
         // Less of it, and other choices of the inner parameters: the score test is only of first order.
-        if let Some(faint) = &scored.faint {
-            let parameters = old.parameters.iter().chain(faint).copied().collect();
+        if let Some(reduced_start) = &scored.reduced_start {
+            let parameters = old.parameters.iter().chain(reduced_start).copied().collect();
             points.push(Point { parameters, starts: kept.clone() });
         }
         for (_, values, shift) in &scored.others {
@@ -711,11 +730,17 @@ impl<'a> Search<'a> {
             }
         }
         let fit = setup.fit(&level, scale, &points, limits(iterations));
-        fit.cost.is_finite().then(|| Fitted { setup, parts, level, fit })
+        fit.cost.is_finite().then(|| FittedModel { setup, parts, level, fit })
     }
 
     /// `fitted` without part `index`, refitted.
-    fn without(&self, fitted: &Fitted, index: usize, scale: &[f64], iterations: usize) -> Option<Fitted> {
+    fn without(
+        &self,
+        fitted: &FittedModel,
+        index: usize,
+        scale: &[f64],
+        iterations: usize,
+    ) -> Option<FittedModel> {
         let mut parts = self.laws(fitted);
         parts.remove(index);
         self.reassembled(fitted, &parts, scale, iterations)
@@ -724,23 +749,23 @@ impl<'a> Search<'a> {
     /// The model with other parts at these values, from a fit's parameters.
     fn reassembled(
         &self,
-        fitted: &Fitted,
+        fitted: &FittedModel,
         parts: &[Law],
         scale: &[f64],
         iterations: usize,
-    ) -> Option<Fitted> {
+    ) -> Option<FittedModel> {
         self.reassembled_from(fitted, parts, Vec::new(), scale, iterations)
     }
 
     /// [`reassembled`](Self::reassembled) from there or from one of the `others`, values of all parameters.
     pub(crate) fn reassembled_from(
         &self,
-        fitted: &Fitted,
+        fitted: &FittedModel,
         parts: &[Law],
         others: Vec<Vec<f64>>,
         scale: &[f64],
         iterations: usize,
-    ) -> Option<Fitted> {
+    ) -> Option<FittedModel> {
         let n0 = self.nominal.model.parameters.len();
         let head = &fitted.fit.point.parameters[..n0];
         let (setup, kept) = self.assemble(&fitted.setup.holds, head, parts, &fitted.setup).ok()?;
@@ -753,20 +778,20 @@ impl<'a> Search<'a> {
             .map(|parameters| Point { parameters, starts: starts.clone() })
             .collect();
         let fit = setup.fit(&level, scale, &points, limits(iterations));
-        Some(Fitted { setup, parts: kept, level, fit })
+        Some(FittedModel { setup, parts: kept, level, fit })
     }
 
     /// Tries the other holds of every input; switches where the cost falls by more than `margin`.
-    pub(crate) fn redecide_holds(&self, fitted: &Fitted, scale: &[f64], margin: f64) -> Fitted {
+    pub(crate) fn redecide_holds(&self, fitted: &FittedModel, scale: &[f64], margin: f64) -> FittedModel {
         let mut best = fitted.clone();
         if self.keep_holds {
             return best;
         }
-        let gain = |from: &Fitted, to: &Fitted| -> f64 {
-            let kappa = kappa(&to.setup, &to.level, scale, &to.fit.point);
-            (0..kappa.len())
+        let gain = |from: &FittedModel, to: &FittedModel| -> f64 {
+            let ratios = effective_sample_ratio(&to.setup, &to.level, scale, &to.fit.point);
+            (0..ratios.len())
                 .filter(|&c| to.fit.rss[c] > 0.0 && from.fit.rss[c] > 0.0)
-                .map(|c| to.fit.count[c] as f64 * kappa[c] * (from.fit.rss[c] / to.fit.rss[c]).ln())
+                .map(|c| to.fit.count[c] as f64 * ratios[c] * (from.fit.rss[c] / to.fit.rss[c]).ln())
                 .sum()
         };
         // What the model states counts unless the data speak clearly: another hold may have stood in for a
@@ -776,7 +801,7 @@ impl<'a> Search<'a> {
             if best.setup.holds[i] != stated {
                 let mut holds = best.setup.holds.clone();
                 holds[i] = stated;
-                let trial = Fitted { setup: best.setup.with_holds(holds), ..best.clone() };
+                let trial = FittedModel { setup: best.setup.with_holds(holds), ..best.clone() };
                 let trial = self.refit(&trial, scale, 10);
                 if gain(&trial, &best) < HOLD_GAIN {
                     best = trial;
@@ -793,7 +818,7 @@ impl<'a> Search<'a> {
                 }
                 let mut holds = best.setup.holds.clone();
                 holds[i] = hold;
-                let trial = Fitted { setup: best.setup.with_holds(holds), ..best.clone() };
+                let trial = FittedModel { setup: best.setup.with_holds(holds), ..best.clone() };
                 let trial = self.refit(&trial, scale, 4);
                 if trial.fit.cost < best.fit.cost * (1.0 - margin) {
                     // Significant for the information that a correlated residual holds, or else the
@@ -807,28 +832,34 @@ impl<'a> Search<'a> {
         best
     }
 
-    fn weigh(&self, old: &Fitted, new: &Fitted, scale: &[f64]) -> Evidence {
-        let kappa = kappa(&new.setup, &new.level, scale, &new.fit.point);
-        self.weigh_with(old, new, scale, &kappa)
+    fn weigh(&self, old: &FittedModel, new: &FittedModel, scale: &[f64]) -> Evidence {
+        let ratios = effective_sample_ratio(&new.setup, &new.level, scale, &new.fit.point);
+        self.weigh_with(old, new, scale, &ratios)
     }
 
     /// The evidence for `new` over `old`; where residuals are whitened, by the profile likelihood: each
     /// model with the noise model that suits its own residual.
-    fn weigh_with(&self, old: &Fitted, new: &Fitted, scale: &[f64], kappa: &[f64]) -> Evidence {
+    fn weigh_with(
+        &self,
+        old: &FittedModel,
+        new: &FittedModel,
+        scale: &[f64],
+        effective_sample_ratio: &[f64],
+    ) -> Evidence {
         let (before, after) = (self.side(old, new, scale), self.side(new, new, scale));
-        let folds = |f: &Fitted| folds(&f.setup, &f.level, scale, &f.fit.point);
+        let folds = |f: &FittedModel| folds(&f.setup, &f.level, scale, &f.fit.point);
         let whitened = new.setup.noise.is_some();
-        weigh((&before, &folds(old)), (&after, &folds(new)), &new.fit.count, kappa, whitened)
+        weigh((&before, &folds(old)), (&after, &folds(new)), &new.fit.count, effective_sample_ratio, whitened)
     }
 
     /// What a comparison that ends at `new` knows of a model.
-    fn side(&self, of: &Fitted, new: &Fitted, scale: &[f64]) -> Side {
+    fn side(&self, of: &FittedModel, new: &FittedModel, scale: &[f64]) -> ComparedModel {
         let rss = if new.setup.noise.is_some() { innovations(of, scale) } else { of.fit.rss.clone() };
         let mechanisms = || of.parts.iter().map(|part| &self.library[part.candidate.mechanism]);
         // (Of a free shape its size alone: the rest has a prior.)
         let parameters =
             mechanisms().map(|m| if m.shape.is_some() { 1.0 } else { m.parameters().count() as f64 });
-        Side {
+        ComparedModel {
             rss,
             parameters: parameters.sum(),
             surcharge: mechanisms().map(|m| m.surcharge).sum(),
@@ -837,8 +868,8 @@ impl<'a> Search<'a> {
     }
 
     /// What the free shapes of a model cost.
-    fn smoothness(&self, of: &Fitted, scale: &[f64]) -> Smoothness {
-        let is_shape = |part: &&Part| self.library[part.candidate.mechanism].shape.is_some();
+    fn smoothness(&self, of: &FittedModel, scale: &[f64]) -> Smoothness {
+        let is_shape = |part: &&MechanismTerm| self.library[part.candidate.mechanism].shape.is_some();
         let free = |name: &String| {
             let index = of.setup.model.parameter(name)?;
             of.setup.free.iter().position(|f| f.index == index)
@@ -857,11 +888,13 @@ impl<'a> Search<'a> {
     }
 
     /// What is known of the strengths that `new` has and `old` has not ([`robust`]).
-    pub(crate) fn robust(&self, old: &Fitted, new: &Fitted, scale: &[f64]) -> f64 {
+    pub(crate) fn robust(&self, old: &FittedModel, new: &FittedModel, scale: &[f64]) -> f64 {
         // Whoever listens changes nothing: what it costs is not counted.
         let work = Arc::new(Work::of_fits_within(u64::MAX));
-        let uncounted =
-            |f: &Fitted| Fitted { setup: Setup { work: work.clone(), ..f.setup.clone() }, ..f.clone() };
+        let uncounted = |f: &FittedModel| FittedModel {
+            setup: Setup { work: work.clone(), ..f.setup.clone() },
+            ..f.clone()
+        };
         let (old, new) = (uncounted(old), uncounted(new));
         let inflation = Uncertainty::inflation(&new, scale, &self.tested(&old, &new));
         robust(&self.side(&old, &new, scale), &self.side(&new, &new, scale), &new.fit.count, inflation)
@@ -869,8 +902,8 @@ impl<'a> Search<'a> {
 
     /// Positions, among what is free in `new`, of what stands for the laws that `old` lacks: their strengths, or all
     /// parameters of a law that has none.
-    fn tested(&self, old: &Fitted, new: &Fitted) -> Vec<usize> {
-        let is_new = |part: &&Part| !old.parts.iter().any(|o| o.candidate == part.candidate);
+    fn tested(&self, old: &FittedModel, new: &FittedModel) -> Vec<usize> {
+        let is_new = |part: &&MechanismTerm| !old.parts.iter().any(|o| o.candidate == part.candidate);
         let names = new.parts.iter().filter(is_new).flat_map(|part| {
             let strengths = self.library[part.candidate.mechanism].linear.len();
             let names = &part.instance.names;
@@ -891,7 +924,7 @@ impl<'a> Search<'a> {
     /// Tells what was weighed against what.
     fn tell(
         &self,
-        (old, new): (&Fitted, &Fitted),
+        (old, new): (&FittedModel, &FittedModel),
         kinds: &[&str],
         evidence: &Evidence,
         scale: &[f64],
@@ -899,50 +932,62 @@ impl<'a> Search<'a> {
     ) {
         let robust = || self.robust(old, new, scale);
         let threshold = self.threshold(kinds.len());
-        self.observer.weighed(&Weighed { kinds, evidence, robust: &robust, threshold, believed });
+        self.listener.weighed(&Weighed { kinds, evidence, robust: &robust, threshold, believed });
     }
 
     /// Whether the improvement is to be believed.
-    fn believable(&self, e: &Evidence, mechanism: &Mechanism, share: f64, first: bool, loose: bool) -> bool {
+    fn accepts(
+        &self,
+        e: &Evidence,
+        mechanism: &Mechanism,
+        share: f64,
+        first: bool,
+        allow_rare: bool,
+    ) -> bool {
         let threshold = self.threshold(1);
         // An effect that acts rarely is seen in few folds: it must pay much where it acts and cost nothing
         // elsewhere, and the baseline must have shown a misfit while its segments were short.
         // (Where the residual is white, the likelihood can be taken at its word.)
-        let (times, focus) = if e.kappa > WHITE && !e.whitened { (2.0, 0.7) } else { (4.0, 0.85) };
+        let (times, focus) =
+            if e.effective_sample_ratio > WHITE && !e.whitened { (2.0, 0.7) } else { (4.0, 0.85) };
         let rare = mechanism.rare
-            && loose
+            && allow_rare
             && e.score > times * threshold.max(15.0)
             && e.drop > if e.whitened { 0.01 } else { 0.05 }
-            && e.focus > focus;
+            && e.improvement_concentration > focus;
         if rare {
             return true;
         }
         if e.whitened {
             return e.score > threshold
                 && e.drop > 0.003
-                && e.held_out > 0.0015
+                && e.cross_validation_gain > 0.0015
                 && e.t > 1.5
-                && e.improving >= 0.6;
+                && e.improved_fold_fraction >= 0.6;
         }
-        let enough = (e.drop > 0.02 && e.held_out > 0.01)
-            || (e.kappa > WHITE && e.drop > 0.005 && e.held_out > 0.004 && e.t > 2.5);
+        let enough = (e.drop > 0.02 && e.cross_validation_gain > 0.01)
+            || (e.effective_sample_ratio > WHITE
+                && e.drop > 0.005
+                && e.cross_validation_gain > 0.004
+                && e.t > 2.5);
         // Of a force that never rests, each fold brings its share of the score, with a spread near its
         // square root: where the score is beyond doubt, so is t.
-        if mechanism.steady && (e.t < STEADY || e.improving < 0.8) {
+        if mechanism.steady && (e.t < STEADY || e.improved_fold_fraction < 0.8) {
             return false;
         }
         // Steady over the folds; or, where a few strong moments hold most of the gain, for the better in
         // nearly every fold and to no one's loss (the sign test).
-        let steady = (e.t > 2.0 && e.improving >= 0.6)
-            || (e.t > 1.5 && e.improving >= 0.8)
-            || (e.improving >= 0.9 && e.focus > 0.95);
+        let steady = (e.t > 2.0 && e.improved_fold_fraction >= 0.6)
+            || (e.t > 1.5 && e.improved_fold_fraction >= 0.8)
+            || (e.improved_fold_fraction >= 0.9 && e.improvement_concentration > 0.95);
         // A second effect may be small beside the first; it must then be seen everywhere.
-        let visible = first || share > LEAST_SHARE || (e.drop > 0.1 && e.t > 5.0 && e.improving >= 0.9);
+        let visible =
+            first || share > LEAST_SHARE || (e.drop > 0.1 && e.t > 5.0 && e.improved_fold_fraction >= 0.9);
         e.score > threshold && visible && enough && steady
     }
 
     /// Residual sum of squares of `calibrated` at the level of `like`, in units of `scale`, its starts refitted.
-    pub fn rss_at(&self, calibrated: &Fitted, like: &Fitted, scale: &[f64]) -> f64 {
+    pub fn rss_at(&self, calibrated: &FittedModel, like: &FittedModel, scale: &[f64]) -> f64 {
         let mut f = calibrated.clone();
         let fixed = Setup { free: Vec::new(), ..f.setup.clone() };
         let point = fixed.stitch(&f.level, &f.fit.point, &like.level, scale);
@@ -952,10 +997,10 @@ impl<'a> Search<'a> {
     }
 
     /// The calibrated and the improved model on the search's longest windows, with one noise model, refitted.
-    pub fn comparable(&self, found: &Found) -> (Fitted, Fitted) {
+    pub fn comparable(&self, found: &Found) -> (FittedModel, FittedModel) {
         let length = self.lengths.last().copied().unwrap_or(SHORTEST);
         let windows = self.nominal.windows(length, MOST_SAMPLES);
-        let on_windows = |f: &Fitted| {
+        let on_windows = |f: &FittedModel| {
             let mut f = f.clone();
             f.setup.noise.clone_from(&found.improved.setup.noise);
             if f.level.segments == windows.segments {
@@ -972,23 +1017,24 @@ impl<'a> Search<'a> {
     /// not even be stable.
     pub fn rss_without(
         &self,
-        fitted: &Fitted,
+        fitted: &FittedModel,
         parts: &[usize],
-        calibrated: &Fitted,
+        calibrated: &FittedModel,
         scale: &[f64],
     ) -> Option<f64> {
         let mut rest = self.laws(fitted);
         parts.iter().for_each(|index| drop(rest.remove(*index)));
         let n0 = self.nominal.model.parameters.len();
-        let mut faint = calibrated.fit.point.parameters[..n0].to_vec();
+        let mut reduced_start = calibrated.fit.point.parameters[..n0].to_vec();
         for (candidate, values, _) in &rest {
             let linear = self.library[candidate.mechanism].linear.len();
-            faint.extend(values.iter().enumerate().map(|(i, v)| if i < linear { FAINT * v } else { *v }));
+            reduced_start
+                .extend(values.iter().enumerate().map(|(i, v)| if i < linear { FAINT * v } else { *v }));
         }
         let left = self.reassembled_from(
             fitted,
             &rest,
-            vec![faint],
+            vec![reduced_start],
             scale,
             STEPS_WITHOUT * parts.len().min(MOST_MECHANISMS),
         )?;
@@ -996,7 +1042,7 @@ impl<'a> Search<'a> {
     }
 
     /// How far the score of the law that casts doubt on part `index` is above its own; `None` where none does.
-    pub fn doubt(&self, fitted: &Fitted, index: usize, scale: &[f64]) -> Option<f64> {
+    pub fn doubt(&self, fitted: &FittedModel, index: usize, scale: &[f64]) -> Option<f64> {
         let part = &fitted.parts[index].candidate;
         let kind = &self.library[part.mechanism].kind;
         let meets = |place: &Place| match (place, &part.place) {
@@ -1020,8 +1066,8 @@ impl<'a> Search<'a> {
         let rival = self.extend(&base, doubt, scored.first()?, scale, LAST_STEPS)?;
         // One information per sample for both: that of the residual which fits better.
         let best = if rival.rss() < fitted.rss() { &rival } else { fitted };
-        let kappa = kappa(&best.setup, &best.level, scale, &best.fit.point);
-        let score = |f: &Fitted| self.weigh_with(&base, f, scale, &kappa).score;
+        let ratios = effective_sample_ratio(&best.setup, &best.level, scale, &best.fit.point);
+        let score = |f: &FittedModel| self.weigh_with(&base, f, scale, &ratios).score;
         Some(score(&rival) - score(fitted))
     }
 
@@ -1029,19 +1075,19 @@ impl<'a> Search<'a> {
     pub fn run(&self) -> Found {
         let sigma = self.nominal.data.sigma.clone();
         let scale: Vec<f64> = self.nominal.data.spread.iter().map(|s| s.max(1e-300)).collect();
-        self.observer.stage(Stage::Calibrating);
+        self.listener.stage(Stage::Calibrating);
         let level = self.nominal.windows(self.lengths[0], MOST_SAMPLES);
         let start = Point {
             parameters: self.nominal.values(),
             starts: self.nominal.starts(&level, &self.nominal.values()),
         };
         let fit = self.nominal.fit(&level, &scale, &[start], limits(30));
-        let mut calibrated = Fitted { setup: self.nominal.clone(), parts: Vec::new(), level, fit };
-        let mut state = State {
+        let mut calibrated = FittedModel { setup: self.nominal.clone(), parts: Vec::new(), level, fit };
+        let mut state = SearchState {
             scale: next_scale(&calibrated.fit, &scale, &sigma),
             current: calibrated.clone(),
             accepted: Vec::new(),
-            loose: true,
+            allow_rare: true,
             sigma,
             rejected: Vec::new(),
         };
@@ -1051,7 +1097,7 @@ impl<'a> Search<'a> {
         state.current = calibrated.clone();
         // Only a baseline that misses something already on short segments may lack a rare effect: on long
         // ones a fit may also be stuck.
-        state.loose = state.misfit() > 1.05;
+        state.allow_rare = state.misfit() > 1.05;
         for (step, &length) in self.lengths.iter().enumerate() {
             // The last, on which conclusions rest, in any case.
             if self.is_spent() && step + 1 < self.lengths.len() {
@@ -1062,22 +1108,22 @@ impl<'a> Search<'a> {
             }
             self.level(&mut calibrated, &mut state);
         }
-        self.anneal(&mut calibrated, &mut state);
+        self.restart_short_segments(&mut calibrated, &mut state);
         let mut settled = false;
         if self.is_coloured(&state, 0.6) && state.noise_is_coloured() {
-            self.observer.stage(Stage::Whitening);
+            self.listener.stage(Stage::Whitening);
             let plain = (calibrated.clone(), state.clone());
             self.whitened(&mut calibrated, &mut state);
             // An estimate that takes noise for noise simulates as well as one that does not. One that takes
             // a misfit for noise predicts the next sample and forgets the simulation.
             let before = raw_rss(&plain.1.current, &plain.1.scale);
-            let remembers = |f: &Fitted| {
+            let remembers = |f: &FittedModel| {
                 let after = raw_rss(f, &plain.1.scale);
                 !after.iter().zip(&before).any(|(a, b)| *a > FORGETS * b)
             };
             settled = remembers(&state.current);
             if settled {
-                self.think_again(&mut calibrated, &mut state);
+                self.refine_structure(&mut calibrated, &mut state);
                 settled = remembers(&state.current);
             }
             if !settled {
@@ -1085,7 +1131,7 @@ impl<'a> Search<'a> {
             }
         }
         if !settled {
-            self.think_again(&mut calibrated, &mut state);
+            self.refine_structure(&mut calibrated, &mut state);
         }
         // An answer that stands is not less complete for what was tried beyond it.
         let (mut limited, standing) = (self.limited.load(Ordering::Relaxed), state.candidates());
@@ -1100,9 +1146,9 @@ impl<'a> Search<'a> {
         if whole.segments != state.current.level.segments {
             calibrated = self.relevel(&calibrated, whole.clone(), &state.scale, 15);
             if state.current.parts.is_empty() {
-                state.current = Fitted { setup: state.current.setup.clone(), ..calibrated.clone() };
+                state.current = FittedModel { setup: state.current.setup.clone(), ..calibrated.clone() };
             } else {
-                self.widen(&mut state, &whole);
+                self.refit_all_data(&mut state, &whole);
             }
             if state.current.setup.noise.is_none() {
                 state.rescale();
@@ -1110,7 +1156,7 @@ impl<'a> Search<'a> {
             }
         }
         self.simplify(&mut state);
-        self.declare_unseen(&mut state);
+        self.mark_unidentifiable(&mut state);
         let current = state.current;
         let better_holds = (0..current.setup.holds.len())
             .filter(|&i| current.setup.holds[i] != self.nominal.holds[i])
@@ -1150,12 +1196,12 @@ impl<'a> Search<'a> {
         if !fit.cost.is_finite() {
             return None;
         }
-        let mut improved = Fitted { setup, parts, level, fit };
+        let mut improved = FittedModel { setup, parts, level, fit };
         let scale = next_scale(&improved.fit, &found.scale, &self.nominal.data.sigma);
         self.method(&mut improved, &scale);
         improved = self.refit(&improved, &scale, 10);
         let score = |gain: f64| Evidence { score: 2.0 * gain, ..Evidence::NONE };
-        let accepted = improved.parts.iter().zip(beliefs).map(|(part, belief)| Accepted {
+        let accepted = improved.parts.iter().zip(beliefs).map(|(part, belief)| SelectedTerm {
             candidate: part.candidate.clone(),
             evidence: score(belief.gain),
             rivals: belief
@@ -1184,14 +1230,14 @@ impl<'a> Search<'a> {
     }
 
     /// The model without part `index`, on the same segments, refitted.
-    pub fn smaller(&self, fitted: &Fitted, index: usize, scale: &[f64]) -> Option<Fitted> {
+    pub fn smaller(&self, fitted: &FittedModel, index: usize, scale: &[f64]) -> Option<FittedModel> {
         self.without(fitted, index, scale, STEPS_WITHOUT)
     }
 
     /// How well the recordings determine each part: the largest of its strengths over the half `widths` of their 95 %
     /// intervals (of the free parameters). −∞ for a part without strengths of its own, which shows nothing of the kind.
-    pub(crate) fn known(&self, fitted: &Fitted, widths: &[f64]) -> Vec<f64> {
-        let known = |part: &Part| -> f64 {
+    pub(crate) fn known(&self, fitted: &FittedModel, widths: &[f64]) -> Vec<f64> {
+        let known = |part: &MechanismTerm| -> f64 {
             let mechanism = &self.library[part.candidate.mechanism];
             let ratio = |name: &String| {
                 let index = fitted.setup.model.parameter(name)?;
@@ -1209,7 +1255,7 @@ impl<'a> Search<'a> {
 
     /// The part whose strengths the recordings determine least, where the 95 % intervals (half `widths`, of the free
     /// parameters) of all of them hold zero: such a mechanism may as well not be there.
-    pub fn undetermined(&self, fitted: &Fitted, widths: &[f64]) -> Option<usize> {
+    pub fn undetermined(&self, fitted: &FittedModel, widths: &[f64]) -> Option<usize> {
         let ratios =
             self.known(fitted, widths).into_iter().enumerate().filter(|(_, r)| *r != f64::NEG_INFINITY);
         let least = ratios.filter(|(_, ratio)| *ratio < 1.0).min_by(|a, b| a.1.total_cmp(&b.1));
@@ -1217,7 +1263,7 @@ impl<'a> Search<'a> {
     }
 
     /// The parts that act at certain times of a single recording. Nothing tells when they would act in another.
-    pub fn bound_to_a_clock(&self, fitted: &Fitted) -> Vec<usize> {
+    pub fn bound_to_a_clock(&self, fitted: &FittedModel) -> Vec<usize> {
         (0..fitted.parts.len()).filter(|i| self.is_bound_to_a_clock(&fitted.parts[*i].candidate)).collect()
     }
 
@@ -1228,8 +1274,14 @@ impl<'a> Search<'a> {
 
     /// Whether the mechanisms turn the sign of the mass matrix's determinant somewhere along the recordings: a negative
     /// inertia, or a coupling of accelerations stronger than the inertias that it couples.
-    pub fn has_negative_inertia(&self, setup: &Setup, level: &Level, point: &Point, scale: &[f64]) -> bool {
-        let along = Along::smoothed(setup, level, scale, point);
+    pub fn has_negative_inertia(
+        &self,
+        setup: &Setup,
+        level: &Segmentation,
+        point: &Point,
+        scale: &[f64],
+    ) -> bool {
+        let along = TrajectoryEval::smoothed(setup, level, scale, point);
         let n0 = self.nominal.system.nz;
         let model = &setup.model;
         let highest: Vec<(&str, u8)> =
@@ -1258,7 +1310,7 @@ impl<'a> Search<'a> {
     /// Goes on with whole pieces where something is left over that is not noise: what acts slowly is hardly seen on a
     /// quarter of the data. Long free runs of a model that is wrong in small ways also bend it: what was found there counts
     /// where it predicts data left out of its fit better.
-    fn go_on_to_the_end(&self, calibrated: &mut Fitted, state: &mut State) {
+    fn go_on_to_the_end(&self, calibrated: &mut FittedModel, state: &mut SearchState) {
         let length = whole(&self.nominal);
         if self.lengths.last().is_some_and(|&last| 2 * last >= length)
             || !self.leaves_more(state)
@@ -1269,24 +1321,24 @@ impl<'a> Search<'a> {
         let before = (calibrated.clone(), state.clone());
         self.lengthen(calibrated, state, length);
         self.level(calibrated, state);
-        self.anneal(calibrated, state);
-        self.think_again(calibrated, state);
+        self.restart_short_segments(calibrated, state);
+        self.refine_structure(calibrated, state);
         if !self.predicts_better(&before.1, state) {
             (*calibrated, *state) = before;
         }
     }
 
     /// Whether more is left over than a single mechanism leaves of noise.
-    fn leaves_more(&self, state: &State) -> bool {
+    fn leaves_more(&self, state: &SearchState) -> bool {
         let current = &state.current;
         current.parts.len() > 1 || !current.leaves_white_noise(&state.scale) && state.misfit() >= STUCK
     }
 
     /// Whether what another search found predicts data left out of its fit better, beyond chance.
-    fn predicts_better(&self, standing: &State, found: &State) -> bool {
+    fn predicts_better(&self, standing: &SearchState, found: &SearchState) -> bool {
         let (criterion, reach) =
             standing.current.setup.criterion(&standing.current.fit.point.parameters, &standing.scale);
-        let error = |s: &State| errors(&s.current, &s.scale, criterion, reach);
+        let error = |s: &SearchState| errors(&s.current, &s.scale, criterion, reach);
         Gain::of(&error(standing), &error(found)).is_beyond_chance()
     }
 
@@ -1294,7 +1346,7 @@ impl<'a> Search<'a> {
     /// hardly seen on short ones, where the free starts of the segments absorb it, and what was taken for it there leaves
     /// more to be explained: the result of fewer mechanisms, or of more evidence, counts. Not where a single mechanism
     /// leaves nothing but white noise.
-    fn search_long(&self, calibrated: &Fitted, state: &mut State) {
+    fn search_long(&self, calibrated: &FittedModel, state: &mut SearchState) {
         let length = whole(&self.nominal);
         if !self.leaves_more(state)
             || self.lengths.last().is_some_and(|&last| last >= length)
@@ -1305,19 +1357,19 @@ impl<'a> Search<'a> {
         let plain = Setup { noise: None, ..calibrated.setup.clone() };
         let level = self.nominal.windows(length, MOST_SAMPLES);
         let mut baseline =
-            self.relevel(&Fitted { setup: plain, ..calibrated.clone() }, level, &state.scale, 20);
-        let mut other = State {
+            self.relevel(&FittedModel { setup: plain, ..calibrated.clone() }, level, &state.scale, 20);
+        let mut other = SearchState {
             scale: next_scale(&baseline.fit, &state.scale, &state.sigma),
             current: baseline.clone(),
             accepted: Vec::new(),
             sigma: state.sigma.clone(),
-            loose: false,
+            allow_rare: false,
             rejected: Vec::new(),
         };
         baseline = self.refit(&baseline, &other.scale, 10);
         other.current = baseline.clone();
         self.level(&mut baseline, &mut other);
-        self.think_again(&mut baseline, &mut other);
+        self.refine_structure(&mut baseline, &mut other);
         if other.current.parts.is_empty() {
             if state.current.parts.is_empty() && !other.rejected.is_empty() {
                 state.rejected = other.rejected;
@@ -1359,17 +1411,17 @@ impl<'a> Search<'a> {
 
     /// From the windows to all data. A mechanism that fits what the windows show and nothing beyond them is
     /// let go.
-    fn widen(&self, state: &mut State, whole: &Level) {
+    fn refit_all_data(&self, state: &mut SearchState, whole: &Segmentation) {
         // A simulation that has left every bound is worse than any number.
         let worst = |a: f64, b: f64| if b.is_nan() { f64::INFINITY } else { a.max(b) };
-        let ratio = |wide: &Fitted, narrow: &Fitted| -> f64 {
+        let ratio = |wide: &FittedModel, narrow: &FittedModel| -> f64 {
             let (a, b) = (raw_rms(wide, &state.scale), raw_rms(narrow, &state.scale));
             a.iter().zip(&b).map(|(a, b)| a / b.max(1e-300)).fold(0.0, worst)
         };
         let mut narrow = state.current.clone();
         let mut wide = self.relevel(&narrow, whole.clone(), &state.scale, 15);
         while narrow.parts.len() > 1 && ratio(&wide, &narrow) > BEYOND_WINDOWS {
-            let smaller: Vec<(Fitted, Fitted)> = (0..narrow.parts.len())
+            let smaller: Vec<(FittedModel, FittedModel)> = (0..narrow.parts.len())
                 .into_par_iter()
                 .filter_map(|i| {
                     let without = self.without(&narrow, i, &state.scale, 12)?;
@@ -1389,22 +1441,26 @@ impl<'a> Search<'a> {
 
     /// A fit that is left well above the noise may be stuck where long segments led it: from the shortest
     /// segments up again, with all its mechanisms; if that is better, the search goes on from there.
-    fn anneal(&self, calibrated: &mut Fitted, state: &mut State) {
+    fn restart_short_segments(&self, calibrated: &mut FittedModel, state: &mut SearchState) {
         if state.misfit() < STUCK || self.lengths.len() < 2 || self.is_spent() {
             return;
         }
         let mut fitted = state.current.clone();
         for &length in &self.lengths {
             let level = same_level(&fitted.setup, &self.nominal.windows(length, MOST_SAMPLES));
-            let hats = Point {
+            let smoothed_states = Point {
                 parameters: fitted.fit.point.parameters.clone(),
                 starts: fitted.setup.starts(&level, &fitted.fit.point.parameters),
             };
             let stitched = fitted.setup.stitch(&fitted.level, &fitted.fit.point, &level, &state.scale);
             // At the shortest, from the measurements alone: what the long segments believe is in doubt.
-            let points = if length == self.lengths[0] { vec![hats] } else { vec![stitched, hats] };
+            let points = if length == self.lengths[0] {
+                vec![smoothed_states]
+            } else {
+                vec![stitched, smoothed_states]
+            };
             let fit = fitted.setup.fit(&level, &state.scale, &points, limits(25));
-            fitted = Fitted { level, fit, ..fitted };
+            fitted = FittedModel { level, fit, ..fitted };
         }
         if fitted.fit.cost < 0.98 * state.current.fit.cost {
             if fitted.parts.is_empty() {
@@ -1417,9 +1473,9 @@ impl<'a> Search<'a> {
     }
 
     /// Goes on with longer segments.
-    fn lengthen(&self, calibrated: &mut Fitted, state: &mut State, length: usize) {
+    fn lengthen(&self, calibrated: &mut FittedModel, state: &mut SearchState, length: usize) {
         let level = self.nominal.windows(length, MOST_SAMPLES);
-        self.observer.stage(Stage::Lengthening { segments: level.segments.len() });
+        self.listener.stage(Stage::Lengthening { segments: level.segments.len() });
         *calibrated = self.relevel(calibrated, level.clone(), &state.scale, 20);
         state.current = if state.current.parts.is_empty() {
             calibrated.clone()
@@ -1434,19 +1490,19 @@ impl<'a> Search<'a> {
         }
     }
 
-    fn is_coloured(&self, state: &State, below: f64) -> bool {
+    fn is_coloured(&self, state: &SearchState, below: f64) -> bool {
         let f = &state.current;
-        least_kappa(&f.setup, &f.level, &state.scale, &f.fit.point) < below
+        least_effective_sample_ratio(&f.setup, &f.level, &state.scale, &f.fit.point) < below
     }
 
     /// The second pass: the noise has a model of its own (an autoregression per channel), residuals,
     /// sensitivities and candidates are whitened by it, and models are compared by the likelihood of
     /// their innovations.
-    fn whitened(&self, calibrated: &mut Fitted, state: &mut State) {
+    fn whitened(&self, calibrated: &mut FittedModel, state: &mut SearchState) {
         // Not the shortest: they hide the low frequencies of the noise.
         for &length in &self.lengths[self.lengths.len().saturating_sub(2)..] {
             let plain = Setup { noise: None, ..state.current.setup.clone() };
-            state.current = Fitted { setup: plain, ..state.current.clone() };
+            state.current = FittedModel { setup: plain, ..state.current.clone() };
             let level = self.nominal.windows(length, MOST_SAMPLES);
             if level.segments != state.current.level.segments {
                 state.current = self.relevel(&state.current, level.clone(), &state.scale, 20);
@@ -1467,7 +1523,7 @@ impl<'a> Search<'a> {
     }
 
     /// One level: rounds until nothing more is believable.
-    fn level(&self, calibrated: &mut Fitted, state: &mut State) {
+    fn level(&self, calibrated: &mut FittedModel, state: &mut SearchState) {
         let mut seen: Vec<Vec<Candidate>> = Vec::new();
         // A round is dearer than the one before, which had a mechanism less to simulate.
         let mut last = 0;
@@ -1490,7 +1546,7 @@ impl<'a> Search<'a> {
     }
 
     /// One round: the best candidate, if it is believable.
-    fn round(&self, calibrated: &mut Fitted, state: &mut State) -> bool {
+    fn round(&self, calibrated: &mut FittedModel, state: &mut SearchState) -> bool {
         let current = &state.current;
         let scale = state.scale.clone();
         let taken = |c: &Candidate| {
@@ -1503,11 +1559,11 @@ impl<'a> Search<'a> {
             })
         };
         let open: Vec<Candidate> = self.all.iter().filter(|c| !taken(c)).cloned().collect();
-        self.observer.stage(Stage::Screening { candidates: open.len(), found: current.parts.len() });
+        self.listener.stage(Stage::Screening { candidates: open.len(), found: current.parts.len() });
         let scored = screen(&current.setup, self.library, &open, &current.level, &scale, &current.fit.point);
         let ranking: Vec<(&str, f64)> =
             scored.iter().map(|s| (&*self.library[open[s.candidate].mechanism].kind, s.gain)).collect();
-        self.observer.screened(&ranking);
+        self.listener.screened(&ranking);
         let least = if current.setup.noise.is_some() { 0.001 } else { 0.003 };
         let short = self.short_list(&open, &scored, least, SHORT_LIST, state.near_equals());
         let trials = self.all_trials(current, state, &open, &short, least);
@@ -1521,7 +1577,7 @@ impl<'a> Search<'a> {
         };
         // Control: the smaller model from the winner's parameters. If that is better than it was, the
         // baseline had been stuck.
-        let control = self.control(current, &chosen, &scale);
+        let control = self.refit_baseline(current, &chosen, &scale);
         let evidence = if control.fit.cost < current.fit.cost * 0.999 {
             if current.parts.is_empty() && current.setup.noise.is_none() {
                 *calibrated = control.clone();
@@ -1536,7 +1592,7 @@ impl<'a> Search<'a> {
             if evidence.whitened { 1.0 } else { (state.current.rss() - chosen.rss()) / total.max(1e-300) };
         let mechanism = &self.library[winner.mechanism];
         let believable =
-            self.believable(&evidence, mechanism, share, state.current.parts.is_empty(), state.loose);
+            self.accepts(&evidence, mechanism, share, state.current.parts.is_empty(), state.allow_rare);
         self.tell((&state.current, &chosen), &[&mechanism.kind], &evidence, &scale, believable);
         if !believable {
             state.rejected = vec![chosen];
@@ -1553,14 +1609,14 @@ impl<'a> Search<'a> {
     /// - at the nominal parameters, where the calibrated ones are far from them and the simulation still far
     ///   from the recording: a strong friction is taken for an inertia and a damping many times too large, and
     ///   no friction helps there.
-    fn anchors(&self, current: &Fitted, state: &State) -> Vec<Fitted> {
+    fn anchors(&self, current: &FittedModel, state: &SearchState) -> Vec<FittedModel> {
         let mut out = Vec::new();
         if !current.parts.is_empty() {
             return out; // what was found has changed the model already
         }
         let stated = current.setup.with_holds(self.nominal.holds.clone());
         if current.setup.holds != self.nominal.holds {
-            let fitted = Fitted { setup: stated.clone(), ..current.clone() };
+            let fitted = FittedModel { setup: stated.clone(), ..current.clone() };
             out.push(self.refit(&fitted, &state.scale, 10));
         }
         if current.setup.noise.is_none() && current.misfit(&state.scale) > FAR {
@@ -1574,7 +1630,7 @@ impl<'a> Search<'a> {
                 let held = Setup { free: Vec::new(), ..stated.clone() };
                 let start = Point { parameters: nominal, starts };
                 let fit = held.fit(&current.level, &state.scale, &[start], limits(STARTS));
-                out.push(Fitted { setup: stated, fit, ..current.clone() });
+                out.push(FittedModel { setup: stated, fit, ..current.clone() });
             }
         }
         out.retain(|f| f.fit.cost.is_finite());
@@ -1584,14 +1640,14 @@ impl<'a> Search<'a> {
     /// Fits a short-list from `base`, and what ranks high at its anchors from these: of each candidate the better.
     fn all_trials(
         &self,
-        base: &Fitted,
-        state: &State,
+        base: &FittedModel,
+        state: &SearchState,
         open: &[Candidate],
         short: &[&Scored],
         least: f64,
-    ) -> Vec<(usize, Fitted)> {
+    ) -> Vec<(usize, FittedModel)> {
         let scale = &state.scale;
-        let anchors: Vec<(Fitted, Vec<Scored>)> = self
+        let anchors: Vec<(FittedModel, Vec<Scored>)> = self
             .anchors(base, state)
             .into_iter()
             .map(|a| {
@@ -1599,11 +1655,11 @@ impl<'a> Search<'a> {
                 (a, scored)
             })
             .collect();
-        let anchored: Vec<(&Fitted, Vec<&Scored>)> =
+        let anchored: Vec<(&FittedModel, Vec<&Scored>)> =
             anchors.iter().map(|(a, s)| (a, self.short_list(open, s, least, SHORT_LIST, 0))).collect();
         let candidates = short.len() + anchored.iter().map(|a| a.1.len()).sum::<usize>();
         if candidates > 0 {
-            self.observer.stage(Stage::Fitting { candidates });
+            self.listener.stage(Stage::Fitting { candidates });
         }
         let mut trials = self.trials(base, open, short, scale);
         for (anchor, short) in anchored {
@@ -1621,18 +1677,18 @@ impl<'a> Search<'a> {
     /// Fits a short-list: all of it a little, the more promising half further, the best to the end.
     fn trials(
         &self,
-        base: &Fitted,
+        base: &FittedModel,
         open: &[Candidate],
         short: &[&Scored],
         scale: &[f64],
-    ) -> Vec<(usize, Fitted)> {
-        let mut trials: Vec<(usize, Fitted)> = short
+    ) -> Vec<(usize, FittedModel)> {
+        let mut trials: Vec<(usize, FittedModel)> = short
             .par_iter()
             .filter_map(|s| self.trial(base, &open[s.candidate], s, scale).map(|f| (s.candidate, f)))
             .collect();
         trials.sort_by(|a, b| a.1.rss().total_cmp(&b.1.rss()).then(a.0.cmp(&b.0)));
         let rest = trials.split_off(trials.len().min(FINALISTS));
-        let go_on = |trials: Vec<(usize, Fitted)>, steps: usize| -> Vec<(usize, Fitted)> {
+        let go_on = |trials: Vec<(usize, FittedModel)>, steps: usize| -> Vec<(usize, FittedModel)> {
             trials
                 .into_par_iter()
                 .map(|(c, f)| {
@@ -1678,9 +1734,9 @@ impl<'a> Search<'a> {
     /// mechanisms that no longer pay.
     fn accept(
         &self,
-        state: &mut State,
+        state: &mut SearchState,
         winner: Candidate,
-        chosen: Fitted,
+        chosen: FittedModel,
         rivals: Vec<Rival>,
         evidence: Evidence,
     ) {
@@ -1713,7 +1769,7 @@ impl<'a> Search<'a> {
                             .filter(|r| !split.parts.iter().any(|p| p.candidate == r.candidate))
                             .map(|r| Rival { equivalent: false, ..r.clone() }),
                     );
-                    state.accepted.push(Accepted {
+                    state.accepted.push(SelectedTerm {
                         candidate: part.candidate.clone(),
                         evidence,
                         rivals: others,
@@ -1723,14 +1779,14 @@ impl<'a> Search<'a> {
             }
             None => {
                 state.current = chosen;
-                state.accepted.push(Accepted { candidate: winner, evidence, rivals });
+                state.accepted.push(SelectedTerm { candidate: winner, evidence, rivals });
             }
         }
         self.settle(state);
     }
 
     /// After an acceptance: the noise or the scale anew, the hold, the mechanisms that no longer pay.
-    fn settle(&self, state: &mut State) {
+    fn settle(&self, state: &mut SearchState) {
         if state.current.setup.noise.is_some() {
             state.whiten();
             self.method(&mut state.current, &state.scale);
@@ -1756,7 +1812,7 @@ impl<'a> Search<'a> {
 
     /// Second thoughts; where they change the model, whether it lacks something still. Mechanisms that were thought of before
     /// would lead to the same again.
-    fn think_again(&self, calibrated: &mut Fitted, state: &mut State) {
+    fn refine_structure(&self, calibrated: &mut FittedModel, state: &mut SearchState) {
         let mut seen: Vec<Vec<Candidate>> = Vec::new();
         while seen.len() < MOST_MECHANISMS && !self.is_spent() {
             let before = state.candidates();
@@ -1779,7 +1835,7 @@ impl<'a> Search<'a> {
     /// Every mechanism again, with all others in place and the segments at their longest: what else could
     /// stand in its stead? The better (or the simpler of equals) takes its place; the others are the
     /// alternatives of the report.
-    fn reconsider(&self, calibrated: &Fitted, state: &mut State) {
+    fn reconsider(&self, calibrated: &FittedModel, state: &mut SearchState) {
         self.reconsider_pair(state);
         let mut index = 0;
         let mut relieved = 0;
@@ -1790,7 +1846,7 @@ impl<'a> Search<'a> {
             let part = state.current.parts[at].clone();
             let taken = |c: &Candidate| base.parts.iter().any(|p| p.candidate == *c);
             let open: Vec<Candidate> = self.all.iter().filter(|c| !taken(c)).cloned().collect();
-            self.observer.stage(Stage::Screening { candidates: open.len(), found: base.parts.len() });
+            self.listener.stage(Stage::Screening { candidates: open.len(), found: base.parts.len() });
             let scored = screen(&base.setup, self.library, &open, &base.level, &state.scale, &base.fit.point);
             let relatives = &self.library[part.candidate.mechanism].about.confused_with;
             let mut short = self.short_list(&open, &scored, 0.003, RIVALS, state.near_equals());
@@ -1815,7 +1871,7 @@ impl<'a> Search<'a> {
                 trials.push((own, standing));
             }
             // Of those that fit as well: one that makes another mechanism superfluous.
-            if relieved < MOST_MECHANISMS && self.relieve(&base, state, &open, &trials, &part) {
+            if relieved < MOST_MECHANISMS && self.swap_and_drop(&base, state, &open, &trials, &part) {
                 // From the first again: fewer mechanisms, other alternatives.
                 relieved += 1;
                 index = 0;
@@ -1844,7 +1900,7 @@ impl<'a> Search<'a> {
             let mechanism = &self.library[winner.mechanism];
             // On few data, what was found on short segments is not traded for a whim of the long ones.
             let believable = state.current.fit.count.iter().sum::<usize>() >= PAIR_SAMPLES
-                && self.believable(&evidence, mechanism, 1.0, base.parts.is_empty(), state.loose);
+                && self.accepts(&evidence, mechanism, 1.0, base.parts.is_empty(), state.allow_rare);
             self.tell((&base, &chosen), &[&mechanism.kind], &evidence, &state.scale, believable);
             if !believable {
                 continue;
@@ -1856,9 +1912,9 @@ impl<'a> Search<'a> {
 
     /// Two mechanisms of one family may be the round-about way to another two that only pay together (which
     /// the search, one at a time, does not see): the best simpler pair that fits as well takes their place.
-    fn reconsider_pair(&self, state: &mut State) {
+    fn reconsider_pair(&self, state: &mut SearchState) {
         let current = state.current.clone();
-        let family = |p: &Part| &self.library[p.candidate.mechanism].family;
+        let family = |p: &MechanismTerm| &self.library[p.candidate.mechanism].family;
         let samples: usize = current.fit.count.iter().sum();
         let [first, second] = &current.parts[..] else { return };
         if family(first) != family(second) || self.complexity(&current) <= 2.0 || samples < PAIR_SAMPLES {
@@ -1872,7 +1928,7 @@ impl<'a> Search<'a> {
         };
         let pairs =
             screen_pairs(&base.setup, self.library, &self.all, &base.level, &scale, &base.fit.point, PAIRS);
-        self.observer.stage(Stage::Fitting { candidates: pairs.len() });
+        self.listener.stage(Stage::Fitting { candidates: pairs.len() });
         let best = pairs
             .par_iter()
             .filter_map(|p| self.extend_by_pair(&base, &self.all, p, &scale))
@@ -1886,7 +1942,7 @@ impl<'a> Search<'a> {
             state.accepted = best
                 .parts
                 .iter()
-                .map(|p| Accepted { candidate: p.candidate.clone(), evidence, rivals: Vec::new() })
+                .map(|p| SelectedTerm { candidate: p.candidate.clone(), evidence, rivals: Vec::new() })
                 .collect();
             state.current = best;
             self.settle(state);
@@ -1894,13 +1950,13 @@ impl<'a> Search<'a> {
     }
 
     /// Takes over a trial that fits nearly as well as the standing one and lets another mechanism go.
-    fn relieve(
+    fn swap_and_drop(
         &self,
-        base: &Fitted,
-        state: &mut State,
+        base: &FittedModel,
+        state: &mut SearchState,
         open: &[Candidate],
-        trials: &[(usize, Fitted)],
-        standing: &Part,
+        trials: &[(usize, FittedModel)],
+        standing: &MechanismTerm,
     ) -> bool {
         if state.current.parts.len() < 2 {
             return false;
@@ -1924,7 +1980,11 @@ impl<'a> Search<'a> {
                 }
                 let evidence = self.weigh(base, trial, &state.scale);
                 state.accepted.retain(|a| smaller.parts.iter().any(|p| p.candidate == a.candidate));
-                state.accepted.push(Accepted { candidate: open[*c].clone(), evidence, rivals: Vec::new() });
+                state.accepted.push(SelectedTerm {
+                    candidate: open[*c].clone(),
+                    evidence,
+                    rivals: Vec::new(),
+                });
                 state.current = smaller;
                 self.settle(state);
                 return true;
@@ -1936,22 +1996,22 @@ impl<'a> Search<'a> {
     /// Fits a candidate: added, or in place of the relative that it refines.
     fn trial(
         &self,
-        current: &Fitted,
+        current: &FittedModel,
         candidate: &Candidate,
         scored: &Scored,
         scale: &[f64],
-    ) -> Option<Fitted> {
+    ) -> Option<FittedModel> {
         let fitted = self.fitted_trial(current, candidate, scored, scale)?;
         self.admissible(&fitted, scale).then_some(fitted)
     }
 
     fn fitted_trial(
         &self,
-        current: &Fitted,
+        current: &FittedModel,
         candidate: &Candidate,
         scored: &Scored,
         scale: &[f64],
-    ) -> Option<Fitted> {
+    ) -> Option<FittedModel> {
         let refined = current.parts.iter().position(|p| {
             p.candidate.place == candidate.place
                 && self.library[candidate.mechanism]
@@ -1976,7 +2036,7 @@ impl<'a> Search<'a> {
     }
 
     /// The last part written as the sum of simpler mechanisms that it equals exactly.
-    fn split(&self, fitted: &Fitted, scale: &[f64]) -> Option<Fitted> {
+    fn split(&self, fitted: &FittedModel, scale: &[f64]) -> Option<FittedModel> {
         let mut parts = self.laws(fitted);
         let (whole, values, _) = parts.pop()?;
         let mechanism = &self.library[whole.mechanism];
@@ -2001,7 +2061,7 @@ impl<'a> Search<'a> {
     }
 
     /// The model without the winner, from the winner's parameters.
-    fn control(&self, current: &Fitted, chosen: &Fitted, scale: &[f64]) -> Fitted {
+    fn refit_baseline(&self, current: &FittedModel, chosen: &FittedModel, scale: &[f64]) -> FittedModel {
         let mut parameters = current.fit.point.parameters.clone();
         for (p, name) in parameters.iter_mut().zip(current.setup.model.parameters.iter().map(|p| &p.name)) {
             if let Some(i) = chosen.setup.model.parameter(name) {
@@ -2011,25 +2071,25 @@ impl<'a> Search<'a> {
         let starts = transfer(&chosen.setup, &current.level, &chosen.fit.point.starts, &current.setup, &[]);
         let points = [Point { parameters, starts }];
         let fit = current.setup.fit(&current.level, scale, &points, limits(15));
-        if fit.cost < current.fit.cost { Fitted { fit, ..current.clone() } } else { current.clone() }
+        if fit.cost < current.fit.cost { FittedModel { fit, ..current.clone() } } else { current.clone() }
     }
 
     /// The best trial by score, unless a simpler one is as good; with the evidence of all.
     fn decide(
         &self,
-        calibrated: &Fitted,
-        current: &Fitted,
+        calibrated: &FittedModel,
+        current: &FittedModel,
         open: &[Candidate],
-        trials: Vec<(usize, Fitted)>,
+        trials: Vec<(usize, FittedModel)>,
         scale: &[f64],
-    ) -> Option<(Candidate, Fitted, Vec<Rival>, Evidence)> {
+    ) -> Option<(Candidate, FittedModel, Vec<Rival>, Evidence)> {
         // One information per sample for all: that of the residual which fits best.
         let best = trials.iter().min_by(|a, b| a.1.rss().total_cmp(&b.1.rss()))?;
-        let kappa = kappa(&best.1.setup, &best.1.level, scale, &best.1.fit.point);
-        let mut weighed: Vec<(usize, Fitted, Evidence)> = trials
+        let ratios = effective_sample_ratio(&best.1.setup, &best.1.level, scale, &best.1.fit.point);
+        let mut weighed: Vec<(usize, FittedModel, Evidence)> = trials
             .into_par_iter()
             .map(|(c, f)| {
-                let e = self.weigh_with(current, &f, scale, &kappa);
+                let e = self.weigh_with(current, &f, scale, &ratios);
                 (c, f, e)
             })
             .collect();
@@ -2037,7 +2097,7 @@ impl<'a> Search<'a> {
         for (c, f, e) in &weighed {
             if let Some(part) = f.parts.last() {
                 let kind = &self.library[open[*c].mechanism].kind;
-                self.observer.tried(kind, &part.instance.expression.to_string(), e);
+                self.listener.tried(kind, &part.instance.expression.to_string(), e);
             }
         }
         let total = calibrated_rss(calibrated, scale);
@@ -2057,7 +2117,7 @@ impl<'a> Search<'a> {
         };
         let (chosen, fitted, evidence) = weighed.remove(best);
         let likelihood = by_likelihood(&fitted, &evidence, scale);
-        let tell = |(c, f, e): (usize, Fitted, Evidence), undetermined: bool| {
+        let tell = |(c, f, e): (usize, FittedModel, Evidence), undetermined: bool| {
             // The data cannot separate what fits as well with no more parameters, nor what the evidence
             // leaves at odds that no one would bet on: close scores, or criteria that contradict each other
             // (BIC asks for certainty, Akaike's for a better prediction).
@@ -2080,7 +2140,7 @@ impl<'a> Search<'a> {
     }
 
     /// Whether the recordings determine none of the strengths of a model's last part.
-    fn shows_nothing(&self, fitted: &Fitted, scale: &[f64]) -> bool {
+    fn shows_nothing(&self, fitted: &FittedModel, scale: &[f64]) -> bool {
         let last = fitted.parts.len().wrapping_sub(1);
         self.undetermined(fitted, &Uncertainty::of(fitted, scale).widths()) == Some(last)
     }
@@ -2088,9 +2148,9 @@ impl<'a> Search<'a> {
     /// Whether a refinement is no choice: the law that it refines is at hand, and the data do not show its parts.
     fn gives_way(
         &self,
-        weighed: &[(usize, Fitted, Evidence)],
+        weighed: &[(usize, FittedModel, Evidence)],
         best: usize,
-        current: &Fitted,
+        current: &FittedModel,
         open: &[Candidate],
         scale: &[f64],
     ) -> bool {
@@ -2107,14 +2167,14 @@ impl<'a> Search<'a> {
     }
 
     /// Whether the 95 % interval of one of a part's strengths is wider than the largest of them.
-    fn is_undetermined(&self, fitted: &Fitted, part: usize, scale: &[f64]) -> bool {
+    fn is_undetermined(&self, fitted: &FittedModel, part: usize, scale: &[f64]) -> bool {
         let strengths = self.strengths(fitted, part, scale);
         let largest = strengths.iter().map(|s| s.value.abs()).fold(0.0, f64::max);
         strengths.iter().any(|s| s.width > largest)
     }
 
     /// The linear parameters of a part that are fitted; none of a part that is not there.
-    fn strengths(&self, fitted: &Fitted, part: usize, scale: &[f64]) -> Vec<Strength> {
+    fn strengths(&self, fitted: &FittedModel, part: usize, scale: &[f64]) -> Vec<Strength> {
         let Some(part) = fitted.parts.get(part) else { return Vec::new() };
         let mechanism = &self.library[part.candidate.mechanism];
         let widths = Uncertainty::of(fitted, scale).widths();
@@ -2133,7 +2193,7 @@ impl<'a> Search<'a> {
     }
 
     /// The model with a law in place of its refinement, from the refinement's parameters.
-    fn simpler(&self, fitted: &Fitted, index: usize, scale: &[f64]) -> Option<Fitted> {
+    fn simpler(&self, fitted: &FittedModel, index: usize, scale: &[f64]) -> Option<FittedModel> {
         let mut parts = self.laws(fitted);
         let (refinement, values, _) = &parts[index];
         let law = self.all.iter().find(|c| self.is_refined_by(c, refinement))?;
@@ -2159,7 +2219,7 @@ impl<'a> Search<'a> {
     /// The best by score, unless a simpler one is as good.
     fn best_of(
         &self,
-        weighed: &[(usize, Fitted, Evidence)],
+        weighed: &[(usize, FittedModel, Evidence)],
         open: &[Candidate],
         total: f64,
         scale: &[f64],
@@ -2193,7 +2253,7 @@ impl<'a> Search<'a> {
     }
 
     /// Drops what no longer pays.
-    fn prune(&self, state: &mut State) {
+    fn prune(&self, state: &mut SearchState) {
         let mut index = 0;
         // What was found on coloured residuals stands the test of white ones, or goes.
         let least_parts = if state.current.setup.noise.is_some() { 0 } else { 1 };
@@ -2204,14 +2264,14 @@ impl<'a> Search<'a> {
             };
             let e = self.weigh(&smaller, &state.current, &state.scale);
             // A little less than what it takes to be accepted, or rounds would go in circles.
-            let least = match (e.whitened, e.kappa > WHITE) {
+            let least = match (e.whitened, e.effective_sample_ratio > WHITE) {
                 (true, _) => 0.0025,
                 (false, true) => 0.004,
                 (false, false) => 0.01,
             };
             if e.score < LEAST_SCORE || e.drop < least {
                 let gone = state.current.parts[index].candidate.clone();
-                self.observer.dropped(&self.library[gone.mechanism].kind);
+                self.listener.dropped(&self.library[gone.mechanism].kind);
                 state.accepted.retain(|a| a.candidate != gone);
                 state.current = smaller;
                 index = 0;
@@ -2223,9 +2283,9 @@ impl<'a> Search<'a> {
 
     /// Puts a law in the place of its refinement where the data do not show the refinement's parts, and the law fits
     /// as well.
-    fn simplify(&self, state: &mut State) {
+    fn simplify(&self, state: &mut SearchState) {
         for index in 0..state.current.parts.len() {
-            let Part { candidate: refinement, instance, .. } = state.current.parts[index].clone();
+            let MechanismTerm { candidate: refinement, instance, .. } = state.current.parts[index].clone();
             let mechanism = &self.library[refinement.mechanism];
             if mechanism.refines.is_empty() || !self.is_undetermined(&state.current, index, &state.scale) {
                 continue;
@@ -2237,7 +2297,7 @@ impl<'a> Search<'a> {
             }
             let Some(base) = self.without(&simpler, index, &state.scale, 12) else { continue };
             let evidence = self.weigh(&base, &simpler, &state.scale);
-            self.observer.dropped(&mechanism.kind);
+            self.listener.dropped(&mechanism.kind);
             let law = simpler.parts[index].candidate.clone();
             if let Some(known) = state.accepted.iter_mut().find(|a| a.candidate == refinement) {
                 known.rivals.retain(|r| r.candidate != law);
@@ -2252,7 +2312,7 @@ impl<'a> Search<'a> {
 
     /// Declares refinements that these recordings would not show equals of the law that they refine: that BIC prefers
     /// the law says then no more than that it is the simpler.
-    fn declare_unseen(&self, state: &mut State) {
+    fn mark_unidentifiable(&self, state: &mut SearchState) {
         for index in 0..state.current.parts.len() {
             let law = state.current.parts[index].candidate.clone();
             let Some(known) = state.accepted.iter_mut().find(|a| a.candidate == law) else { continue };
@@ -2284,7 +2344,7 @@ impl<'a> Search<'a> {
     /// law's. Only of a refinement that is the law itself where its strengths are the law's.
     fn unseen(
         &self,
-        fitted: &Fitted,
+        fitted: &FittedModel,
         index: usize,
         refinement: &Candidate,
         scale: &[f64],
@@ -2295,7 +2355,7 @@ impl<'a> Search<'a> {
         if !mechanism.is_at_equal_strengths(law) {
             return None;
         }
-        let along = Along::smoothed(&fitted.setup, &fitted.level, scale, &fitted.fit.point);
+        let along = TrajectoryEval::smoothed(&fitted.setup, &fitted.level, scale, &fitted.fit.point);
         let scales = inner_scales(mechanism, refinement, &along, &fitted.setup)?;
         let choices = first_values(mechanism, &scales);
         let at = |inner: &Vec<f64>| -> Option<(bool, Instance)> {
@@ -2312,7 +2372,7 @@ impl<'a> Search<'a> {
     }
 
     /// The model with these parts, of which one has its inner parameters held where they are.
-    fn held(&self, fitted: &Fitted, parts: &[Law], index: usize, scale: &[f64]) -> Option<Fitted> {
+    fn held(&self, fitted: &FittedModel, parts: &[Law], index: usize, scale: &[f64]) -> Option<FittedModel> {
         let mut held = self.reassembled(fitted, parts, scale, 0)?;
         let mechanism = &self.library[held.parts[index].candidate.mechanism];
         let names = mechanism.parameters().zip(&held.parts[index].instance.names);
@@ -2326,7 +2386,7 @@ impl<'a> Search<'a> {
 
     /// Whether an admissible end of the 95 % interval of one of a part's strengths lies further than [`SUBSTANTIAL`]
     /// from this one.
-    fn may_differ(&self, fitted: &Fitted, index: usize, strength: f64, scale: &[f64]) -> bool {
+    fn may_differ(&self, fitted: &FittedModel, index: usize, strength: f64, scale: &[f64]) -> bool {
         let admissible = |at: usize, value: f64| {
             let mut parameters = fitted.fit.point.parameters.clone();
             parameters[at] = value;
@@ -2363,20 +2423,20 @@ struct Strength {
 
 /// Where the search stands.
 #[derive(Clone)]
-struct State {
-    current: Fitted,
-    accepted: Vec<Accepted>,
+struct SearchState {
+    current: FittedModel,
+    accepted: Vec<SelectedTerm>,
     /// Residual scale per channel, SI.
     scale: Vec<f64>,
     /// Noise per channel, SI.
     sigma: Vec<f64>,
     /// Rare effects may be believed.
-    loose: bool,
+    allow_rare: bool,
     /// With the best single candidate, and the best pair, of the last round that found nothing to be believed.
-    rejected: Vec<Fitted>,
+    rejected: Vec<FittedModel>,
 }
 
-impl State {
+impl SearchState {
     fn candidates(&self) -> Vec<Candidate> {
         self.current.parts.iter().map(|p| p.candidate.clone()).collect()
     }
@@ -2417,7 +2477,7 @@ impl State {
 /// differences show and are no tiny part of it. Coloured noise has little power at high frequencies (for an
 /// autoregression with a coefficient near one, innovations are twice what the differences say); a slow misfit
 /// over white noise leaves innovations of just that noise.
-pub fn coloured_channels(f: &Fitted, scale: &[f64]) -> Vec<bool> {
+pub fn coloured_channels(f: &FittedModel, scale: &[f64]) -> Vec<bool> {
     let noise = f.setup.innovations(&f.level, scale, &f.fit.point);
     noise
         .iter()
@@ -2443,32 +2503,32 @@ fn is_long(samples: usize, ratio: f64) -> bool {
 
 /// Whether the likelihood can be taken at its word: of innovations, and of a residual that is white and no
 /// larger than the noise. Anything else holds misfits that no likelihood knows of.
-fn by_likelihood(f: &Fitted, e: &Evidence, scale: &[f64]) -> bool {
-    e.whitened || f.is_white(e.kappa, scale)
+fn by_likelihood(f: &FittedModel, e: &Evidence, scale: &[f64]) -> bool {
+    e.whitened || f.is_white(e.effective_sample_ratio, scale)
 }
 
 /// Sum of squared innovations per channel, each model with the noise model of its own residual.
-fn innovations(f: &Fitted, scale: &[f64]) -> Vec<f64> {
+fn innovations(f: &FittedModel, scale: &[f64]) -> Vec<f64> {
     let noise = f.setup.innovations(&f.level, scale, &f.fit.point);
     let relative = noise.iter().zip(scale).map(|(a, s)| a.variance() / (s * s));
     relative.zip(&f.fit.count).map(|(v, n)| v * *n as f64).collect()
 }
 
 /// Twice the gain in log-likelihood from one model to another, each with the noise model of its own residual.
-pub fn log_likelihood_gain(old: &Fitted, new: &Fitted, scale: &[f64]) -> f64 {
+pub fn log_likelihood_gain(old: &FittedModel, new: &FittedModel, scale: &[f64]) -> f64 {
     let (before, after) = (innovations(old, scale), innovations(new, scale));
     let ratios = before.iter().zip(&after).filter(|(b, a)| **b > 0.0 && **a > 0.0);
     ratios.zip(&new.fit.count).map(|((b, a), n)| *n as f64 * (b / a).ln()).sum()
 }
 
 /// Residual sum of squares per channel of a fitted model, not whitened, in units of `scale`.
-pub fn raw_rss(fitted: &Fitted, scale: &[f64]) -> Vec<f64> {
+pub fn raw_rss(fitted: &FittedModel, scale: &[f64]) -> Vec<f64> {
     let plain = Setup { noise: None, ..fitted.setup.clone() };
     plain.with_problem(&fitted.level, scale, |p| p.rss(&p.rows(&fitted.fit.point, false, None)).0)
 }
 
 /// Residual RMS per channel in SI, not whitened.
-pub fn raw_rms(fitted: &Fitted, scale: &[f64]) -> Vec<f64> {
+pub fn raw_rms(fitted: &FittedModel, scale: &[f64]) -> Vec<f64> {
     rms_of(&raw_rss(fitted, scale), &fitted.fit.count, scale)
 }
 
@@ -2483,7 +2543,7 @@ fn determinant_sign(a: &mut [f64], n: usize) -> f64 {
     if swaps % 2 == 0 { product } else { -product }
 }
 
-fn calibrated_rss(calibrated: &Fitted, scale: &[f64]) -> f64 {
+fn calibrated_rss(calibrated: &FittedModel, scale: &[f64]) -> f64 {
     raw_rss(calibrated, scale).iter().sum()
 }
 
@@ -2535,7 +2595,7 @@ second = "m2*x2'' + k2*x2 = 0"
     }
 
     /// The nominal equations with the first candidate of such a mechanism, at this value of its only parameter.
-    fn with(search: &Search<'_>, is: impl Fn(&Mechanism) -> bool, value: f64) -> Fitted {
+    fn with(search: &Search<'_>, is: impl Fn(&Mechanism) -> bool, value: f64) -> FittedModel {
         let candidate = search.all.iter().find(|c| is(&search.library[c.mechanism])).unwrap().clone();
         let nominal = &search.nominal;
         let scale = nominal.data.spread.clone();
@@ -2544,7 +2604,7 @@ second = "m2*x2'' + k2*x2 = 0"
         let starts = nominal.starts(&level, &values);
         let held = Setup { free: Vec::new(), ..nominal.clone() };
         let fit = held.fit(&level, &scale, &[Point { parameters: values, starts }], limits(3));
-        let base = Fitted { setup: nominal.clone(), parts: Vec::new(), level, fit };
+        let base = FittedModel { setup: nominal.clone(), parts: Vec::new(), level, fit };
         search.reassembled(&base, &[(candidate, vec![value], vec![])], &scale, 0).unwrap()
     }
 
@@ -2607,7 +2667,7 @@ second = "m2*x2'' + k2*x2 = 0"
         let undetermined = |force: f64, width: f64| {
             let fitted = with(&search, |m| m.kind == "constant_offset", force);
             let index = fitted.setup.model.parameter(&fitted.parts[0].instance.names[0]).unwrap();
-            let width = |f: &Free| if f.index == index { width } else { 0.1 };
+            let width = |f: &FreeParameter| if f.index == index { width } else { 0.1 };
             search.undetermined(&fitted, &fitted.setup.free.iter().map(width).collect::<Vec<_>>())
         };
         assert_eq!((undetermined(0.6, 0.5), undetermined(-0.6, 0.5)), (None, None));

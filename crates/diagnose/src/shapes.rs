@@ -5,7 +5,7 @@
 //! a gain of d, d', d² and each input).
 //!
 //! As a hypothesis, a shape is a Gaussian process (Rasmussen and Williams, *Gaussian Processes for Machine Learning*, 2006,
-//! ch. 2): its values a at the knots are normal with covariance K. Along a fitted model the residuals r are linear in them,
+//! ch. 2): its values a at the knots are normal with covariance K. TrajectoryEval a fitted model the residuals r are linear in them,
 //! r = G a + e, with e of unit variance and every square worth w of one that is independent. With the parameters projected
 //! off, what the shape adds to the logarithm of the marginal likelihood is
 //!
@@ -17,9 +17,9 @@ use std::ops::Range;
 
 use greybox_calibrate::{Setup, qr};
 
-use crate::along::Along;
 use crate::place::{Motion, Place, places};
 use crate::screen::Component;
+use crate::trajectory::TrajectoryEval;
 
 /// Knots of slow time over a recording.
 const SLOW_KNOTS: usize = 14;
@@ -97,7 +97,7 @@ pub struct Shapes {
 impl Shapes {
     /// Evaluates them; `None` where no motion has a shape. Beyond quantiles of `rare` and 1 − `rare` of its variable a
     /// function stays as it is there.
-    pub fn along(setup: &Setup, along: &Along<'_>, rare: f64) -> Option<Shapes> {
+    pub fn along(setup: &Setup, along: &TrajectoryEval<'_>, rare: f64) -> Option<Shapes> {
         let motions: Vec<Motion> = places(&setup.model)
             .into_iter()
             .filter_map(|p| match p {

@@ -8,13 +8,13 @@
 
 use std::sync::Mutex;
 
-use greybox_calibrate::{Level, Point, Setup, qr};
+use greybox_calibrate::{Point, Segmentation, Setup, qr};
 use greybox_model::Expr;
 
-use crate::along::Along;
 use crate::candidate::Candidate;
 use crate::locate::spectrum;
 use crate::place::Place;
+use crate::trajectory::TrajectoryEval;
 
 /// Lines proposed by each spectrum, by power and again by prominence.
 const LINES: usize = 6;
@@ -39,10 +39,10 @@ const CLIP: f64 = 6.0;
 /// Proposals of angular frequencies for the candidates of one screening.
 pub struct Spectra<'a> {
     setup: &'a Setup,
-    level: &'a Level,
+    level: &'a Segmentation,
     scale: &'a [f64],
     point: &'a Point,
-    along: &'a Along<'a>,
+    along: &'a TrajectoryEval<'a>,
     /// The force that each equation lacks, `[piece][equation][sample]`.
     forces: &'a [Vec<Vec<f64>>],
     /// Those already made.
@@ -63,10 +63,10 @@ impl<'a> Spectra<'a> {
     /// For the model of `setup` at `point`.
     pub fn new(
         setup: &'a Setup,
-        level: &'a Level,
+        level: &'a Segmentation,
         scale: &'a [f64],
         point: &'a Point,
-        along: &'a Along<'a>,
+        along: &'a TrajectoryEval<'a>,
         forces: &'a [Vec<Vec<f64>>],
     ) -> Self {
         Spectra { setup, level, scale, point, along, forces, known: Mutex::new(Vec::new()) }

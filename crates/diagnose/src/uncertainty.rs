@@ -22,7 +22,7 @@ use statrs::distribution::{ChiSquared, ContinuousCDF};
 
 use crate::evidence::Inflation;
 use crate::screen::{Projected, project};
-use crate::search::Fitted;
+use crate::search::FittedModel;
 
 /// Blocks of samples over all recordings.
 const BLOCKS: usize = 40;
@@ -64,7 +64,7 @@ impl Estimated {
 
 /// A fit's model linearised at its optimum, its starts eliminated.
 struct Linearised<'a> {
-    fitted: &'a Fitted,
+    fitted: &'a FittedModel,
     segments: Vec<Projected>,
     /// Precision of the priors.
     priors: Vec<f64>,
@@ -73,7 +73,7 @@ struct Linearised<'a> {
 }
 
 impl Linearised<'_> {
-    fn of<'a>(fitted: &'a Fitted, scale: &[f64]) -> Linearised<'a> {
+    fn of<'a>(fitted: &'a FittedModel, scale: &[f64]) -> Linearised<'a> {
         let setup = &fitted.setup;
         let (nx, np) = (setup.system.nx, setup.free.len());
         let rows = setup.with_problem(&fitted.level, scale, |p| p.rows(&fitted.fit.point, true, None));
@@ -178,7 +178,7 @@ impl Linearised<'_> {
 
 impl Uncertainty {
     /// At the optimum of a fit.
-    pub(crate) fn of(fitted: &Fitted, scale: &[f64]) -> Uncertainty {
+    pub(crate) fn of(fitted: &FittedModel, scale: &[f64]) -> Uncertainty {
         Uncertainty::at(&Linearised::of(fitted, scale))
     }
 
@@ -206,7 +206,7 @@ impl Uncertainty {
     /// tr(V⁻¹ S)/tr(V⁻¹ S₀) of the parameters θ at these positions among those that are free: S is the part of their covariance
     /// that comes from the residual, S₀ the same in white noise, and V = (H⁻¹)_θ what a fit of unit variance knows of them with
     /// their priors. (Where a prior decides, the residual says nothing, however it is distributed.)
-    pub(crate) fn inflation(fitted: &Fitted, scale: &[f64], tested: &[usize]) -> Inflation {
+    pub(crate) fn inflation(fitted: &FittedModel, scale: &[f64], tested: &[usize]) -> Inflation {
         if tested.is_empty() {
             return Inflation { factor: 1.0, freedom: f64::INFINITY, parameters: 0.0 };
         }
@@ -242,7 +242,7 @@ impl Uncertainty {
     }
 
     /// Covariance of the parameters at these positions in white noise of the fit's scale.
-    pub(crate) fn known(fitted: &Fitted, scale: &[f64], positions: &[usize]) -> Vec<f64> {
+    pub(crate) fn known(fitted: &FittedModel, scale: &[f64], positions: &[usize]) -> Vec<f64> {
         let model = Linearised::of(fitted, scale);
         let t = positions.len();
         (0..t * t).map(|i| model.inverse[positions[i / t]][positions[i % t]]).collect()
@@ -320,7 +320,7 @@ fn between(inverse: &[Vec<f64>], meat: &[f64], np: usize) -> Vec<f64> {
 }
 
 /// Jᵀ r over each block of samples.
-fn block_scores(fitted: &Fitted, segments: &[Projected]) -> Vec<Vec<f64>> {
+fn block_scores(fitted: &FittedModel, segments: &[Projected]) -> Vec<Vec<f64>> {
     let (ny, np) = (fitted.setup.system.ny, fitted.setup.free.len());
     let total: usize = fitted.level.segments.iter().map(|s| s.range.len()).sum();
     let length = (total / BLOCKS).max(1);
@@ -372,7 +372,7 @@ y = "b*f"
     }
 
     /// A model fitted to one recording of these channels, one sample a second, from these parameters.
-    fn fit(model: &Model, channels: &[(&str, &[f64])], from: &[f64]) -> Fitted {
+    fn fit(model: &Model, channels: &[(&str, &[f64])], from: &[f64]) -> FittedModel {
         let time = (0..channels[0].1.len()).map(|k| k as f64).collect();
         let channel = |(name, values): &(&str, &[f64])| Channel {
             name: (*name).into(),
@@ -386,7 +386,7 @@ y = "b*f"
         let level = setup.level(1);
         let start = Point { parameters: from.to_vec(), starts: setup.starts(&level, from) };
         let fit = setup.fit(&level, &[0.1], &[start], Limits::default());
-        Fitted { setup, parts: Vec::new(), level, fit }
+        FittedModel { setup, parts: Vec::new(), level, fit }
     }
 
     /// b, half of its interval and its inflation from one recording of the input f(k), in errors made of it and a first-order autoregression.

@@ -9,11 +9,11 @@
 
 use std::ops::Range;
 
-use greybox_calibrate::{Criterion, Data, Level, Limits, Point, Segment, Setup};
+use greybox_calibrate::{Criterion, Data, Limits, Point, Segment, Segmentation, Setup};
 use rayon::prelude::*;
 use statrs::distribution::{ContinuousCDF, StudentsT};
 
-use crate::search::Fitted;
+use crate::search::FittedModel;
 
 /// Most folds of several recordings; a single one has one less.
 const FOLDS: usize = 5;
@@ -62,7 +62,7 @@ pub(crate) fn folds(data: &Data) -> Vec<Fold> {
 
 /// The mean over the channels of ln(RMS error / spread) on each fold, left out of the fit; infinite where the simulation
 /// diverges.
-pub(crate) fn errors(fitted: &Fitted, scale: &[f64], criterion: Criterion, window: f64) -> Vec<f64> {
+pub(crate) fn errors(fitted: &FittedModel, scale: &[f64], criterion: Criterion, window: f64) -> Vec<f64> {
     let setup = &fitted.setup;
     let run = setup.free_run(&fitted.fit.point.parameters, scale);
     let window = match criterion {
@@ -103,12 +103,12 @@ pub(crate) fn errors(fitted: &Fitted, scale: &[f64], criterion: Criterion, windo
         .collect()
 }
 
-fn longest(level: &Level) -> usize {
+fn longest(level: &Segmentation) -> usize {
     level.segments.iter().map(|s| s.range.len()).max().unwrap_or(SHORTEST).max(SHORTEST)
 }
 
 /// Segments of at most this length over all that a fold leaves.
-fn without(setup: &Setup, fold: &Fold, length: usize) -> Level {
+fn without(setup: &Setup, fold: &Fold, length: usize) -> Segmentation {
     let single = setup.data.recordings.len() == 1;
     let last = fold.iter().map(|f| f.0).max().unwrap_or(0);
     let mut segments = Vec::new();
@@ -134,7 +134,7 @@ fn without(setup: &Setup, fold: &Fold, length: usize) -> Level {
         }
     }
     let priors = segments.iter().map(|s| setup.start_prior(s.piece, s.range.start)).collect();
-    Level { segments, priors }
+    Segmentation { segments, priors }
 }
 
 /// What cross-validation says of a model beside a simpler one.

@@ -1,6 +1,6 @@
 //! What is proposed without a name, and how far it can be trusted.
 
-use greybox_diagnose::diagnosis::{Basis, Finding};
+use greybox_diagnose::diagnosis::{Basis, IdentifiedMechanism};
 use greybox_diagnose::{Options, Quiet, Verdict, diagnose};
 use greybox_model::{Hold, Model, System, WriteOptions};
 use greybox_recording::{Channel, Recording};
@@ -191,7 +191,7 @@ fn terms_alone_are_never_named() {
     let terms = found(true);
     assert_eq!((terms.verdict, terms.basis), (Verdict::Unexplained, Basis::Proposed));
     assert!(terms.mechanisms.is_empty());
-    let of = |found: &[Finding]| {
+    let of = |found: &[IdentifiedMechanism]| {
         let [one] = found else { panic!("{} terms", found.len()) };
         (one.kind.clone(), one.parameters[0].2.value)
     };

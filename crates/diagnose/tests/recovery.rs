@@ -6,7 +6,7 @@ use std::ops::Range;
 use std::sync::{Arc, Mutex};
 
 use greybox_calibrate::Work;
-use greybox_diagnose::{Diagnosis, Observer, Options, Quiet, Verdict, Weighed, calibrate, diagnose};
+use greybox_diagnose::{Diagnosis, Options, ProgressListener, Quiet, Verdict, Weighed, calibrate, diagnose};
 use greybox_model::Model;
 use greybox_recording::{Channel, Recording};
 use rand::SeedableRng;
@@ -300,7 +300,7 @@ struct Listener {
     work: Mutex<Vec<Arc<Work>>>,
 }
 
-impl Observer for Listener {
+impl ProgressListener for Listener {
     fn begins(&self, work: &Arc<Work>) {
         self.work.lock().unwrap().push(work.clone());
     }

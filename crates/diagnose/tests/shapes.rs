@@ -2,9 +2,9 @@
 
 use std::sync::Arc;
 
-use greybox_calibrate::{Data, Fit, Level, Limits, Point, Setup, free_parameters};
-use greybox_diagnose::evidence::fall;
-use greybox_diagnose::surface::{held_out, test};
+use greybox_calibrate::{Data, Fit, Limits, Point, Segmentation, Setup, free_parameters};
+use greybox_diagnose::discrepancy::{held_out, test};
+use greybox_diagnose::evidence::cross_validation_improvement;
 use greybox_model::{Hold, Model, System};
 use greybox_recording::{Channel, Recording};
 use greybox_simulate::{Environment, Method, Seeds, Signal, integrate};
@@ -71,7 +71,7 @@ fn record(seed: u64, correlation: f64) -> Recording {
 }
 
 /// A model fitted to a recording, with a noise model of its own residual if asked for.
-fn fitted(force: &str, recording: &Recording, whitened: bool) -> (Setup, Level, Vec<f64>, Fit) {
+fn fitted(force: &str, recording: &Recording, whitened: bool) -> (Setup, Segmentation, Vec<f64>, Fit) {
     let model = model(force);
     let data = Arc::new(Data::new(&model, std::slice::from_ref(recording)).unwrap());
     let mut setup = Setup::new(&model, data, free_parameters(&model)).unwrap();
@@ -119,7 +119,7 @@ fn models_and_free_shapes_share_their_folds() {
     let (setup, level, scale, fit) = fitted("k*x", &recording, false);
     let free = test(&setup, &level, &scale, &fit.point).unwrap();
     let own = held_out(&setup, &level, &scale, &fit.point, free.block).unwrap();
-    let (ahead, t) = fall(&own, &free.errors);
+    let (ahead, t) = cross_validation_improvement(&own, &free.errors);
     assert!((ahead / own.iter().sum::<f64>() - free.gain).abs() < 1e-12, "{ahead} {}", free.gain);
     assert!((t - free.t).abs() < 1e-9, "{t} {}", free.t);
     assert!(free.gain > 0.5, "{}", free.gain);
@@ -127,6 +127,6 @@ fn models_and_free_shapes_share_their_folds() {
     // The law itself is ahead of every free shape.
     let (setup, level, _, fit) = fitted("k*x + k3*x^3", &recording, false);
     let law = held_out(&setup, &level, &scale, &fit.point, free.block).unwrap();
-    let (ahead, t) = fall(&free.errors, &law);
+    let (ahead, t) = cross_validation_improvement(&free.errors, &law);
     assert!(ahead > 0.0 && t > 2.0, "{ahead} {t}");
 }

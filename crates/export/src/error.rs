@@ -46,7 +46,7 @@ pub enum ExportError {
     #[error(transparent)]
     Compile(#[from] CompileError),
     /// A model that a language cannot hold as it stands.
-    #[error("equation \"{equation}\": `{function}` cannot be written in {language}: {reason}; mend: {mend}")]
+    #[error("equation \"{equation}\": `{function}` cannot be written in {language}: {reason}; help: {help}")]
     Refused {
         /// Name of the equation.
         equation: String,
@@ -57,6 +57,6 @@ pub enum ExportError {
         /// Why not.
         reason: &'static str,
         /// What to do.
-        mend: &'static str,
+        help: &'static str,
     },
 }

@@ -233,7 +233,7 @@ impl Module<'_> {
                     function: "sign",
                     language: "Python",
                     reason: "whether the sign of a delayed expression sticks depends on the rate of the past",
-                    mend: "let the sign act on a state of its own, or write tanh(…/width) for it",
+                    help: "let the sign act on a state of its own, or write tanh(…/width) for it",
                 });
             }
         }

@@ -192,7 +192,7 @@ fn python_refuses_the_sign_of_a_delay_and_says_what_to_do() {
         matches!(&error, ExportError::Refused { equation, function: "sign", .. } if equation == "motor"),
         "{error}"
     );
-    assert!(error.to_string().contains("mend: "), "{error}");
+    assert!(error.to_string().contains("help: "), "{error}");
     // The others have no such trouble.
     assert!(modelica(&model).unwrap().contains("delay(x_dot, tau) > sign_width"));
 }

@@ -159,7 +159,7 @@ pub enum HjbError {
         option: &'static str,
         /// Its value.
         value: f64,
-        /// The mend.
+        /// The fix.
         wanted: &'static str,
     },
     /// The collocation points do not determine the weights.

@@ -90,7 +90,7 @@ impl Reduced {
     }
 
     /// n ln(RSS/n + floor) + c k + surcharges + \[an even term is chosen\] · c_e, with k chosen optional
-    /// terms. The floor keeps a noise-free record from paying for terms that only mend rounding.
+    /// terms. The floor keeps a noise-free record from paying for terms that only fix rounding.
     fn criterion(&self, solution: &Solution, price: &Price<'_>) -> f64 {
         let n = self.samples;
         let Roles { kept, even, surcharge, .. } = price.roles;
@@ -334,7 +334,7 @@ mod tests {
     }
 
     #[test]
-    fn what_only_mends_rounding_is_left_out() {
+    fn what_only_fixes_rounding_is_left_out() {
         // Residuals of 10⁻⁷ where 10⁻⁵ counts as numerical: the third term is certain, and irrelevant.
         let mut reduced = orthogonal(&[30.0, 20.0, 1e-5], 1000.0, 1e-10);
         reduced.rest = 1000.0 * 1e-14;

@@ -2,7 +2,7 @@
 
 use std::sync::Arc;
 
-use greybox_calibrate::{Data, FreeRun, Hats, Score, Setup, Work, window_length};
+use greybox_calibrate::{Data, FreeRun, Score, Setup, SmoothedStates, Work, window_length};
 use greybox_model::{Hold, Model, Unit};
 use greybox_recording::Recording;
 use greybox_sparse::{folds, select};
@@ -225,7 +225,7 @@ pub struct Identification {
 }
 
 /// Watches an identification. It never steers it, but may end it: by giving the work up, and by unwinding.
-pub trait Observer: Sync {
+pub trait ProgressListener: Sync {
     /// The work begins; it may be [given up](Work::give_up), after which it ends soon.
     fn begins(&self, _work: &Arc<Work>) {}
     /// A stage begins.
@@ -235,7 +235,7 @@ pub trait Observer: Sync {
 /// Nobody watches.
 #[derive(Debug, Clone, Copy, Default)]
 pub struct Quiet;
-impl Observer for Quiet {}
+impl ProgressListener for Quiet {}
 
 /// Identifies the governing equations of `train`; `holdout` recordings are only simulated.
 ///
@@ -245,11 +245,11 @@ pub fn identify(
     train: &[Recording],
     holdout: &[Recording],
     options: &Options,
-    observer: &dyn Observer,
+    listener: &dyn ProgressListener,
 ) -> Result<Identification, IdentifyError> {
     let (fit_on, held, source) = split(train, holdout);
-    let found = search(&fit_on, options, observer)?;
-    observer.stage("precision");
+    let found = search(&fit_on, options, listener)?;
+    listener.stage("precision");
     let Search { structure, data, first, refined } = &found;
     let precision = precision::assess(structure, refined, &first.allowed, options);
     conclude(structure, data, refined, &precision, first, &held, source, options)
@@ -268,7 +268,7 @@ pub(crate) struct Search {
 pub(crate) fn search(
     fit_on: &[Recording],
     options: &Options,
-    observer: &dyn Observer,
+    listener: &dyn ProgressListener,
 ) -> Result<Search, IdentifyError> {
     let structure = structure(fit_on, options)?;
     let all = vec![true; structure.terms.len()];
@@ -284,13 +284,13 @@ pub(crate) fn search(
         return Err(IdentifyError::Still { name: data.channels[c].name.clone() });
     }
 
-    observer.stage("weak form");
-    let hats = Hats::new(&whole, &data);
-    let first = first_estimates(&structure, &whole, &data, &hats, options)?;
+    listener.stage("weak form");
+    let smoothed_states = SmoothedStates::new(&whole, &data);
+    let first = first_estimates(&structure, &whole, &data, &smoothed_states, options)?;
 
-    observer.stage("output error");
+    listener.stage("output error");
     let work = Arc::new(Work::within(options.work));
-    observer.begins(&work);
+    listener.begins(&work);
     let refined = best_refined(&structure, &data, &first, &work).ok_or(IdentifyError::NoFit)?;
     let (structure, refined) = match options.hold {
         None if !work.is_spent() => better_hold(structure, refined),
@@ -478,13 +478,13 @@ fn first_estimates(
     structure: &Structure,
     model: &Model,
     data: &Data,
-    hats: &Hats,
+    smoothed_states: &SmoothedStates,
     options: &Options,
 ) -> Result<First, IdentifyError> {
     let period = weak::period(data);
     let longest = data.pieces.iter().map(|p| p.len).max().unwrap_or(0);
     let dt = data.pieces.iter().map(|p| p.dt).fold(f64::INFINITY, f64::min);
-    let values = weak::evaluate(structure, model, data, hats).ok_or(IdentifyError::NoFit)?;
+    let values = weak::evaluate(structure, model, data, smoothed_states).ok_or(IdentifyError::NoFit)?;
     let window = |share: f64| (share * period).clamp(16.0 * dt, 0.2 * longest as f64 * dt);
     let everything = vec![true; structure.terms.len()];
     let trials = trials(options);

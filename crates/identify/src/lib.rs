@@ -14,7 +14,7 @@ mod weak;
 pub use error::IdentifyError;
 pub use identify::{
     Blocks, DelayedState, DoubtfulTerm, FoundDelay, FoundEquation, FoundTerm, HoldoutSource, Identification,
-    MOST_WORK, Observer, Options, OrderChoice, Quiet, Role, identify,
+    MOST_WORK, Options, OrderChoice, ProgressListener, Quiet, Role, identify,
 };
 pub use library::{Library, Monomials};
 pub use stream::{Linearisation, Statistics, Streamed, identify_blocks};

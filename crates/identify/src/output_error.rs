@@ -10,7 +10,7 @@
 use std::sync::Arc;
 
 use greybox_calibrate::{
-    Data, Fit, Free, Level, Limits, Point, Prior, Segment, SegmentRows, Setup, Work, qr,
+    Data, Fit, FreeParameter, Limits, Point, Prior, Segment, SegmentRows, Segmentation, Setup, Work, qr,
 };
 use rayon::prelude::*;
 
@@ -40,7 +40,7 @@ pub(crate) struct Refined {
     /// Compiled with its data.
     pub setup: Setup,
     /// Segments of the last fit.
-    pub level: Level,
+    pub level: Segmentation,
     /// The last fit.
     pub fit: Fit,
     /// Residual standard deviation per channel, SI.
@@ -68,7 +68,7 @@ pub(crate) fn setup(
                 (true, true) => (0.02 * p.value, 50.0 * p.value),
                 (true, false) => (50.0 * p.value, 0.02 * p.value),
             };
-            Free { index, prior: Prior::Flat, lower, upper }
+            FreeParameter { index, prior: Prior::Flat, lower, upper }
         })
         .collect();
     let holds: Vec<greybox_model::Hold> = model.inputs.iter().map(|i| i.hold).collect();
@@ -433,7 +433,7 @@ pub(crate) fn refit(structure: &Structure, refined: &Refined) -> Option<Refined>
     fit.cost.is_finite().then(|| Refined { setup: next, fit, ..refined.clone() }.after(structure))
 }
 
-fn fit_at(refined: &Refined, structure: &Structure, to: Level, limits: Limits) -> Refined {
+fn fit_at(refined: &Refined, structure: &Structure, to: Segmentation, limits: Limits) -> Refined {
     let start = refined.setup.stitch(&refined.level, &refined.fit.point, &to, &refined.scale);
     let fit = refined.setup.with_problem(&to, &refined.scale, |p| p.fit(start, limits));
     Refined { level: to, fit, ..refined.clone() }.after(structure)

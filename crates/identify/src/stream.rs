@@ -19,7 +19,7 @@ use crate::choose::Reduced;
 use crate::correlation::{LONGEST, Lagged};
 use crate::error::IdentifyError;
 use crate::identify::{
-    self, Blocks, HoldoutSource, Identification, Observer, Options, Search, conclude, search,
+    self, Blocks, HoldoutSource, Identification, Options, ProgressListener, Search, conclude, search,
 };
 use crate::output_error::{self, Linearised, Refined, either, floor, stack, triangle_of, widen};
 use crate::precision::{self, BLOCKS, Precision, Spread};
@@ -134,12 +134,12 @@ impl Linearisation {
     pub fn begin(
         block: &Recording,
         options: &Options,
-        observer: &dyn Observer,
+        listener: &dyn ProgressListener,
     ) -> Result<Self, IdentifyError> {
         if options.delay.is_some() {
             return Err(IdentifyError::DelayInBlocks);
         }
-        let search = search(std::slice::from_ref(block), options, observer)?;
+        let search = search(std::slice::from_ref(block), options, listener)?;
         let samples = search.data.samples();
         let segment = samples.div_ceil(search.refined.level.segments.len().max(1));
         Ok(Self { search, segment, steps: 0, moved: f64::INFINITY })
@@ -371,7 +371,7 @@ pub fn identify_blocks<I, E>(
     open: impl Fn() -> Result<I, E>,
     holdout: &[Recording],
     options: &Options,
-    observer: &dyn Observer,
+    listener: &dyn ProgressListener,
 ) -> Result<Streamed, E>
 where
     I: Iterator<Item = Result<Recording, E>> + Send,
@@ -380,19 +380,19 @@ where
     let mut blocks = open()?;
     let first = blocks.next().ok_or(IdentifyError::NoBlocks)??;
     let Some(second) = blocks.next().transpose()? else {
-        let found = identify::identify(std::slice::from_ref(&first), holdout, options, observer)?;
+        let found = identify::identify(std::slice::from_ref(&first), holdout, options, listener)?;
         return Ok(Streamed { found, first, holdout: holdout.to_vec() });
     };
     drop((blocks, second));
-    let mut around = Linearisation::begin(&first, options, observer)?;
+    let mut around = Linearisation::begin(&first, options, listener)?;
     let (statistics, last) = loop {
-        let (statistics, last) = pass(&around, open()?, holdout.is_empty(), observer)?;
+        let (statistics, last) = pass(&around, open()?, holdout.is_empty(), listener)?;
         around = around.step(&statistics)?;
         if around.is_settled() || around.steps == PASSES {
             break (statistics, last);
         }
     };
-    observer.stage("precision");
+    listener.stage("precision");
     let (held, source) = match last {
         Some(last) => (vec![last], HoldoutSource::LastBlock),
         None => (holdout.to_vec(), HoldoutSource::Given),
@@ -407,7 +407,7 @@ fn pass<E: From<IdentifyError> + Send>(
     around: &Linearisation,
     mut blocks: impl Iterator<Item = Result<Recording, E>> + Send,
     keep: bool,
-    observer: &dyn Observer,
+    listener: &dyn ProgressListener,
 ) -> Result<(Statistics, Option<Recording>), E> {
     let most = 4 * rayon::current_num_threads().max(1);
     // Blocks to map, one held back where it may be the last, and whether there are no more.
@@ -442,6 +442,6 @@ fn pass<E: From<IdentifyError> + Send>(
         };
         (batch, held, over) = next?;
         let samples = statistics.as_ref().map_or(0, Statistics::samples);
-        observer.stage(&format!("pass {}, {samples} samples", around.steps + 1));
+        listener.stage(&format!("pass {}, {samples} samples", around.steps + 1));
     }
 }

@@ -6,7 +6,7 @@
 //! choice of terms with them: that is why what is found here is only where the output error starts.
 
 use greybox_algebraic::{Column, Hold as Join, Kernel, rows_of_pieces};
-use greybox_calibrate::{Data, Hats, qr};
+use greybox_calibrate::{Data, SmoothedStates, qr};
 use greybox_model::tape::{Column as Lane, LeafKind, Tape};
 use greybox_model::{Expr, Hold, Model};
 
@@ -60,7 +60,7 @@ pub(crate) fn evaluate(
     structure: &Structure,
     model: &Model,
     data: &Data,
-    hats: &Hats,
+    smoothed_states: &SmoothedStates,
 ) -> Option<Vec<Vec<Vec<f64>>>> {
     let orders: Vec<usize> = model.states.iter().map(|s| s.order).collect();
     let offsets: Vec<usize> = orders
@@ -92,14 +92,14 @@ pub(crate) fn evaluate(
     let tape = Tape::compile(&exprs, kinds, &resolve).ok()?;
     data.pieces
         .iter()
-        .zip(&hats.states)
-        .map(|(piece, hats)| {
-            if hats.iter().any(Option::is_none) {
+        .zip(&smoothed_states.states)
+        .map(|(piece, smoothed_states)| {
+            if smoothed_states.iter().any(Option::is_none) {
                 return None;
             }
             let leaf = |i: usize| -> Lane<'_> {
                 if i < nx {
-                    Lane::Series(hats[i].as_deref().unwrap_or(&[]))
+                    Lane::Series(smoothed_states[i].as_deref().unwrap_or(&[]))
                 } else {
                     Lane::Series(&piece.inputs[i - nx])
                 }

@@ -301,7 +301,7 @@ fn the_number_of_threads_does_not_change_a_bit() {
 }
 
 #[test]
-fn wrong_requests_are_errors_that_name_the_mend() {
+fn wrong_requests_are_errors_that_name_the_help() {
     let data = [duffing(1, 0.01, 5.0, 0.01)];
     let error = |options: Options| identify(&data, &data, &options, &Quiet).unwrap_err();
     assert!(matches!(error(Options::new(&[], &["f"])), IdentifyError::NoStates));

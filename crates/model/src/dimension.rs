@@ -290,7 +290,7 @@ impl<'a> Checker<'a> {
                 dimension,
                 expected,
             };
-            (ModelError::new(problem).with_help(self.mend(e, dimension, expected)), whole.clone())
+            (ModelError::new(problem).with_help(self.help(e, dimension, expected)), whole.clone())
         })
     }
 
@@ -333,7 +333,7 @@ impl<'a> Checker<'a> {
                 others: others.join(", "),
                 expected,
             };
-            let error = ModelError::new(problem).with_help(self.mend(term, *dimension, expected));
+            let error = ModelError::new(problem).with_help(self.help(term, *dimension, expected));
             return Err((error, (*term).clone()));
         }
 
@@ -368,7 +368,7 @@ impl<'a> Checker<'a> {
     }
 
     /// What to change so that `term`, in `dimension`, comes out in `expected`.
-    fn mend(&self, term: &Expr, dimension: Dimension, expected: Dimension) -> String {
+    fn help(&self, term: &Expr, dimension: Dimension, expected: Dimension) -> String {
         if term.constant().is_some() {
             return format!("a bare number is dimensionless: make it a parameter with the unit {expected}");
         }

@@ -4,9 +4,9 @@ use crate::units::Dimension;
 use std::fmt;
 use std::ops::Range;
 
-/// A model that cannot be used: what is wrong, where, and how to mend it.
+/// A model that cannot be used: what is wrong, where, and how to fix it.
 ///
-/// Its `Display` is one paragraph, `file:line:column: what is wrong; mend: …`; the parts are at
+/// Its `Display` is one paragraph, `file:line:column: what is wrong; help: …`; the parts are at
 /// hand for a renderer that shows the source line.
 #[derive(Debug, Clone, PartialEq)]
 #[non_exhaustive]
@@ -303,7 +303,7 @@ impl ModelError {
         self.0.line_column
     }
 
-    /// The mend.
+    /// The fix.
     pub fn help(&self) -> Option<&str> {
         self.0.help.as_deref()
     }
@@ -319,7 +319,7 @@ impl fmt::Display for ModelError {
             f.write_str(" ")?;
         }
         write!(f, "{}", self.problem())?;
-        self.help().map_or(Ok(()), |help| write!(f, "; mend: {help}"))
+        self.help().map_or(Ok(()), |help| write!(f, "; help: {help}"))
     }
 }
 

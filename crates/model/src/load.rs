@@ -47,7 +47,7 @@ impl Model {
     /// ```
     ///
     /// # Errors
-    /// [`ModelError`] with file, line, column, what is wrong and the mend; the first fault only.
+    /// [`ModelError`] with file, line, column, what is wrong and the fix; the first fault only.
     pub fn from_toml(text: &str, file: &str) -> Result<Model, ModelError> {
         load(text).map_err(|(error, span)| error.at(file, text, span))
     }
@@ -519,9 +519,9 @@ fn declare(
     let starts = letters.next().is_some_and(|c| c.is_alphabetic() || c == '_');
     if !starts || !letters.all(|c| c.is_alphabetic() || c.is_ascii_digit() || c == '_') {
         let clean: String = name.chars().map(|c| if c.is_alphanumeric() { c } else { '_' }).collect();
-        let mend = if starts { clean } else { format!("x{clean}") };
+        let help = if starts { clean } else { format!("x{clean}") };
         let help =
-            format!("write `{mend}` in the equations, and `channel = \"{name}\"` if a channel is called so");
+            format!("write `{help}` in the equations, and `channel = \"{name}\"` if a channel is called so");
         return reject("a name is a letter, then letters, digits and `_`", help);
     }
     if let Some((_, first)) = declared.iter().find(|(n, _)| n == name) {

@@ -72,13 +72,13 @@ pub struct ParsedEquation {
 
 /// Text that is not an expression of the model language.
 #[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
-#[error("{message}{}", .help.as_ref().map(|h| format!("; mend: {h}")).unwrap_or_default())]
+#[error("{message}{}", .help.as_ref().map(|h| format!("; help: {h}")).unwrap_or_default())]
 pub struct SyntaxError {
     /// Where, in bytes of the text (empty range at its end).
     pub span: Range<usize>,
     /// What was found and what was expected.
     pub message: String,
-    /// How to mend it.
+    /// How to fix it.
     pub help: Option<String>,
 }
 
@@ -97,7 +97,7 @@ pub struct SyntaxError {
 /// ```
 ///
 /// # Errors
-/// [`SyntaxError`] names what was found, what was expected, and the mend where one is likely.
+/// [`SyntaxError`] names what was found, what was expected, and the fix where one is likely.
 pub fn parse(text: &str) -> Result<Parsed, SyntaxError> {
     let tokens = lex(text)?;
     if let Some(equals) = tokens.iter().find(|t| t.kind == Kind::Equals) {

@@ -70,13 +70,13 @@ pub struct Unit {
 
 /// Text that is not a unit.
 #[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
-#[error("{message}{}", .help.as_ref().map(|h| format!("; mend: {h}")).unwrap_or_default())]
+#[error("{message}{}", .help.as_ref().map(|h| format!("; help: {h}")).unwrap_or_default())]
 pub struct UnitError {
     /// The offending token, in bytes of the unit's text.
     pub span: Range<usize>,
     /// What is wrong.
     pub message: String,
-    /// How to mend it.
+    /// How to fix it.
     pub help: Option<String>,
     /// The symbol, where it is one that is not known. Another model may declare it.
     pub unknown: Option<String>,
@@ -369,7 +369,7 @@ impl Unit {
     /// ```
     ///
     /// # Errors
-    /// [`UnitError`] names the offending token and its mend.
+    /// [`UnitError`] names the offending token and its fix.
     pub fn parse(text: &str) -> Result<Unit, UnitError> {
         Units::default().parse(text)
     }
@@ -727,8 +727,8 @@ impl UnitParser<'_> {
         let digits = self.take(|c| c.is_ascii_digit());
         if !digits.is_empty() {
             let wrong = &self.text[span.start..digits.end];
-            let mend = format!("write `{symbol}^{}`", &self.text[digits.clone()]);
-            return Err(unit_error(span.start..digits.end, format!("unknown unit `{wrong}`"), Some(&mend)));
+            let help = format!("write `{symbol}^{}`", &self.text[digits.clone()]);
+            return Err(unit_error(span.start..digits.end, format!("unknown unit `{wrong}`"), Some(&help)));
         }
         Ok(found)
     }

@@ -364,7 +364,7 @@ fn what_is_read_can_be_printed_and_read_again() {
 
 /// text → place of the error, then fragments of its message.
 #[test]
-fn syntax_errors_name_the_mend() {
+fn syntax_errors_name_the_help() {
     for (text, place, fragments) in [
         ("2theta", 1..6, &["`theta` after `2`", "write `2*theta`"] as &[_]),
         ("2 x", 2..3, &["write `2*x`"]),

@@ -172,7 +172,7 @@ type Case = (&'static str, &'static str, (usize, usize), &'static [&'static str]
 
 /// A change of the flexible link → where the fault is found, and what its message says.
 #[test]
-fn bad_files_name_place_and_mend() {
+fn bad_files_name_place_and_help() {
     let hub = "J*theta'' + B*theta' - ks*alpha = kt*v";
     let cases: &[Case] = &[
         // TOML
@@ -435,7 +435,7 @@ fn temperatures_are_absolute_in_kelvin_and_their_differences_differences() {
     // A difference has no zero.
     let wrong = ROOM.replace("rise = \"Ti - Ta\"", "rise = { expression = \"Ti - Ta\", unit = \"degC\" }");
     let error = Model::from_toml(&wrong, "room.toml").unwrap_err();
-    assert!(error.to_string().contains("is a difference; mend: write `unit = \"K\"`"), "{error}");
+    assert!(error.to_string().contains("is a difference; help: write `unit = \"K\"`"), "{error}");
 }
 
 #[test]
@@ -468,9 +468,9 @@ fn units_that_a_model_declares() {
         ),
         (
             "mm = \"2 kg\"",
-            "m.toml:2:1: `mm` cannot name a unit: it is a built-in unit; mend: choose another symbol, such as `mm_`",
+            "m.toml:2:1: `mm` cannot name a unit: it is a built-in unit; help: choose another symbol, such as `mm_`",
         ),
-        ("x2 = \"2 kg\"", "a unit's symbol consists of letters and `_`; mend: write `x`"),
+        ("x2 = \"2 kg\"", "a unit's symbol consists of letters and `_`; help: write `x`"),
         (
             "bolus = \"2 lot\"\nlot = \"3 bolus\"",
             "unit `bolus`: its definition leads through `lot` back to itself",
@@ -479,7 +479,7 @@ fn units_that_a_model_declares() {
         ("bolus = { value = 2 }", "unit `bolus` lacks `unit`"),
         (
             "bolus = { value = 2, units = \"kg\" }",
-            "unknown key `units` in unit `bolus`; mend: did you mean `unit`?",
+            "unknown key `units` in unit `bolus`; help: did you mean `unit`?",
         ),
         ("a = \"own\"\nb = \"own\"\nc = \"own\"\nd = \"own\"\nbolus = \"own\"", "at most 4 dimensions"),
         ("bolus = \"own\"\nbolus = \"kg\"", "not TOML"),

@@ -127,7 +127,7 @@ impl CsvBlocks {
                 place: Place::line(&self.label, self.before + 1).column(0, "t"),
                 found,
                 previous,
-                mend: "one file holds one continuous experiment: split the file here, or sort the rows",
+                help: "one file holds one continuous experiment: split the file here, or sort the rows",
             });
         }
         self.last = recording.time.last().copied();
@@ -354,7 +354,7 @@ pub(crate) fn parse(bytes: &[u8], label: &str, name: &str, above: u64) -> Result
                 place: source.place(&record).column(0, "t"),
                 found: time[last],
                 previous: time[last - 1],
-                mend: if time[last] == time[last - 1] {
+                help: if time[last] == time[last - 1] {
                     "remove the repeated row, or write the times with more digits"
                 } else {
                     "one file holds one continuous experiment: split the file here, or sort the rows"
@@ -370,7 +370,7 @@ pub(crate) fn parse(bytes: &[u8], label: &str, name: &str, above: u64) -> Result
             place: Place::file(label),
             rows: 0,
             needed: crate::recording::MIN_SAMPLES,
-            mend: "there is a header and nothing under it, export the samples too",
+            help: "there is a header and nothing under it, export the samples too",
         });
     }
     let channels = header
@@ -430,13 +430,13 @@ fn header(record: &ByteRecord, place: &Place, text: &[u8]) -> Result<Header, Rec
         }
         if first.contains(separator) {
             let rows = text.splitn(2, |&b| b == b'\n').nth(1).unwrap_or(&[]);
-            let mend = if rows.iter().take(4096).any(|&b| b == b',') {
+            let help = if rows.iter().take(4096).any(|&b| b == b',') {
                 "first replace the decimal commas by points, then the separators by commas (or export with an \
                  English number format)"
             } else {
                 "replace the separators by commas, or export as `CSV (comma separated)`"
             };
-            return Err(RecordingError::Separator { place: place.clone(), found, mend });
+            return Err(RecordingError::Separator { place: place.clone(), found, help });
         }
     }
     if first.parse::<f64>().is_ok() {
@@ -449,7 +449,7 @@ fn header(record: &ByteRecord, place: &Place, text: &[u8]) -> Result<Header, Rec
         .map(|(c, cell)| header_cell(cell, || place.clone().column(c, cell)))
         .collect::<Result<Vec<_>, _>>();
     let time_column =
-        |mend: String| RecordingError::TimeColumn { place: place.clone(), found: first.clone(), mend };
+        |help: String| RecordingError::TimeColumn { place: place.clone(), found: first.clone(), help };
     let time = header_cell(&first, || place.clone().column(0, &first));
     let time_scale = match &time {
         Ok((name, unit)) if name == "t" => match seconds(unit.as_deref()) {
@@ -498,7 +498,7 @@ pub(crate) fn header_cell(
     cell: &str,
     place: impl Fn() -> Place,
 ) -> Result<(String, Option<String>), RecordingError> {
-    let refuse = |mend| RecordingError::HeaderCell { place: place(), found: cell.to_owned(), mend };
+    let refuse = |help| RecordingError::HeaderCell { place: place(), found: cell.to_owned(), help };
     let (name, unit) = match cell.split_once('[') {
         Some((name, rest)) if !name.contains(']') => match rest.strip_suffix(']') {
             Some(unit) if !unit.contains(['[', ']']) => (name.trim(), Some(unit.trim())),
@@ -546,14 +546,14 @@ fn bad_cell(cell: &[u8], c: usize, place: Place) -> RecordingError {
     if found.matches(',').count() == 1 && number_like(&found.replace(',', ".")) {
         return RecordingError::DecimalComma { place, found: format!("`{found}`") };
     }
-    let mend = if open_quote {
+    let help = if open_quote {
         "a quotation mark opens there and does not close in its line: remove it"
     } else if c == 0 {
         "write the time as a number of seconds"
     } else {
         "write a number, or leave the cell empty for a missing sample"
     };
-    RecordingError::NotANumber { place, found, mend }
+    RecordingError::NotANumber { place, found, help }
 }
 
 /// A row with the wrong number of cells: a decimal comma where all cells are whole numbers and too many.
@@ -567,14 +567,14 @@ fn cell_count(record: &ByteRecord, width: usize, place: Place) -> RecordingError
         return RecordingError::DecimalComma { place, found: format!("the row `{}…`", cells.join(",")) };
     }
     let first = record.get(0).unwrap_or_default();
-    let mend = if record.iter().any(|cell| cell.contains(&b'\n')) {
+    let help = if record.iter().any(|cell| cell.contains(&b'\n')) {
         "a quotation mark opens in this row and does not close in its line: remove it"
     } else if record.len() == 1 && first.iter().any(|b| matches!(b, b';' | b'\t' | b'|')) {
         "separate its cells by commas, as those of the header"
     } else {
         "give every column its cell (an empty cell marks a missing sample) and no more"
     };
-    RecordingError::CellCount { place, found: record.len(), expected: width, mend }
+    RecordingError::CellCount { place, found: record.len(), expected: width, help }
 }
 
 #[cfg(test)]

@@ -1,4 +1,4 @@
-//! Why a recording could not be read or written: the place, what was found there, the mend.
+//! Why a recording could not be read or written: the place, what was found there, the fix.
 
 use std::fmt;
 
@@ -47,7 +47,7 @@ fn counted(number: usize, what: &str) -> String {
     format!("{number} {what}{}", if number == 1 { "" } else { "s" })
 }
 
-/// Why a recording could not be read or written. Each message is one paragraph: place, what was found, mend.
+/// Why a recording could not be read or written. Each message is one paragraph: place, what was found, fix.
 #[derive(Debug, thiserror::Error)]
 #[non_exhaustive]
 pub enum RecordingError {
@@ -99,7 +99,7 @@ pub enum RecordingError {
     /// The columns are separated by something else than a comma.
     #[error(
         "{place}: the columns are separated by {found}; greybox reads comma-separated files with a decimal \
-         point: {mend}"
+         point: {help}"
     )]
     Separator {
         /// The header line.
@@ -107,7 +107,7 @@ pub enum RecordingError {
         /// `semicolons`, `tabs`, ….
         found: &'static str,
         /// How to convert this file.
-        mend: &'static str,
+        help: &'static str,
     },
     /// A number is written with a decimal comma.
     #[error(
@@ -133,7 +133,7 @@ pub enum RecordingError {
     },
     /// The first column is not the time `t`.
     #[error(
-        "{place}: the first column must be the time `t` in seconds, found `{found}`; {mend} (accepted: `t`, \
+        "{place}: the first column must be the time `t` in seconds, found `{found}`; {help} (accepted: `t`, \
          `t [s]`, `t [ms]`, `t [us]`)"
     )]
     TimeColumn {
@@ -141,8 +141,8 @@ pub enum RecordingError {
         place: Place,
         /// The header of the first column.
         found: String,
-        /// How to mend this header.
-        mend: String,
+        /// How to fix this header.
+        help: String,
     },
     /// There is a time and nothing else.
     #[error("{place}: there is no column beside the time; add at least one channel, such as `y [m]`")]
@@ -151,14 +151,14 @@ pub enum RecordingError {
         place: Place,
     },
     /// A header cell is empty or its brackets do not close.
-    #[error("{place}: the header cell `{found}` is not `name` or `name [unit]`; {mend}")]
+    #[error("{place}: the header cell `{found}` is not `name` or `name [unit]`; {help}")]
     HeaderCell {
         /// The header line and column.
         place: Place,
         /// The cell as written.
         found: String,
-        /// How to mend it.
-        mend: &'static str,
+        /// How to fix it.
+        help: &'static str,
     },
     /// Two columns share a name.
     #[error(
@@ -174,7 +174,7 @@ pub enum RecordingError {
     },
     /// A row has more or fewer cells than the header.
     #[error(
-        "{place}: the row has {}, the header has {expected}; {mend}",
+        "{place}: the row has {}, the header has {expected}; {help}",
         counted(*found, "cell")
     )]
     CellCount {
@@ -184,18 +184,18 @@ pub enum RecordingError {
         found: usize,
         /// Cells in the header.
         expected: usize,
-        /// How to mend it.
-        mend: &'static str,
+        /// How to fix it.
+        help: &'static str,
     },
     /// A cell holds text where a number is needed.
-    #[error("{place}: `{found}` is not a number; {mend}")]
+    #[error("{place}: `{found}` is not a number; {help}")]
     NotANumber {
         /// The cell.
         place: Place,
         /// The cell as written.
         found: String,
-        /// How to mend it.
-        mend: &'static str,
+        /// How to fix it.
+        help: &'static str,
     },
     /// A cell holds `NaN` or an infinity.
     #[error("{place}: `{found}` is not a measured value; leave the cell empty for a missing sample")]
@@ -226,7 +226,7 @@ pub enum RecordingError {
     },
     /// The time repeats or runs backwards.
     #[error(
-        "{place}: the time {found} s does not come after the time {previous} s of the row before; {mend}"
+        "{place}: the time {found} s does not come after the time {previous} s of the row before; {help}"
     )]
     TimeNotIncreasing {
         /// The cell.
@@ -235,11 +235,11 @@ pub enum RecordingError {
         found: f64,
         /// Time of the row before, s.
         previous: f64,
-        /// How to mend it.
-        mend: &'static str,
+        /// How to fix it.
+        help: &'static str,
     },
     /// Too few rows to identify anything.
-    #[error("{place}: the recording has {} of samples, at least {needed} are needed; {mend}", counted(*rows, "row"))]
+    #[error("{place}: the recording has {} of samples, at least {needed} are needed; {help}", counted(*rows, "row"))]
     TooFewRows {
         /// The file.
         place: Place,
@@ -247,8 +247,8 @@ pub enum RecordingError {
         rows: usize,
         /// Rows needed.
         needed: usize,
-        /// How to mend it.
-        mend: &'static str,
+        /// How to fix it.
+        help: &'static str,
     },
     /// Gaps leave no piece that is long enough.
     #[error(
@@ -277,14 +277,14 @@ pub enum RecordingError {
         feature: &'static str,
     },
     /// The file is of another format than its name says, or of a version that is not read.
-    #[error("{place}: {found}, which greybox does not read; {mend}")]
+    #[error("{place}: {found}, which greybox does not read; {help}")]
     Format {
         /// The file.
         place: Place,
         /// What it is.
         found: String,
-        /// How to mend it.
-        mend: &'static str,
+        /// How to fix it.
+        help: &'static str,
     },
     /// The file is cut off, or bytes of it were changed.
     #[error(
@@ -313,14 +313,14 @@ pub enum RecordingError {
         limit_gib: u64,
     },
     /// No variable or column is the time.
-    #[error("{place}: there is no time among what the file holds ({found}); {mend}")]
+    #[error("{place}: there is no time among what the file holds ({found}); {help}")]
     NoTime {
         /// The file.
         place: Place,
         /// The variables or columns, in words.
         found: String,
-        /// How to mend it.
-        mend: &'static str,
+        /// How to fix it.
+        help: &'static str,
     },
     /// Signals of the file were sampled at different times.
     #[error(

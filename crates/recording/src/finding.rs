@@ -1,4 +1,4 @@
-//! What a check has to say: severity, sentence, mend, number.
+//! What a check has to say: severity, sentence, fix, number.
 
 use serde::Serialize;
 use std::fmt;
@@ -7,9 +7,9 @@ use std::fmt;
 #[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Hash, Serialize)]
 #[serde(rename_all = "snake_case")]
 pub enum Severity {
-    /// A fact worth knowing; nothing needs mending.
+    /// A fact worth knowing; nothing needs fixing.
     Info,
-    /// Results may suffer; the mend is worth the trouble.
+    /// Results may suffer; the fix is worth the trouble.
     Warning,
     /// Results from this channel or recording cannot be trusted.
     Problem,
@@ -40,7 +40,7 @@ pub struct Finding {
     /// What was found, as a sentence for an engineer.
     pub message: String,
     /// What to do about it, where something can be done.
-    pub mend: Option<String>,
+    pub help: Option<String>,
     /// The number behind the sentence, in `unit`.
     pub value: Option<f64>,
     /// Unit of `value`; `None` where `value` is a count, a ratio, or in a channel unit that the file does not
@@ -49,9 +49,9 @@ pub struct Finding {
 }
 
 impl Finding {
-    /// A finding about the whole recording with no mend and no number.
+    /// A finding about the whole recording with no fix and no number.
     pub fn new(severity: Severity, code: &'static str, message: impl Into<String>) -> Self {
-        Self { severity, code, channel: None, message: message.into(), mend: None, value: None, unit: None }
+        Self { severity, code, channel: None, message: message.into(), help: None, value: None, unit: None }
     }
 
     /// Says which channel it is about.
@@ -63,8 +63,8 @@ impl Finding {
 
     /// Adds what to do about it.
     #[must_use]
-    pub fn mend(mut self, mend: impl Into<String>) -> Self {
-        self.mend = Some(mend.into());
+    pub fn help(mut self, help: impl Into<String>) -> Self {
+        self.help = Some(help.into());
         self
     }
 
@@ -77,7 +77,7 @@ impl Finding {
     }
 }
 
-/// `warning [clipping] y: message Mend: …`, one line.
+/// `warning [clipping] y: message Fix: …`, one line.
 impl fmt::Display for Finding {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         write!(f, "{} [{}] ", self.severity, self.code)?;
@@ -85,8 +85,8 @@ impl fmt::Display for Finding {
             write!(f, "{channel}: ")?;
         }
         f.write_str(&self.message)?;
-        if let Some(mend) = &self.mend {
-            write!(f, " Mend: {mend}")?;
+        if let Some(help) = &self.help {
+            write!(f, " Help: {help}")?;
         }
         Ok(())
     }

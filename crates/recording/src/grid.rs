@@ -118,7 +118,7 @@ const LONGEST_GAP: f64 = 0.1;
 /// Most grid points for each row; beyond, the longest gaps split the recording.
 const MOST_POINTS: f64 = 64.0;
 
-/// Lays the channels on the grid and says what had to be mended. Rows that are left out are the same as rows with empty
+/// Lays the channels on the grid and says what had to be fixed. Rows that are left out are the same as rows with empty
 /// cells: the grid goes on, without a value. Only long gaps split the recording.
 pub(crate) fn pieces(grid: &Grid, time: &[f64], channels: &[Channel]) -> (Vec<Piece>, Vec<Finding>) {
     let parts = parts(grid, time, channels);
@@ -187,7 +187,7 @@ pub(crate) fn pieces(grid: &Grid, time: &[f64], channels: &[Channel]) -> (Vec<Pi
                     number(dt)
                 ),
             )
-            .mend(
+            .help(
                 "Record with a hardware clock, or log at a higher rate, if fast motion matters. Of an input with \
                  `hold = \"zero\"` a model sees the mean over each step instead.",
             )
@@ -206,7 +206,7 @@ pub(crate) fn pieces(grid: &Grid, time: &[f64], channels: &[Channel]) -> (Vec<Pi
         if holes.len() > 3 {
             places.push(format!("{} more", holes.len() - 3));
         }
-        let (split, mend) = match parts.len() {
+        let (split, help) = match parts.len() {
             1 => (
                 "they count as rows with empty cells".to_owned(),
                 "What an input did there follows its `hold`; record without dropped samples if it did otherwise.",
@@ -227,7 +227,7 @@ pub(crate) fn pieces(grid: &Grid, time: &[f64], channels: &[Channel]) -> (Vec<Pi
                     places.join("; ")
                 ),
             )
-            .mend(mend)
+            .help(help)
             .value(missing, None),
         );
     }

@@ -115,7 +115,7 @@ fn unknown_channels(recording: &Recording, inputs: &[&str], outputs: &[&str]) ->
                 format!("{} has no channel of this name.", recording.name),
             )
             .on(name)
-            .mend(format!("Its channels are {known}."))
+            .help(format!("Its channels are {known}."))
         })
         .collect()
 }
@@ -159,7 +159,7 @@ fn flat(channel: &Channel, present: &[f64], role: Role, driven: bool) -> Option<
                  this recording alone."
             ),
         )
-        .mend("If its effect matters, add a recording in which it has another value."),
+        .help("If its effect matters, add a recording in which it has another value."),
         Role::Input => Finding::new(
             Severity::Warning,
             "excitation",
@@ -168,10 +168,10 @@ fn flat(channel: &Channel, present: &[f64], role: Role, driven: bool) -> Option<
                  offset."
             ),
         )
-        .mend("Move the input: steps of several sizes, a sweep or a multisine over the working range."),
+        .help("Move the input: steps of several sizes, a sweep or a multisine over the working range."),
         Role::Output => {
             Finding::new(Severity::Problem, "flat", format!("The channel never moves (always {value})."))
-                .mend("Check that the sensor was connected and that the right column was exported.")
+                .help("Check that the sensor was connected and that the right column was exported.")
         }
         Role::Unknown => {
             Finding::new(Severity::Warning, "flat", format!("The channel never moves (always {value})."))
@@ -241,7 +241,7 @@ fn clipping(channel: &Channel, y: &[f64]) -> Vec<Finding> {
                         number(100.0 * held as f64 / total as f64)
                     ),
                 )
-                .mend("Widen the sensor or amplifier range, or model the limit (input_saturation, end_stop).")
+                .help("Widen the sensor or amplifier range, or model the limit (input_saturation, end_stop).")
                 .on(&channel.name)
                 .value(extreme, unit),
             );
@@ -268,7 +268,7 @@ fn quantisation(channel: &Channel, y: &[f64]) -> Option<Finding> {
     if q < 0.5 * noise {
         return None;
     }
-    let (severity, mend) = if coarse < 50.0 {
+    let (severity, help) = if coarse < 50.0 {
         (
             Severity::Warning,
             Some("Use a finer sensor or amplifier range: fewer than 50 steps span the motion."),
@@ -288,7 +288,7 @@ fn quantisation(channel: &Channel, y: &[f64]) -> Option<Finding> {
     )
     .on(&channel.name)
     .value(q, unit);
-    finding.mend = mend.map(str::to_owned);
+    finding.help = help.map(str::to_owned);
     Some(finding)
 }
 
@@ -317,7 +317,7 @@ fn outliers(recording: &Recording, c: usize, rails: &[f64]) -> Option<Finding> {
                 number(first)
             ),
         )
-        .mend("Look at these samples; empty their cells if they are faults of the measurement.")
+        .help("Look at these samples; empty their cells if they are faults of the measurement.")
         .on(&recording.channels[c].name)
         .value(count as f64, None),
     )
@@ -344,12 +344,12 @@ fn excitation(channel: &Channel, present: &[f64], spectrum: &Periodogram) -> Fin
                 number(peak as f64 * spectrum.resolution)
             ),
         )
-        .mend("Add frequencies and amplitudes: a sweep, a multisine, or steps of several sizes.")
+        .help("Add frequencies and amplitudes: a sweep, a multisine, or steps of several sizes.")
         .on(&channel.name)
         .value(1.0, None);
     }
     let lines = spectrum.significant_lines();
-    let (severity, mend) = if lines < 3 {
+    let (severity, help) = if lines < 3 {
         (
             Severity::Warning,
             Some("Add frequencies: a sweep, a multisine, or steps of several sizes.".to_owned()),
@@ -374,7 +374,7 @@ fn excitation(channel: &Channel, present: &[f64], spectrum: &Periodogram) -> Fin
     )
     .on(&channel.name)
     .value(lines as f64, None);
-    finding.mend = mend;
+    finding.help = help;
     finding
 }
 
@@ -399,7 +399,7 @@ fn noise_level(channel: &Channel, present: &[f64], full: &[f64], sigma: f64) -> 
         )
     } else if ratio > 0.3 {
         Finding::new(Severity::Warning, "noise", format!("The measurement noise is about {level}: much."))
-            .mend("Excite harder, average the sensor, or record for longer.")
+            .help("Excite harder, average the sensor, or record for longer.")
     } else {
         Finding::new(Severity::Info, "noise", format!("The measurement noise is about {level}."))
     };
@@ -421,7 +421,7 @@ fn bandwidth(channel: &Channel, spectrum: &Periodogram, dt: f64) -> Option<Findi
                 number(0.5 / dt)
             ),
         )
-        .mend("Sample at least ten times per period, or state the input's true `hold` in the model.")
+        .help("Sample at least ten times per period, or state the input's true `hold` in the model.")
         .on(&channel.name)
         .value(per_period, None)
     })
@@ -447,7 +447,7 @@ fn record_length(channel: &Channel, full: &[f64], spectrum: &Periodogram) -> Opt
             number(0.5 / spectrum.resolution)
         );
         Finding::new(Severity::Warning, "record_length", message)
-            .mend("Record for longer, or use several recordings, if slow effects (drift, leakage) matter.")
+            .help("Record for longer, or use several recordings, if slow effects (drift, leakage) matter.")
     };
     Some(finding.on(&channel.name).value(100.0 * slow, Some("%")))
 }
@@ -617,7 +617,7 @@ pub fn clock_offsets(recording: &Recording, inputs: &[&str], outputs: &[&str]) -
                 "clock_offset_limit",
                 format!("Only the first {MOST_PAIRS} pairs of channels were compared to find clocks that disagree."),
             )
-            .mend("State the channels that count: by a model, or in a file with fewer columns."),
+            .help("State the channels that count: by a model, or in a file with fewer columns."),
         );
     }
     while let Some(late) = odd_one(&offsets, columns.len()) {
@@ -697,7 +697,7 @@ fn told(recording: &Recording, offset: &Offset, dt: f64, acausal: bool) -> Findi
             number(correlation)
         ),
     )
-    .mend(format!(
+    .help(format!(
         "If the machine does not explain it, move the column `{late}` up by {samples} rows, or record all channels with one clock."
     ))
     .on(late)

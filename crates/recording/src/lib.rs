@@ -13,7 +13,7 @@
 //!
 //! | module | what it answers |
 //! |---|---|
-//! | [`csv`](mod@csv) | what stands in the file, or exactly which cell is wrong and how to mend it |
+//! | [`csv`](mod@csv) | what stands in the file, or exactly which cell is wrong and how to fix it |
 //! | `mat`, `parquet` | the same for MAT-files and Parquet files, each behind a feature of its name |
 //! | [`noise`] | how large the measurement noise is, and whether a channel is quantised |
 //! | [`smooth`] | value, first and second derivative of a noisy channel (Savitzky–Golay) |

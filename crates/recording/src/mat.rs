@@ -1,7 +1,7 @@
 //! Reading MAT-files of MATLAB and Simulink (feature `mat`).
 //!
 //! Read are files of level 5: those of `save` with `-v6` and `-v7` (compressed), also those that SciPy and Octave
-//! write. A file of `-v7.3` (HDF5) is an error that names the mend.
+//! write. A file of `-v7.3` (HDF5) is an error that names the fix.
 //!
 //! The time is the vector `t`, `time` or `tout`, in s; every real array with a value for each time is a signal:
 //!
@@ -48,7 +48,7 @@ pub(crate) fn parse(bytes: &[u8], label: &str, name: &str) -> Result<Recording, 
 
 fn told(fault: Fault, place: Place) -> RecordingError {
     match fault {
-        Fault::Format(found, mend) => RecordingError::Format { place, found: found.to_owned(), mend },
+        Fault::Format(found, help) => RecordingError::Format { place, found: found.to_owned(), help },
         Fault::Damaged { variable, what, at } => {
             RecordingError::Damaged { place, variable, found: format!("{what} (byte {at})") }
         }

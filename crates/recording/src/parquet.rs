@@ -89,8 +89,8 @@ fn read(bytes: Vec<u8>, label: &str, name: &str) -> Result<Recording, RecordingE
     let Some(time) = time else {
         let mut found: Vec<String> = columns.iter().map(|(c, _)| format!("`{}`", c.header())).collect();
         found.extend((!left_out.is_empty()).then_some(left_out));
-        let mend = "call the column of times, in s, `t`";
-        return Err(RecordingError::NoTime { place: place(), found: told(found), mend });
+        let help = "call the column of times, in s, `t`";
+        return Err(RecordingError::NoTime { place: place(), found: told(found), help });
     };
     let (time, scale) = columns.remove(time);
     if columns.is_empty() {

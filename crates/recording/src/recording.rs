@@ -70,7 +70,7 @@ pub struct Recording {
     pub time: Vec<f64>,
     /// The recording on a uniform grid, split at gaps; at least one.
     pub pieces: Vec<Piece>,
-    /// What the reader had to mend: gaps, jitter, pieces left out.
+    /// What the reader had to fix: gaps, jitter, pieces left out.
     pub warnings: Vec<Finding>,
 }
 
@@ -104,7 +104,7 @@ impl Recording {
                     place: place(),
                     found: t,
                     previous: time[k - 1],
-                    mend: "sort the rows and remove repeated times",
+                    help: "sort the rows and remove repeated times",
                 });
             }
         }
@@ -189,7 +189,7 @@ impl Recording {
                 place: Place::file(label),
                 rows: time.len(),
                 needed: MIN_SAMPLES,
-                mend: "record for longer or export all samples",
+                help: "record for longer or export all samples",
             });
         }
         check_sizes(label, &channels)?;

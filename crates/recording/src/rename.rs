@@ -26,7 +26,7 @@ pub struct Rename {
     pub unit: Option<String>,
 }
 
-/// Why channels were not renamed. Each message is one sentence with the mend.
+/// Why channels were not renamed. Each message is one sentence with the fix.
 #[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
 #[non_exhaustive]
 pub enum RenameError {

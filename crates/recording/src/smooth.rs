@@ -196,13 +196,13 @@ impl LocalFit {
             fit(at, first, &kernel(&offsets(first..first + self.window, at), self.order));
         }
         if y.iter().any(|v| v.is_nan()) {
-            self.mend_missing(y, scale, &mut out);
+            self.help_missing(y, scale, &mut out);
         }
         out
     }
 
     /// Fits again where the window holds missing samples, then bridges the long missing runs.
-    fn mend_missing<const D: usize>(&self, y: &[f64], scale: [f64; 3], out: &mut [Vec<f64>; D]) {
+    fn help_missing<const D: usize>(&self, y: &[f64], scale: [f64; 3], out: &mut [Vec<f64>; D]) {
         let n = y.len();
         let needed = (self.window.div_ceil(2)).max(self.order + 2);
         let mut long = vec![false; n];

@@ -1,4 +1,4 @@
-//! Every way a file can be wrong: the error names the place, what was found, and the mend.
+//! Every way a file can be wrong: the error names the place, what was found, and the fix.
 
 // Helpers of a test file are tests too; the lint configuration knows only the annotated functions.
 
@@ -18,7 +18,7 @@ fn error(text: impl AsRef<[u8]>) -> String {
 }
 
 #[test]
-fn bad_text_is_refused_with_place_and_mend() {
+fn bad_text_is_refused_with_place_and_help() {
     let good = "t,u [V],y [m]";
     let table: Vec<(String, &[&str])> = vec![
         (String::new(), &["bad.csv: the file is empty", "header row"]),

@@ -83,7 +83,7 @@ fn a_name_that_is_not_there_is_a_problem() {
     let findings = check(&recording(&[("y", multisine())]), &["torque"], &["y"]);
     let unknown = find(&findings, "unknown_channel").unwrap();
     assert_eq!((unknown.severity, unknown.channel.as_deref()), (Severity::Problem, Some("torque")));
-    assert!(unknown.mend.as_deref().unwrap().contains('y'));
+    assert!(unknown.help.as_deref().unwrap().contains('y'));
 }
 
 #[test]

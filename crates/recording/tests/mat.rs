@@ -85,7 +85,7 @@ fn what_is_left_out_or_assumed_is_told() {
 }
 
 #[test]
-fn what_is_no_recording_is_refused_with_its_mend() {
+fn what_is_no_recording_is_refused_with_its_help() {
     let error = |name: &str| parse_mat(&bytes(name), "bad.mat").unwrap_err();
     let two = error("two_clocks");
     assert!(matches!(two, RecordingError::SeveralTimes { .. }), "{two}");
@@ -101,7 +101,7 @@ fn what_is_no_recording_is_refused_with_its_mend() {
 }
 
 #[test]
-fn other_formats_are_named_with_their_mend() {
+fn other_formats_are_named_with_their_help() {
     let mut hdf5 = b"MATLAB 7.3 MAT-file, Platform: GLNXA64".to_vec();
     hdf5.resize(600, b' ');
     let mut level4 = 0u32.to_le_bytes().to_vec();

@@ -626,8 +626,8 @@ pub struct Finding {
     /// What was found, in plain language.
     pub message: String,
     /// What to do about it.
-    #[serde(default, skip_serializing_if = "Option::is_none")]
-    pub mend: Option<String>,
+    #[serde(default, alias = "mend", skip_serializing_if = "Option::is_none")]
+    pub help: Option<String>,
 }
 
 /// How much a finding matters.
@@ -638,7 +638,7 @@ pub enum Severity {
     Info,
     /// May have influenced the result.
     Warning,
-    /// The result should not be trusted before this is mended.
+    /// The result should not be trusted before this is fixed.
     Error,
 }
 

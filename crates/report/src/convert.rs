@@ -6,13 +6,13 @@ pub mod identification;
 
 use greybox_calibrate::{Data, FreeRun, Setup, input_noise};
 use greybox_diagnose::diagnosis::{
-    Basis as Ground, Estimate as Estimated, Finding as Found, Role as RoleRuns, Run,
+    Basis as Ground, Estimate as Estimated, IdentifiedMechanism, Role as RoleRuns, Run,
 };
 use greybox_diagnose::locate::{Location as Located, spectrum};
 use greybox_diagnose::proposal::{self, Proposal};
 use greybox_diagnose::{Calibration, Diagnosis, Verdict as Answer};
 use greybox_model::{Dimension, Expr, Func, Model, Unit, WriteOptions};
-use greybox_recording::{Correlation, Recording, Severity as Level, health};
+use greybox_recording::{Correlation, Recording, Severity as Segmentation, health};
 
 use crate::contract::*;
 use crate::page::{self, Lagged, MechanismPlot, ModelTexts, Page, Residual, Spectrum, StateMap};
@@ -218,7 +218,7 @@ fn remainder_plan(d: &Diagnosis, reach: &Reach) -> Option<Experiment> {
 }
 
 /// The experiment that separates a mechanism from its alternatives, if it has any.
-fn plan(found: &Found, improved: &Model, reach: &Reach) -> Option<Experiment> {
+fn plan(found: &IdentifiedMechanism, improved: &Model, reach: &Reach) -> Option<Experiment> {
     let told = found.alternatives.iter().find(|a| !a.separate.is_empty());
     let rival = told.or(found.alternatives.first())?;
     let value = |name: &str| {
@@ -295,7 +295,7 @@ fn figure_unit(name: &str) -> &'static str {
     }
 }
 
-fn mechanism(found: &Found, improved: &Model, reach: &Reach) -> Mechanism {
+fn mechanism(found: &IdentifiedMechanism, improved: &Model, reach: &Reach) -> Mechanism {
     let figures =
         found.figures.iter().map(|(name, e)| (name.clone(), estimate(e, figure_unit(name).to_owned())));
     Mechanism {
@@ -494,7 +494,7 @@ fn findings(d: &Diagnosis, sources: &Sources<'_>) -> Vec<Finding> {
                     best.name(),
                     given.name()
                 ),
-                mend: Some(format!(
+                help: Some(format!(
                     "state `hold = \"{}\"` for input `{name}`, as improved.toml does",
                     best.name()
                 )),
@@ -510,7 +510,7 @@ fn findings(d: &Diagnosis, sources: &Sources<'_>) -> Vec<Finding> {
             message: "the search ended at its limit of work: more may be missing than was found, and other \
                       explanations were not all tried"
                 .to_string(),
-            mend: Some("give it more with `--work`, or a shorter recording".to_string()),
+            help: Some("give it more with `--work`, or a shorter recording".to_string()),
         });
     }
     for &c in &d.unknown_noise {
@@ -524,7 +524,7 @@ fn findings(d: &Diagnosis, sources: &Sources<'_>) -> Vec<Finding> {
                 "the noise of `{channel}` is not known: the fast differences of the recording hold more than noise, \
                  and the noise floor is what the best model leaves"
             ),
-            mend: Some("record the channel at rest, or sample it faster".to_string()),
+            help: Some("record the channel at rest, or sample it faster".to_string()),
         });
     }
     // Of what is believed: terms that stand in for something else may fit the noise.
@@ -546,15 +546,15 @@ fn findings(d: &Diagnosis, sources: &Sources<'_>) -> Vec<Finding> {
 pub fn health_finding(f: greybox_recording::Finding, recording: Option<String>) -> Finding {
     Finding {
         severity: match f.severity {
-            Level::Info => Severity::Info,
-            Level::Warning => Severity::Warning,
-            Level::Problem => Severity::Error,
+            Segmentation::Info => Severity::Info,
+            Segmentation::Warning => Severity::Warning,
+            Segmentation::Problem => Severity::Error,
         },
         code: f.code.to_string(),
         recording,
         channel: f.channel,
         message: f.message,
-        mend: f.mend,
+        help: f.help,
     }
 }
 
@@ -891,7 +891,7 @@ mod tests {
     #[test]
     fn a_mechanism_is_told_with_its_figures_and_what_drifts() {
         let one = |value| Estimated { value, ci95: Some((0.9 * value, 1.1 * value)) };
-        let found = Found {
+        let found = IdentifiedMechanism {
             kind: "unmodeled_resonance".into(),
             family: "structure".into(),
             signature: String::new(),

@@ -417,7 +417,7 @@ struct FindingView {
     code: String,
     place: String,
     message: String,
-    mend: Option<String>,
+    help: Option<String>,
 }
 
 impl View {
@@ -1395,7 +1395,7 @@ fn findings(found: &[Finding]) -> Vec<FindingView> {
             code: note.code.replace('_', " "),
             place: note.place,
             message: note.message,
-            mend: note.mend,
+            help: note.help,
         }
     });
     view.collect()

@@ -88,11 +88,11 @@ pub(crate) fn mechanism(found: &Mechanism) -> MechanismResult {
 }
 
 /// The statistics of a recording that could not be diagnosed.
-pub fn failed(recording: &str, message: &str, mend: Option<&str>) -> Statistics {
+pub fn failed(recording: &str, message: &str, help: Option<&str>) -> Statistics {
     let failure = RecordingFailure {
         recording: recording.to_owned(),
         message: message.to_owned(),
-        mend: mend.map(str::to_owned),
+        help: help.map(str::to_owned),
     };
     Statistics { recordings: Vec::new(), failed: vec![failure] }
 }

@@ -17,7 +17,7 @@ pub struct Note {
     /// What was found, in plain language, with the figures of the first recording.
     pub message: String,
     /// What to do about it.
-    pub mend: Option<String>,
+    pub help: Option<String>,
 }
 
 /// One note for each severity, code and channel, in the order in which they come first.
@@ -34,7 +34,7 @@ pub struct Note {
 ///     recording: Some(recording.to_owned()),
 ///     channel: Some("v".to_owned()),
 ///     message: format!("{steps} steps span the motion."),
-///     mend: None,
+///     help: None,
 /// };
 /// let notes = greybox_report::notes::grouped(&[finding("a.csv", 20), finding("b.csv", 30)]);
 /// assert_eq!(notes.len(), 1);
@@ -87,7 +87,7 @@ fn note(group: &[&Finding]) -> Note {
         code: first.code.clone(),
         place: place(first.channel.as_deref(), &recordings),
         message,
-        mend: group.iter().find_map(|f| f.mend.clone()),
+        help: group.iter().find_map(|f| f.help.clone()),
     }
 }
 
@@ -121,7 +121,7 @@ mod tests {
             recording: recording.map(str::to_owned),
             channel: channel.map(str::to_owned),
             message: message.to_owned(),
-            mend: Some(format!("mend {code}")),
+            help: Some(format!("help {code}")),
         }
     }
 
@@ -140,7 +140,7 @@ mod tests {
         assert_eq!(notes.len(), 2, "{notes:?}");
         assert_eq!(notes[0].place, "u in 20 recordings (run0.csv, run1.csv, run2.csv and 17 more)");
         assert_eq!(notes[0].message, "0 samples stand out. (Figures of run0.csv.)");
-        assert_eq!(notes[0].mend.as_deref(), Some("mend outliers"));
+        assert_eq!(notes[0].help.as_deref(), Some("help outliers"));
         assert_eq!(notes[1].message, "Only noise.", "the same in all: nobody's figures");
     }
 

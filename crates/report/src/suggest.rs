@@ -93,7 +93,7 @@ pub struct Subject<'a> {
 
 /// Ways to excite a machine.
 #[derive(Debug, Clone, Copy, PartialEq)]
-enum Way {
+enum Excitation {
     /// Slowly, up to the present amplitude.
     Slow,
     /// Slowly, and further than now.
@@ -115,19 +115,20 @@ enum Way {
 }
 
 /// What the rival asks for, as far as its figures are known; else what the mechanism itself does.
-fn way(subject: &Subject<'_>) -> Way {
-    match way_of(subject.rival, subject) {
-        Way::AsNow => way_of(subject.kind, subject),
+fn excitation(subject: &Subject<'_>) -> Excitation {
+    match excitation_of(subject.rival, subject) {
+        Excitation::AsNow => excitation_of(subject.kind, subject),
         found => found,
     }
 }
 
-fn way_of(kind: &str, subject: &Subject<'_>) -> Way {
+fn excitation_of(kind: &str, subject: &Subject<'_>) -> Excitation {
     let corner = |name: &str| {
         let time = (subject.value)(name).filter(|v| *v > 0.0);
-        time.map_or(Way::AsNow, |time| Way::Around(1.0 / (2.0 * PI * time)))
+        time.map_or(Excitation::AsNow, |time| Excitation::Around(1.0 / (2.0 * PI * time)))
     };
-    let threshold = |name: &str, of: fn(f64) -> Way| (subject.value)(name).map_or(Way::AsNow, of);
+    let threshold =
+        |name: &str, of: fn(f64) -> Excitation| (subject.value)(name).map_or(Excitation::AsNow, of);
     match kind {
         "coulomb_friction"
         | "asymmetric_coulomb_friction"
@@ -138,19 +139,21 @@ fn way_of(kind: &str, subject: &Subject<'_>) -> Way {
         | "dead_zone"
         | "end_stop"
         | "bouc_wen_hysteresis"
-        | "cogging" => Way::Slow,
-        "linear_stiffness" | "quadratic_stiffness" | "cubic_stiffness" | "gravity" => Way::Wide,
-        "quadratic_drag" | "load_dependent_damping" | "position_dependent_inertia" => Way::Loud,
+        | "cogging" => Excitation::Slow,
+        "linear_stiffness" | "quadratic_stiffness" | "cubic_stiffness" | "gravity" => Excitation::Wide,
+        "quadratic_drag" | "load_dependent_damping" | "position_dependent_inertia" => Excitation::Loud,
         "actuator_lag" => corner("ta"),
         "input_delay" => corner("tau"),
         "sensor_delay" => corner("tsd"),
         "feedback_delay" => corner("tau_f"),
-        "unmodeled_resonance" => (subject.value)("f0").filter(|f| *f > 0.0).map_or(Way::AsNow, Way::Around),
-        "constant_offset" | "input_offset" | "sensor_offset" | "periodic_disturbance" => Way::Silent,
-        "step_disturbance" | "parameter_drift" => Way::Again,
-        "input_dead_zone" => threshold("udz", |v| Way::Ramp(2.0 * v)),
-        "input_saturation" => threshold("usat", Way::Beyond),
-        _ => Way::AsNow,
+        "unmodeled_resonance" => {
+            (subject.value)("f0").filter(|f| *f > 0.0).map_or(Excitation::AsNow, Excitation::Around)
+        }
+        "constant_offset" | "input_offset" | "sensor_offset" | "periodic_disturbance" => Excitation::Silent,
+        "step_disturbance" | "parameter_drift" => Excitation::Again,
+        "input_dead_zone" => threshold("udz", |v| Excitation::Ramp(2.0 * v)),
+        "input_saturation" => threshold("usat", Excitation::Beyond),
+        _ => Excitation::AsNow,
     }
 }
 
@@ -164,25 +167,25 @@ struct Drive {
 }
 
 /// How far an experiment drives the input.
-fn drive(way: Way, input: &InputRange) -> Drive {
+fn drive(excitation: Excitation, input: &InputRange) -> Drive {
     if input.is_negative() {
-        let Drive { amplitude: [low, high], clipped } = drive(way, &input.turned());
+        let Drive { amplitude: [low, high], clipped } = drive(excitation, &input.turned());
         return Drive { amplitude: [-low, -high], clipped };
     }
     let (top, largest) = input.largest();
     let louder = (LOUDER * largest).min(top);
     let more = louder > MORE * largest;
-    let (amplitude, clipped) = match way {
-        Way::Slow => ([0.0, largest], false),
-        Way::Wide if more => ([largest, louder], false),
-        Way::Wide => ([0.0, largest], true),
-        Way::Loud if more => ([largest, louder], false),
-        Way::Loud => ([0.5 * largest, largest], true),
-        Way::Around(_) | Way::AsNow => ([input.rms.min(largest), largest], false),
-        Way::Silent => ([0.0, 0.0], false),
-        Way::Again => ([largest, largest], false),
-        Way::Ramp(end) => ([0.0, end.min(top)], end > top),
-        Way::Beyond(start) => {
+    let (amplitude, clipped) = match excitation {
+        Excitation::Slow => ([0.0, largest], false),
+        Excitation::Wide if more => ([largest, louder], false),
+        Excitation::Wide => ([0.0, largest], true),
+        Excitation::Loud if more => ([largest, louder], false),
+        Excitation::Loud => ([0.5 * largest, largest], true),
+        Excitation::Around(_) | Excitation::AsNow => ([input.rms.min(largest), largest], false),
+        Excitation::Silent => ([0.0, 0.0], false),
+        Excitation::Again => ([largest, largest], false),
+        Excitation::Ramp(end) => ([0.0, end.min(top)], end > top),
+        Excitation::Beyond(start) => {
             let wanted = LOUDER * start.max(largest);
             let end = wanted.min(top);
             let start = if start < end { start } else { 0.5 * end };
@@ -196,31 +199,42 @@ fn drive(way: Way, input: &InputRange) -> Drive {
 
 /// The experiment for a mechanism.
 pub fn experiment(subject: &Subject<'_>, reach: &Reach) -> Experiment {
-    planned(way(subject), subject, reach)
+    planned(excitation(subject), subject, reach)
 }
 
 /// The experiment for a remainder without a name: the recordings again, louder.
 pub fn for_remainder(location: &Location, input: Option<&str>, reach: &Reach, shape: &str) -> Experiment {
     // Nobody sweeps time.
-    let (way, ask) = match shape.ends_with("with time") {
-        true => (Way::Again, "the same short experiment at the beginning and at the end of a long run"),
-        false => (Way::Loud, "slow sweeps over the whole range of that variable, at two amplitudes"),
+    let (excitation, ask) = match shape.ends_with("with time") {
+        true => {
+            (Excitation::Again, "the same short experiment at the beginning and at the end of a long run")
+        }
+        false => (Excitation::Loud, "slow sweeps over the whole range of that variable, at two amplitudes"),
     };
     let separate = format!("the residual looks like {shape}: {ask}");
     let subject = Subject { kind: "", rival: "", input, location, value: &|_| None, separate: &separate };
-    planned(way, &subject, reach)
+    planned(excitation, &subject, reach)
 }
 
-fn planned(way: Way, subject: &Subject<'_>, reach: &Reach) -> Experiment {
+fn planned(excitation: Excitation, subject: &Subject<'_>, reach: &Reach) -> Experiment {
     let input = reach.input(subject.input);
-    let drive = input.map(|input| drive(way, input));
+    let drive = input.map(|input| drive(excitation, input));
     // Time is not for the experimenter to pass through; with the input at zero nothing else is either.
-    let region = subject.location.region.iter().next().filter(|(name, _)| *name != "t" && way != Way::Silent);
-    let band = match way {
-        Way::Slow => slow_band(region, reach),
-        Way::Around(f) => decade(f, reach),
-        Way::Loud | Way::AsNow => subject.location.band_hz.map(|b| [b.low, b.high]),
-        Way::Wide | Way::Silent | Way::Again | Way::Ramp(_) | Way::Beyond(_) => None,
+    let region = subject
+        .location
+        .region
+        .iter()
+        .next()
+        .filter(|(name, _)| *name != "t" && excitation != Excitation::Silent);
+    let band = match excitation {
+        Excitation::Slow => slow_band(region, reach),
+        Excitation::Around(f) => decade(f, reach),
+        Excitation::Loud | Excitation::AsNow => subject.location.band_hz.map(|b| [b.low, b.high]),
+        Excitation::Wide
+        | Excitation::Silent
+        | Excitation::Again
+        | Excitation::Ramp(_)
+        | Excitation::Beyond(_) => None,
     };
     let mut found = Experiment {
         text: String::new(),
@@ -235,7 +249,7 @@ fn planned(way: Way, subject: &Subject<'_>, reach: &Reach) -> Experiment {
     };
     let unit = region.and_then(|(name, _)| subject.location.region_units.get(name));
     let driven = input.zip(drive).filter(|_| found.amplitude.is_some());
-    found.text = words(way, &found, driven, unit.map_or("", String::as_str), subject.separate);
+    found.text = words(excitation, &found, driven, unit.map_or("", String::as_str), subject.separate);
     found
 }
 
@@ -266,7 +280,7 @@ fn decade(frequency: f64, reach: &Reach) -> Option<[f64; 2]> {
 
 /// `Drive u slowly, 0.05 … 0.3 Hz, up to 2 V, with θ′ from −0.2 to 0.2; then …`.
 fn words(
-    way: Way,
+    excitation: Excitation,
     e: &Experiment,
     driven: Option<(&InputRange, Drive)>,
     unit: &str,
@@ -280,24 +294,26 @@ fn words(
         let size = |v: f64| format!("{}{space}{of}", format::plain(v));
         let back = if input.is_negative() { -input.allowed()[1] } else { input.allowed()[0] };
         let (from, to) = (size(low), size(high));
-        text = match way {
-            Way::Slow => format!("drive {name} slowly, up to {to} as now"),
-            Way::Wide if clipped => format!("drive {name} slowly, up to {to}"),
-            Way::Wide => format!("drive {name} slowly, from {from} as now up to {to}"),
-            Way::Loud if clipped => format!("drive {name} at up to {from} and at up to {to}"),
-            Way::Loud => format!("drive {name} as now, {from}, and at up to {to}"),
-            Way::Around(_) => format!("sweep {name} as a sine of {from} to {to}"),
-            Way::AsNow => format!("drive {name} with {from} to {to}"),
-            Way::Silent if low == 0.0 => format!("record with {name} at zero"),
-            Way::Silent => format!("record with {name} held at {from}"),
-            Way::Again => format!("record the same again, {name} up to {to}"),
+        text = match excitation {
+            Excitation::Slow => format!("drive {name} slowly, up to {to} as now"),
+            Excitation::Wide if clipped => format!("drive {name} slowly, up to {to}"),
+            Excitation::Wide => format!("drive {name} slowly, from {from} as now up to {to}"),
+            Excitation::Loud if clipped => format!("drive {name} at up to {from} and at up to {to}"),
+            Excitation::Loud => format!("drive {name} as now, {from}, and at up to {to}"),
+            Excitation::Around(_) => format!("sweep {name} as a sine of {from} to {to}"),
+            Excitation::AsNow => format!("drive {name} with {from} to {to}"),
+            Excitation::Silent if low == 0.0 => format!("record with {name} at zero"),
+            Excitation::Silent => format!("record with {name} held at {from}"),
+            Excitation::Again => format!("record the same again, {name} up to {to}"),
             // To the other side only as far as the input goes there.
-            Way::Ramp(_) if back <= -high.abs() => {
+            Excitation::Ramp(_) if back <= -high.abs() => {
                 format!("ramp {name} slowly between {} and {to}", size(-high))
             }
-            Way::Ramp(_) if back < 0.0 => format!("ramp {name} slowly between {} and {to}", size(back)),
-            Way::Ramp(_) => format!("ramp {name} slowly between {from} and {to}"),
-            Way::Beyond(_) => format!("step {name} from {from} up to {to}"),
+            Excitation::Ramp(_) if back < 0.0 => {
+                format!("ramp {name} slowly between {} and {to}", size(back))
+            }
+            Excitation::Ramp(_) => format!("ramp {name} slowly between {from} and {to}"),
+            Excitation::Beyond(_) => format!("step {name} from {from} up to {to}"),
         };
         if clipped {
             text.push_str(match input.stated {
@@ -313,10 +329,10 @@ fn words(
             });
         }
         if let (Some(variable), Some(range)) = (&e.variable, e.range)
-            && !matches!(way, Way::Silent | Way::Ramp(_) | Way::Beyond(_))
+            && !matches!(excitation, Excitation::Silent | Excitation::Ramp(_) | Excitation::Beyond(_))
             && let Some(condition) = crate::sentence::condition(variable, range, unit)
         {
-            let further = way == Way::Wide && driven.is_some_and(|(_, d)| !d.clipped);
+            let further = excitation == Excitation::Wide && driven.is_some_and(|(_, d)| !d.clipped);
             let through = if further { "beyond" } else { "through" };
             text.push_str(&format!(", {through} {condition}"));
         }

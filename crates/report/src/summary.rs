@@ -50,8 +50,8 @@ pub struct RecordingFailure {
     /// What is wrong, in plain language.
     pub message: String,
     /// What to do about it, where the message does not say.
-    #[serde(default, skip_serializing_if = "Option::is_none")]
-    pub mend: Option<String>,
+    #[serde(default, alias = "mend", skip_serializing_if = "Option::is_none")]
+    pub help: Option<String>,
 }
 
 /// Which law acts where: what makes a mechanism of one recording the same as that of another.

@@ -124,7 +124,7 @@ fn changed() -> Comparison {
         recording: Some("<script>.csv".into()),
         channel: None,
         message: "it clips".into(),
-        mend: None,
+        help: None,
     });
     compared(&with_friction(0.06, 0.004), &after)
 }
@@ -193,7 +193,7 @@ fn hostile_names_do_nothing_in_the_browser() {
             recording: Some(evil.into()),
             channel: Some(evil.into()),
             message: format!("{fc} {evil}"),
-            mend: Some(evil.into()),
+            help: Some(evil.into()),
         });
         report
     };

@@ -223,7 +223,7 @@ fn text_from_a_file_stays_text() {
         recording: Some(evil()),
         channel: Some(evil()),
         message: evil(),
-        mend: Some(evil()),
+        help: Some(evil()),
     });
     for recording in &mut page.recordings {
         recording.name = evil();

@@ -225,7 +225,7 @@ fn hostile() -> Page {
         recording: Some(evil()),
         channel: Some(evil()),
         message: evil(),
-        mend: Some(evil()),
+        help: Some(evil()),
     });
     page.models.improved = format!("[equations]\n\"{}\" = \"x' = {}\"\n", "a<b", EVIL.replace('"', ""));
     page.models.nominal = evil();

@@ -167,7 +167,7 @@ fn the_page_shows_every_recording_and_every_estimate() {
         "<a href=\"tuesday%20%3C2%3E/report.html\">tuesday &#60;2&#62;.csv</a>",
         "<th scope=\"row\">wednesday.csv</th>",
         "broken.csv: line 3",
-        "Mend: correct the cell",
+        "Help: correct the cell",
         "Coulomb friction <small>in the hub equation</small>",
         "3 of 4",
         "p &#60; 0.001",

@@ -18,9 +18,9 @@ fn design(tangent: Tangent<4>) -> Design<4> {
 }
 
 /// The error, which must say what to change.
-fn refused<T: std::fmt::Debug, E: std::fmt::Display>(result: Result<T, E>, mend: &str) -> E {
+fn refused<T: std::fmt::Debug, E: std::fmt::Display>(result: Result<T, E>, help: &str) -> E {
     let error = result.unwrap_err();
-    assert!(error.to_string().contains(mend), "`{error}` does not say `{mend}`");
+    assert!(error.to_string().contains(help), "`{error}` does not say `{help}`");
     error
 }
 
@@ -34,7 +34,7 @@ fn a_sound_design_passes_and_keeps_its_numbers() {
 }
 
 #[test]
-fn bad_numbers_are_refused_with_the_mend() {
+fn bad_numbers_are_refused_with_the_help() {
     let mut broken = CARTS;
     broken.a[2][1] = f64::NAN;
     let error = refused(design(broken).law(), "look where they come from");
@@ -177,7 +177,7 @@ fn a_fault_of_a_step_says_what_to_do() {
 }
 
 #[test]
-fn equilibria_that_do_not_exist_are_refused_with_the_mend() {
+fn equilibria_that_do_not_exist_are_refused_with_the_help() {
     let pendulum = |x: &[f64; 2], u: f64| [x[1], u.tanh() - 3.0 * x[0].sin()];
     let solver = EquilibriumSolver::new(0).unwrap();
     solver.solve(pendulum, 0.3, &Equilibrium::ORIGIN).unwrap();

@@ -65,7 +65,7 @@ fn judge(before: Option<u64>, now: u64) -> Result<String, String> {
     let change = now as f64 / before as f64 - 1.0;
     let percent = format!("{:+.1} %", 100.0 * change);
     if change > TOLERANCE {
-        Err(format!("{percent}: SLOWER; mend it, or accept it with --write and say why"))
+        Err(format!("{percent}: SLOWER; help it, or accept it with --write and say why"))
     } else if change < -TOLERANCE {
         Ok(format!("{percent}: faster; keep it with --write"))
     } else {

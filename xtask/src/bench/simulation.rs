@@ -3,7 +3,7 @@
 use std::sync::Arc;
 
 use anyhow::{Context, Result};
-use greybox_calibrate::{Data, Free, Limits, Point, Prior, Setup};
+use greybox_calibrate::{Data, FreeParameter, Limits, Point, Prior, Setup};
 use greybox_model::{Hold, Model, System};
 use greybox_recording::{Channel, Recording};
 use greybox_simulate::rigs::{Duffing, Sampling};
@@ -231,8 +231,13 @@ fn calibration() -> Result<Case> {
     let first = x[0];
     let recording = Recording::from_columns("bench.csv", time, vec![channel("f", force), channel("x", x)])
         .context("the recording of the bench")?;
-    let free: Vec<Free> = (0..6)
-        .map(|index| Free { index, prior: Prior::Flat, lower: f64::NEG_INFINITY, upper: f64::INFINITY })
+    let free: Vec<FreeParameter> = (0..6)
+        .map(|index| FreeParameter {
+            index,
+            prior: Prior::Flat,
+            lower: f64::NEG_INFINITY,
+            upper: f64::INFINITY,
+        })
         .collect();
     let setup = Setup::new(&model, Arc::new(Data::new(&model, &[recording])?), free)?;
     let mut level = setup.level(1);

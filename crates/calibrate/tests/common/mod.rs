@@ -3,7 +3,7 @@
 
 use std::sync::Arc;
 
-use greybox_calibrate::{Data, Level, Point, Problem, Setup, free_parameters, qr};
+use greybox_calibrate::{Data, Point, Problem, Segmentation, Setup, free_parameters, qr};
 use greybox_model::{Hold, Model, System};
 use greybox_recording::{Channel, Recording};
 use greybox_simulate::{Environment, Method, Seeds, Signal, integrate};
@@ -102,7 +102,7 @@ pub fn standard_errors(problem: &Problem<'_>, point: &Point) -> Vec<f64> {
 }
 
 /// Fits from the model's own values.
-pub fn fit(setup: &Setup, level: &Level, scale: &[f64]) -> greybox_calibrate::Fit {
+pub fn fit(setup: &Setup, level: &Segmentation, scale: &[f64]) -> greybox_calibrate::Fit {
     let parameters = setup.values();
     let starts = setup.starts(level, &parameters);
     setup.fit(level, scale, &[Point { parameters, starts }], greybox_calibrate::Limits::default())

@@ -100,10 +100,10 @@ pub(crate) fn run(arguments: &Arguments) -> Result<Answer, Failure> {
 /// The report of a folder, or of a file.
 fn read(path: &Path) -> Result<Report, Failure> {
     let file = if path.is_dir() { path.join("report.json") } else { path.to_owned() };
-    let mend = "name a folder that `greybox diagnose` wrote, or its report.json";
-    let text = loading::text(&file).map_err(|failure| failure.mend(mend))?;
+    let help = "name a folder that `greybox diagnose` wrote, or its report.json";
+    let text = loading::text(&file).map_err(|failure| failure.help(help))?;
     Report::from_json(&text).map_err(|e| {
-        Failure::file(&file, format!("this is no report of a diagnosis: {}", cause(&e))).mend(mend)
+        Failure::file(&file, format!("this is no report of a diagnosis: {}", cause(&e))).help(help)
     })
 }
 

@@ -157,7 +157,7 @@ fn request(arguments: &Arguments) -> Result<Request, Failure> {
         match parsed {
             Some((name, value)) if value > 0.0 && value.is_finite() => Ok((name.to_owned(), value)),
             _ => Err(Failure::input(format!("`--size {text}` is no size of a state"))
-                .mend("write it as NAME=VALUE with a positive number, such as `--size theta=0.5`")),
+                .help("write it as NAME=VALUE with a positive number, such as `--size theta=0.5`")),
         }
     };
     Ok(Request {

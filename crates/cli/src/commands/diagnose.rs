@@ -78,7 +78,7 @@ fn work(arguments: &Arguments) -> Result<Answer, Failure> {
                 folder,
                 "this is a folder, which stands alone as the place of recordings",
             )
-            .mend("name the folder alone, or every recording by its own name"));
+            .help("name the folder alone, or every recording by its own name"));
         }
         (_, None) => {}
     }

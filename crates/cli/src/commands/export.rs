@@ -69,7 +69,7 @@ impl Language {
 
 pub(crate) fn run(arguments: &Arguments) -> Result<Answer, Failure> {
     if arguments.bare && arguments.to != Language::Latex {
-        return Err(Failure::input("`--bare` is for LaTeX").mend("leave it out, or write `--to latex`"));
+        return Err(Failure::input("`--bare` is for LaTeX").help("leave it out, or write `--to latex`"));
     }
     let model = loading::model(&arguments.model)?.model;
     let text = match arguments.to {

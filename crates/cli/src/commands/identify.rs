@@ -259,7 +259,7 @@ fn library(arguments: &Arguments, usual: Monomials) -> Result<Library, Failure> 
     let monomials = kinds.next().unwrap_or(usual);
     if kinds.any(|other| other != monomials) {
         return Err(Failure::input("--library names two kinds of monomials")
-            .mend("choose one of `tensor`, `total` and `separate`"));
+            .help("choose one of `tensor`, `total` and `separate`"));
     }
     Ok(Library {
         monomials,

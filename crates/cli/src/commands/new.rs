@@ -50,13 +50,13 @@ pub(crate) fn run(arguments: &Arguments) -> Result<Answer, Failure> {
     let Some((name, text)) = TEMPLATES.into_iter().find(|(name, _)| name == wanted) else {
         let names: Vec<&str> = TEMPLATES.iter().map(|(name, _)| *name).collect();
         return Err(Failure::input(format!("there is no template called `{wanted}`"))
-            .mend(format!("name one of {}", names.join(", "))));
+            .help(format!("name one of {}", names.join(", "))));
     };
     let Some(path) = &arguments.out else {
         return Ok(Answer::new(text.to_owned(), json!({ "template": name, "text": text })));
     };
     if path.exists() {
-        return Err(Failure::file(path, "this file is there already").mend("name another after `--out`"));
+        return Err(Failure::file(path, "this file is there already").help("name another after `--out`"));
     }
     OutputFile::prepare(path, &[])?.write(text.as_bytes())?;
     let shown = path.display().to_string();

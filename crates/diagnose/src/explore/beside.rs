@@ -13,13 +13,13 @@
 //! replaces a law is compared with it there. Each shape is one of N candidates.
 
 use greybox_calibrate::stochastic::Filter;
-use greybox_calibrate::{Level, Point};
+use greybox_calibrate::{Point, Segmentation};
 
 use super::{Hypothesis, Known, innovations};
-use crate::along::Along;
 use crate::library::Mechanism;
 use crate::screen::{Gram, effect, signals};
 use crate::shapes::{Group, Shapes, log_sum};
+use crate::trajectory::TrajectoryEval;
 
 /// Forces of free shape beside a hypothesis.
 pub(super) struct Beside<'h> {
@@ -42,13 +42,13 @@ impl<'h> Beside<'h> {
         h: &'h Hypothesis,
         filter: &Filter,
         library: &[Mechanism],
-        (level, point): &(Level, Point),
+        (level, point): &(Segmentation, Point),
         inflation: f64,
         candidates: usize,
     ) -> Option<Beside<'h>> {
         let at = h.at();
         let setup = &at.setup;
-        let along = Along::smoothed(setup, level, &at.errors.noise(), point);
+        let along = TrajectoryEval::smoothed(setup, level, &at.errors.noise(), point);
         let Shapes { groups, forces: mut added } = Shapes::along(setup, &along, 0.0)?;
         let (np, shapes) = (setup.free.len(), added.len());
         let mut lanes = Vec::new();

@@ -90,7 +90,7 @@ pub(super) fn recording(
             None => RecordingError::NoTime {
                 place: place(),
                 found: if left_out.is_empty() { "nothing".to_owned() } else { left_out },
-                mend: match found.objects {
+                help: match found.objects {
                     true => {
                         "the content of MATLAB's objects (timeseries, tables, Simulink's data sets) is not kept in a form \
                          that others can read: save the arrays, `t = ts.Time; y = ts.Data; save('run.mat', 't', 'y', '-v7')`"

@@ -50,7 +50,7 @@ pub(crate) struct Array {
 /// Why the bytes are not read.
 #[derive(Debug, Clone, PartialEq)]
 pub(crate) enum Fault {
-    /// They are of another format: what it is, and the mend.
+    /// They are of another format: what it is, and the fix.
     Format(&'static str, &'static str),
     /// They end too early, or have no meaning: what was found, in which variable, before which byte.
     Damaged { variable: Option<String>, what: &'static str, at: usize },
@@ -58,7 +58,7 @@ pub(crate) enum Fault {
     TooLarge { variable: Option<String> },
 }
 
-/// The mend for formats that greybox does not read.
+/// The fix for formats that greybox does not read.
 const SAVE_V7: &str = "load it in MATLAB and write it again with `save('run.mat', 't', 'y', '-v7')`";
 
 /// Reads all variables of a file.

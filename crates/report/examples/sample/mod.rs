@@ -387,7 +387,7 @@ fn findings() -> Vec<Finding> {
             recording: Some("train.csv".to_owned()),
             channel: Some("theta".to_owned()),
             message: "Steps of 0.00153 rad: an encoder of 4096 counts per turn.".to_owned(),
-            mend: None,
+            help: None,
         },
         Finding {
             severity: Severity::Warning,
@@ -395,7 +395,7 @@ fn findings() -> Vec<Finding> {
             recording: Some("train.csv".to_owned()),
             channel: Some("v".to_owned()),
             message: "Little power above 6 Hz: the link's damping rests on few cycles.".to_owned(),
-            mend: Some("add a sweep up to 15 Hz to the input".to_owned()),
+            help: Some("add a sweep up to 15 Hz to the input".to_owned()),
         },
     ]
 }

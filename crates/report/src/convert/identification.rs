@@ -101,19 +101,19 @@ fn limit() -> Finding {
         channel: None,
         message: "the search ended at its limit of work: the terms were not all tried, and the fit may be unfinished"
             .to_owned(),
-        mend: Some("give it more with `--work`, a smaller library, or the input that drives the machine".to_owned()),
+        help: Some("give it more with `--work`, a smaller library, or the input that drives the machine".to_owned()),
     }
 }
 
 /// What reading in blocks means for the report.
 fn blocks(found: &Blocks) -> Vec<Finding> {
-    let finding = |severity, code: &str, message: String, mend: Option<&str>| Finding {
+    let finding = |severity, code: &str, message: String, help: Option<&str>| Finding {
         severity,
         code: code.to_owned(),
         recording: None,
         channel: None,
         message,
-        mend: mend.map(str::to_owned),
+        help: help.map(str::to_owned),
     };
     let Blocks { blocks, samples, lost, passes, settled } = *found;
     let read = format!(
@@ -124,14 +124,14 @@ fn blocks(found: &Blocks) -> Vec<Finding> {
     if lost > 0 {
         let message =
             format!("the model cannot be simulated on blocks with {lost} samples, which were left out");
-        let mend = "look at these stretches: a channel may be missing there, or another physics at work";
-        out.push(finding(Severity::Warning, "lost_blocks", message, Some(mend)));
+        let help = "look at these stretches: a channel may be missing there, or another physics at work";
+        out.push(finding(Severity::Warning, "lost_blocks", message, Some(help)));
     }
     if !settled {
         let message = "the choice of terms still changed in the last pass over the blocks".to_owned();
-        let mend =
+        let help =
             "the recordings do not settle it: look at the doubtful terms, or ask for a smaller library";
-        out.push(finding(Severity::Warning, "unsettled", message, Some(mend)));
+        out.push(finding(Severity::Warning, "unsettled", message, Some(help)));
     }
     out
 }

@@ -123,7 +123,7 @@ impl View {
             failed: statistics
                 .failed
                 .iter()
-                .map(|f| [f.recording.clone(), f.message.clone(), f.mend.clone().unwrap_or_default()])
+                .map(|f| [f.recording.clone(), f.message.clone(), f.help.clone().unwrap_or_default()])
                 .collect(),
             mechanisms: summary.mechanisms.iter().map(|m| mechanism(m, counts.diagnosed())).collect(),
             parameters: summary.parameters.iter().map(|(name, p)| parameter(name, p)).collect(),

@@ -137,7 +137,7 @@ fn recordings(folder: &Path, holdout: &[PathBuf]) -> Result<Vec<PathBuf>, Failur
     recordings.retain(|path| !holdout.iter().any(|held| same_file(held, path)));
     if recordings.is_empty() {
         return Err(Failure::file(folder, "every recording of this folder is held out")
-            .mend("leave at least one of them to learn from"));
+            .help("leave at least one of them to learn from"));
     }
     Ok(recordings)
 }
@@ -156,7 +156,7 @@ fn tasks(recordings: &[PathBuf], place: &Path) -> Result<Vec<Task>, Failure> {
                 recording,
                 format!("its results would go where those of `{other}` go, to `{name}`"),
             )
-            .mend("rename the recording"));
+            .help("rename the recording"));
         }
         let out = OutputFolder::prepare(&place.join(&name))?;
         tasks.push(Task { recording: recording.clone(), name, out });
@@ -226,7 +226,7 @@ impl Batch<'_> {
             [recording].into_iter().map(Path::to_owned).chain(self.holdout.iter().cloned()).collect();
         let fingerprint = |path: &Path| {
             let content = fs::read(path).map_err(|e| {
-                Failure::file(path, format!("the file cannot be read: {e}")).mend("check its permissions")
+                Failure::file(path, format!("the file cannot be read: {e}")).help("check its permissions")
             })?;
             Ok(Fingerprint::of(loading::called(path, &paths), &content))
         };

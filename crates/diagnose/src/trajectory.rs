@@ -1,11 +1,11 @@
 //! Expressions of the model evaluated along given states, sample by sample.
 
-use greybox_calibrate::{Level, Point, Setup};
+use greybox_calibrate::{Point, Segmentation, Setup};
 use greybox_model::tape::{Column, LeafKind, Tape};
 use greybox_model::{Expr, Func};
 
 /// States of every piece at every sample, from the measurements where there are any.
-pub struct Along<'a> {
+pub struct TrajectoryEval<'a> {
     setup: &'a Setup,
     /// `states[piece][i]` is entry i of the state vector.
     pub states: Vec<Vec<Vec<f64>>>,
@@ -17,7 +17,7 @@ pub struct Along<'a> {
 fn follow(
     states: &mut [Vec<Vec<f64>>],
     setup: &Setup,
-    level: &Level,
+    level: &Segmentation,
     scale: &[f64],
     point: &Point,
     entry: impl Fn(usize) -> bool,
@@ -31,17 +31,17 @@ fn follow(
     }
 }
 
-impl<'a> Along<'a> {
+impl<'a> TrajectoryEval<'a> {
     /// Smoothed by model and measurements together ([`crate::smoother`]): states, and the force that each
     /// equation lacks. Beside coloured noise the states are those of the fit itself: what the model still lacks
     /// moves them less than the noise does, and noise in a candidate's variables would pass for its effect.
     pub fn observed(
         setup: &'a Setup,
-        level: &Level,
+        level: &Segmentation,
         scale: &[f64],
         point: &Point,
-    ) -> (Along<'a>, Vec<Vec<Vec<f64>>>) {
-        let first = Along::smoothed(setup, level, scale, point);
+    ) -> (TrajectoryEval<'a>, Vec<Vec<Vec<f64>>>) {
+        let first = TrajectoryEval::smoothed(setup, level, scale, point);
         let force: Vec<f64> = first
             .own_forces()
             .into_iter()
@@ -60,13 +60,13 @@ impl<'a> Along<'a> {
             noise: &setup.data.sigma,
             force: &force,
             first: &first.states,
-            tolerance: &setup.hats.tolerance,
+            tolerance: &setup.smoothed_states.tolerance,
         };
         let smoothed = crate::smoother::smooth(setup, &given);
         let along = if setup.noise.is_some() {
-            Along::undisturbed(setup, level, scale, point)
+            TrajectoryEval::undisturbed(setup, level, scale, point)
         } else {
-            Along { states: smoothed.states, ..first }
+            TrajectoryEval { states: smoothed.states, ..first }
         };
         (along, smoothed.forces)
     }
@@ -106,7 +106,7 @@ impl<'a> Along<'a> {
             let (mut sum, mut count) = (0.0, 0usize);
             for (j, column) in values.iter().enumerate() {
                 for (p, column) in column.iter().enumerate() {
-                    let Some(z) = &self.setup.hats.highest[p][j] else { continue };
+                    let Some(z) = &self.setup.smoothed_states.highest[p][j] else { continue };
                     for v in column.iter().zip(z).map(|(c, z)| c * z).filter(|v| v.is_finite()) {
                         sum += v * v;
                         count += 1;
@@ -119,42 +119,58 @@ impl<'a> Along<'a> {
     }
 
     /// Smoothed measurements; unmeasured entries from the segments' trajectories.
-    pub fn smoothed(setup: &'a Setup, level: &Level, scale: &[f64], point: &Point) -> Along<'a> {
-        Along::measured(setup, level, scale, point, false)
+    pub fn smoothed(
+        setup: &'a Setup,
+        level: &Segmentation,
+        scale: &[f64],
+        point: &Point,
+    ) -> TrajectoryEval<'a> {
+        TrajectoryEval::measured(setup, level, scale, point, false)
     }
 
     /// Smoothed measurements, or beside coloured noise, which they hold, the segments' trajectories.
-    pub fn undisturbed(setup: &'a Setup, level: &Level, scale: &[f64], point: &Point) -> Along<'a> {
-        Along::measured(setup, level, scale, point, setup.noise.is_some())
+    pub fn undisturbed(
+        setup: &'a Setup,
+        level: &Segmentation,
+        scale: &[f64],
+        point: &Point,
+    ) -> TrajectoryEval<'a> {
+        TrajectoryEval::measured(setup, level, scale, point, setup.noise.is_some())
     }
 
     /// Smoothed measurements; on the segments of `level` all entries (`simulated`) or the unmeasured ones from
     /// their own trajectories.
-    fn measured(setup: &'a Setup, level: &Level, scale: &[f64], point: &Point, simulated: bool) -> Along<'a> {
-        let own = |i: usize| simulated || setup.hats.tolerance[i].is_infinite();
+    fn measured(
+        setup: &'a Setup,
+        level: &Segmentation,
+        scale: &[f64],
+        point: &Point,
+        simulated: bool,
+    ) -> TrajectoryEval<'a> {
+        let own = |i: usize| simulated || setup.smoothed_states.tolerance[i].is_infinite();
         let mut states: Vec<Vec<Vec<f64>>> = setup
             .data
             .pieces
             .iter()
-            .zip(&setup.hats.states)
-            .map(|(piece, hats)| {
-                hats.iter().map(|h| h.clone().unwrap_or_else(|| vec![0.0; piece.len])).collect()
+            .zip(&setup.smoothed_states.states)
+            .map(|(piece, smoothed_states)| {
+                smoothed_states.iter().map(|h| h.clone().unwrap_or_else(|| vec![0.0; piece.len])).collect()
             })
             .collect();
         if (0..setup.system.nx).any(own) {
             follow(&mut states, setup, level, scale, point, own);
         }
-        Along { setup, states, parameters: point.parameters.clone(), simulated }
+        TrajectoryEval { setup, states, parameters: point.parameters.clone(), simulated }
     }
 
     /// Simulated states, `x[piece][i * n + k]`.
-    pub fn simulated(setup: &'a Setup, x: &[Vec<f64>], parameters: &[f64]) -> Along<'a> {
+    pub fn simulated(setup: &'a Setup, x: &[Vec<f64>], parameters: &[f64]) -> TrajectoryEval<'a> {
         let states = x
             .iter()
             .zip(&setup.data.pieces)
             .map(|(x, piece)| x.chunks(piece.len).map(<[f64]>::to_vec).collect())
             .collect();
-        Along { setup, states, parameters: parameters.to_vec(), simulated: true }
+        TrajectoryEval { setup, states, parameters: parameters.to_vec(), simulated: true }
     }
 
     /// Highest derivatives `[piece][state][sample]`: smoothed where the state is measured, else what the
@@ -193,7 +209,7 @@ impl<'a> Along<'a> {
                         }
                     }
                     if smoothed {
-                        for (z, hat) in z.iter_mut().zip(&self.setup.hats.highest[p]) {
+                        for (z, hat) in z.iter_mut().zip(&self.setup.smoothed_states.highest[p]) {
                             if let Some(hat) = hat {
                                 z.clone_from(hat);
                             }
@@ -354,7 +370,7 @@ mod tests {
         let data = Arc::new(Data::new(&model, &[recording]).unwrap());
         let setup = Setup::new(&model, data, free_parameters(&model)).unwrap();
         let x: Vec<f64> = (0..60).map(|k| f64::from(k * k)).collect();
-        let along = Along::simulated(&setup, std::slice::from_ref(&x), &[1.0]);
+        let along = TrajectoryEval::simulated(&setup, std::slice::from_ref(&x), &[1.0]);
         let delay = |e: Expr, by: f64| Expr::Call(Func::Delay, vec![e, Expr::Num(by)]);
         let nested = delay(delay(Expr::var("x"), 0.2), 0.3);
         let values = along.eval(&[nested, Expr::var("x")], &[]).unwrap();

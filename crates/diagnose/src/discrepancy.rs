@@ -5,14 +5,14 @@
 
 use std::sync::Arc;
 
-use greybox_calibrate::{Level, Point, Setup, qr};
+use greybox_calibrate::{Point, Segmentation, Setup, qr};
 use greybox_simulate::SignalLanes;
 use rayon::prelude::*;
 
-use crate::along::Along;
-use crate::evidence::{fall, least_kappa};
+use crate::evidence::{cross_validation_improvement, least_effective_sample_ratio};
 use crate::screen::{project, signals};
 use crate::shapes::{Shapes, Variable};
+use crate::trajectory::TrajectoryEval;
 
 const FOLDS: usize = 10;
 /// Samples that tell enough, and fewest segments that are kept.
@@ -25,7 +25,7 @@ const LEAST_INDEPENDENT: f64 = 20.0;
 
 /// What free shapes explain beyond the model.
 #[derive(Debug, Clone, PartialEq)]
-pub struct Surface {
+pub struct Discrepancy {
     /// Relative drop of the held-out residual sum of squares.
     pub gain: f64,
     /// Mean over standard error of the folds' drops.
@@ -35,7 +35,7 @@ pub struct Surface {
     /// Samples that were looked at, over all channels.
     pub samples: usize,
     /// Independent samples that one of them is worth.
-    pub kappa: f64,
+    pub effective_sample_ratio: f64,
     /// Held-out errors by fold, with the shapes.
     pub errors: Vec<f64>,
     /// Held-out error of the model without them, over all folds.
@@ -46,7 +46,7 @@ pub struct Surface {
 
 /// Every so many-th segment, where there are more samples than the test needs (and no memory goes on from one
 /// segment to the next).
-fn thinned(setup: &Setup, level: &Level, point: &Point) -> (Level, Point) {
+fn thinned(setup: &Setup, level: &Segmentation, point: &Point) -> (Segmentation, Point) {
     let total: usize = level.segments.iter().map(|s| s.range.len()).sum();
     let step = if setup.carried.is_empty() { total.div_ceil(MOST_SAMPLES) } else { 1 };
     // Few long segments are as many blocks as they hold.
@@ -57,23 +57,23 @@ fn thinned(setup: &Setup, level: &Level, point: &Point) -> (Level, Point) {
         priors.push(level.priors[i].clone());
         starts.push(point.starts[i].clone());
     }
-    (Level { segments, priors }, Point { parameters: point.parameters.clone(), starts })
+    (Segmentation { segments, priors }, Point { parameters: point.parameters.clone(), starts })
 }
 
 /// Tests a fitted model against free shapes: `scale` is one per channel, SI, `point` an optimum at `level`. `None`
 /// where no motion has a shape, or where there is too little independent data.
-pub fn test(setup: &Setup, level: &Level, scale: &[f64], point: &Point) -> Option<Surface> {
+pub fn test(setup: &Setup, level: &Segmentation, scale: &[f64], point: &Point) -> Option<Discrepancy> {
     let (level, point) = &thinned(setup, level, point);
-    let along = Along::undisturbed(setup, level, scale, point);
+    let along = TrajectoryEval::undisturbed(setup, level, scale, point);
     let Shapes { groups, forces } = Shapes::along(setup, &along, RARE)?;
     let (lanes, signals) = (forces.len(), signals(setup, &forces));
     let total: usize = level.segments.iter().map(|s| s.range.len()).sum();
     // Blocks no shorter than the residual's correlation: neighbours must not predict each other.
-    let kappa = least_kappa(setup, level, scale, point);
-    if (total as f64) * kappa < LEAST_INDEPENDENT {
+    let effective_sample_ratio = least_effective_sample_ratio(setup, level, scale, point);
+    if (total as f64) * effective_sample_ratio < LEAST_INDEPENDENT {
         return None; // too little independent data to call anything systematic
     }
-    let block = (total / 40).max((1.0 / kappa).ceil() as usize).max(1);
+    let block = (total / 40).max((1.0 / effective_sample_ratio).ceil() as usize).max(1);
     let data = Folded::new(setup, level, scale, point, &signals, block)?;
     let np = setup.free.len();
     let parameters: Vec<usize> = (0..np).collect();
@@ -83,7 +83,7 @@ pub fn test(setup: &Setup, level: &Level, scale: &[f64], point: &Point) -> Optio
         let mut chosen = parameters.clone();
         chosen.extend(range.map(|l| np + l));
         let errors = data.errors(&chosen);
-        let (total, t) = fall(&base, &errors);
+        let (total, t) = cross_validation_improvement(&base, &errors);
         (total / base_sum.max(1e-300), t, errors)
     };
     let mut all = with(0..lanes);
@@ -101,23 +101,23 @@ pub fn test(setup: &Setup, level: &Level, scale: &[f64], point: &Point) -> Optio
         all = single;
     }
     let (gain, t, errors) = all;
-    Some(Surface {
+    Some(Discrepancy {
         gain,
         t,
         variable: best,
         samples: total * setup.system.ny,
-        kappa,
+        effective_sample_ratio,
         errors,
         without: base_sum,
         block,
     })
 }
 
-/// Held-out errors by fold of a model without free shapes, on the folds of a [`Surface`] of the same level with
+/// Held-out errors by fold of a model without free shapes, on the folds of a [`Discrepancy`] of the same level with
 /// blocks of `block` samples.
 pub fn held_out(
     setup: &Setup,
-    level: &Level,
+    level: &Segmentation,
     scale: &[f64],
     point: &Point,
     block: usize,
@@ -142,7 +142,7 @@ impl Folded {
     /// Every tenth block of `block` samples is a fold; `None` where there are less than four blocks.
     fn new(
         setup: &Setup,
-        level: &Level,
+        level: &Segmentation,
         scale: &[f64],
         point: &Point,
         signals: &[Arc<SignalLanes>],
