@@ -353,7 +353,7 @@ fn a_json_error_has_its_place_in_fields() {
     let json: Value = serde_json::from_str(&outcome.stdout).unwrap();
     let error = &json["error"];
     assert_eq!((error["file"].as_str(), error["line"].as_u64()), (Some("bad.toml"), Some(15)), "{error}");
-    assert!(error["column"].is_u64() && error["help:"].is_string(), "{error}");
+    assert!(error["column"].is_u64() && error["help"].is_string(), "{error}");
     assert!(outcome.stderr.starts_with("error: "), "{}", outcome.stderr);
 }
 
