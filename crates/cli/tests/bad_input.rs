@@ -1,7 +1,7 @@
-//! Every row of the book's table of bad inputs, run as it is printed there.
+//! Bad inputs, and what the command answers to each, to the byte.
 //!
-//! The rows stand here; `UPDATE=1 cargo test -p greybox-cli --test bad_input` writes them, with what the command says now,
-//! into `docs/src/bad-input.md`. Without it the page and the command must agree to the byte.
+//! `bad_input/rows.rs` has the inputs; `UPDATE=1 cargo test -p greybox-cli --test bad_input` writes what the command says now to
+//! `bad_input/answers.md`, and the first of each section to the book's page. Without it both must agree with the command.
 
 // The words of the operating system stand in the page.
 #![cfg(target_os = "linux")]
@@ -29,11 +29,11 @@ mod spring;
 
 /// Longest that a row may take.
 const PATIENCE: Duration = Duration::from_secs(60);
-/// Fewest rows of the table.
+/// Fewest rows.
 const LEAST: usize = 60;
-/// What stands around the generated part of the page.
+/// What stands around the generated part of the book's page.
 const MARKS: (&str, &str) =
-    ("<!-- begin of the generated rows -->\n", "<!-- end of the generated rows -->\n");
+    ("<!-- begin of the generated examples -->\n\n", "<!-- end of the generated examples -->\n");
 
 /// What a shell line left.
 #[derive(Debug, PartialEq, Eq)]
@@ -157,9 +157,9 @@ fn json_agrees(bench: &Bench, row: &Row, words: &Said) -> bool {
         && told("help")
 }
 
-/// A block of the page: its heading and what the terminal shows.
-fn block(number: usize, row: &Row, said: &Said) -> String {
-    let mut text = format!("**{number}. {}**\n\n```text\n$ {}\n", row.what, row.run);
+/// An answer: its heading and what the terminal shows.
+fn block(row: &Row, said: &Said) -> String {
+    let mut text = format!("**{}**\n\n```text\n$ {}\n", row.what, row.run);
     text.push_str(&said.stdout);
     text.push_str(&said.stderr);
     assert!(text.ends_with('\n'), "{text}");
@@ -167,32 +167,34 @@ fn block(number: usize, row: &Row, said: &Said) -> String {
     text
 }
 
-/// A cell of a table.
-fn cell(text: &str) -> String {
-    let code = text.replace('|', "\\|");
-    match text.contains('`') {
-        true => format!("`` {code} ``"),
-        false => format!("`{code}`"),
-    }
-}
-
-/// The generated part of the page, and the blocks by their rows.
-fn generated(rows: &[Row], outcomes: &[Said]) -> String {
-    let mut text = String::from("| | bad input | exit | what is told |\n|--:|---|--:|---|\n");
-    for (k, (row, said)) in rows.iter().zip(outcomes).enumerate() {
-        let told = format!("{}{}", said.stderr, said.stdout);
-        let first = told.lines().next().unwrap_or_default();
-        writeln!(text, "| {} | {} | {} | {} |", k + 1, row.what, said.code, cell(first)).unwrap();
-    }
+/// All answers, and those of the book's page: the first of each section.
+fn answers(rows: &[Row], outcomes: &[Said]) -> (String, String) {
+    let mut all = String::from(
+        "# What the command answers to bad input\n\nWritten by `UPDATE=1 cargo test -p greybox-cli --test bad_input`.\n\n",
+    );
+    let mut page = String::new();
     let mut section = "";
-    for (k, (row, said)) in rows.iter().zip(outcomes).enumerate() {
+    for (row, said) in rows.iter().zip(outcomes) {
+        let block = block(row, said);
         if row.section != section {
             section = row.section;
-            writeln!(text, "\n## {section}\n").unwrap();
+            write!(all, "## {section}\n\n").unwrap();
+            write!(page, "### {section}\n\n{block}").unwrap();
         }
-        text.push_str(&block(k + 1, row, said));
+        all.push_str(&block);
     }
-    text
+    (all, page)
+}
+
+/// Writes the text with `UPDATE`; else it must be what is there, and the first block that is not is shown.
+fn agree(now: &str, then: &str, write: impl FnOnce()) {
+    if std::env::var_os("UPDATE").is_some() {
+        return write();
+    }
+    for (now, then) in now.split("\n**").zip(then.split("\n**")) {
+        assert_eq!(now, then, "the command has changed: look at the answer, and run this test with UPDATE=1");
+    }
+    assert_eq!(now, then, "answers are missing or too many: run this test with UPDATE=1");
 }
 
 /// All rows, on as many threads as there are processors.
@@ -211,25 +213,24 @@ fn run(rows: &[Row]) -> Vec<Said> {
 }
 
 #[test]
-fn every_row_of_the_table_says_what_the_page_says() {
+fn every_bad_input_is_answered_as_before() {
     let rows = rows();
     assert!(rows.len() >= LEAST, "only {} rows", rows.len());
     for (k, row) in rows.iter().enumerate() {
         assert!(rows[..k].iter().all(|other| other.what != row.what), "`{}` stands twice", row.what);
     }
-    let text = generated(&rows, &run(&rows));
-    let path = Path::new(env!("CARGO_MANIFEST_DIR")).join("../../docs/src/bad-input.md");
-    let page = fs::read_to_string(&path).unwrap();
+    let (all, examples) = answers(&rows, &run(&rows));
+    let package = Path::new(env!("CARGO_MANIFEST_DIR"));
+    let file = package.join("tests/bad_input/answers.md");
+    agree(&all, &fs::read_to_string(&file).unwrap_or_default(), || fs::write(&file, &all).unwrap());
+    // The book is not in the package.
+    let path = package.join("../../docs/src/bad-input.md");
+    let Ok(page) = fs::read_to_string(&path) else { return };
     let (head, rest) = page.split_once(MARKS.0).unwrap();
     let (body, tail) = rest.split_once(MARKS.1).unwrap();
-    if std::env::var_os("UPDATE").is_some() {
-        fs::write(&path, format!("{head}{}{text}{}{tail}", MARKS.0, MARKS.1)).unwrap();
-        return;
-    }
-    for (now, then) in text.split("\n**").zip(body.split("\n**")) {
-        assert_eq!(now, then, "the page is stale, or the command has changed: run this test with UPDATE=1");
-    }
-    assert_eq!(text, body, "the page is stale: run this test with UPDATE=1");
+    agree(&examples, body, || {
+        fs::write(&path, format!("{head}{}{examples}{}{tail}", MARKS.0, MARKS.1)).unwrap();
+    });
 }
 
 /// Killed while it works: nothing is there, and the same command runs.

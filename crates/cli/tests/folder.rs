@@ -312,7 +312,7 @@ fn two_diagnoses_are_held_against_each_other() {
     assert_eq!(fail_if("worse.json", &[&worse[..], &["--margin", "-1"]].concat()).code, 2);
 
     bench.write("no.json", "{\"verdict\": 3}");
-    for (path, part) in [("no.json", "this is no report of a diagnosis"), ("nowhere", "no such file")] {
+    for (path, part) in [("no.json", "not a diagnosis report"), ("nowhere", "no such file")] {
         let refused = bench.greybox(&["compare", path, "out/friday", "--out", "none"]);
         assert_eq!(refused.code, 2, "{}", refused.stderr);
         assert!(

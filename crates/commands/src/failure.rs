@@ -83,7 +83,7 @@ impl Failure {
 
     /// A panic, of which the default hook has said where.
     pub fn fault() -> Failure {
-        Failure::internal("greybox met a fault of its own; please report the lines above")
+        Failure::internal("internal error; please report the lines above")
     }
 
     /// Adds the fix.
@@ -178,7 +178,7 @@ impl Failure {
         self.0.help.as_deref()
     }
 
-    /// Exit status: 2 for bad input, 1 for a fault of greybox or of the machine.
+    /// Exit status: 2 for bad input, 1 for an internal error or a fault of the machine.
     pub fn code(&self) -> u8 {
         match self.0.cause {
             Cause::BadInput => 2,
@@ -334,7 +334,7 @@ impl From<DataError> for Failure {
     }
 }
 
-/// A mechanism of the built-in library that cannot be read is a fault of greybox.
+/// A mechanism of the built-in library that cannot be read is an internal error.
 impl From<DiagnoseError> for Failure {
     fn from(error: DiagnoseError) -> Failure {
         match error {

@@ -130,7 +130,7 @@ impl Candidate {
         with.resolve_units().is_ok() || model.clone().resolve_units().is_err()
     }
 
-    /// Whether it is a free parameter of the model under another name: its force is in every equation the
+    /// Whether it is collinear with a free parameter of the model: its force is in every equation the
     /// same multiple of what that parameter multiplies. (Judged at a few arbitrary points.)
     fn duplicates(&self, model: &Model, mechanism: &Mechanism) -> bool {
         let [name] = &mechanism.linear[..] else { return false };
@@ -393,7 +393,7 @@ mod tests {
     use super::*;
     use crate::place::places;
 
-    /// A damper's parameter has its law under another name; a force that does not turn with the motion has not.
+    /// A damper's law is collinear with the damper's parameter; a force that does not turn with the motion has not.
     #[test]
     fn an_even_force_is_no_parameter_under_another_name() {
         let text = "[inputs]\nf = { unit = \"N\" }\n[states]\nx = { unit = \"m\" }\n[parameters]\n\

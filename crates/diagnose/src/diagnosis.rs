@@ -1582,7 +1582,7 @@ fn is_crowded(improved: &FittedModel, shares: &[f64], index: usize, nominal: &Mo
 /// Whether forces of free shape beat the mechanisms: held out by folds, they explain clearly more of the
 /// calibrated model's residual, and steadily so, or as much where the mechanisms need a memory and the shapes need
 /// none. A law
-/// of the library is at least as good as a free shape of its variables; what imitates another law is not.
+/// of the library is at least as good as a free shape of its variables; an imitating law need not be.
 fn beaten_by_discrepancy(
     (base, improved): &(FittedModel, FittedModel),
     scale: &[f64],

@@ -51,8 +51,8 @@ impl Variant {
     }
 }
 
-/// Share of a column's sum of squares that the model's own parameters must leave over: less is a parameter
-/// under another name, and its coefficient would be rounding.
+/// Share of a column's sum of squares that the model's own parameters must leave over: a column with less is
+/// collinear with a parameter, and its coefficient would be rounding.
 const INDEPENDENT: f64 = 3e-4;
 
 /// What the score test says of a candidate's best variant.

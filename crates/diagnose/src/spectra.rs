@@ -155,7 +155,7 @@ impl<'a> Spectra<'a> {
             }
         }
         // A frequency that the input itself is made of cannot be told from what the motion does.
-        // A model far off answers wrongly wherever it is moved, line or not.
+        // A model far off leaves residual at every driven frequency, line or not.
         let off = self.scale.iter().zip(&self.setup.data.sigma).any(|(r, s)| *r > OFF * s);
         let taken = if off { moves } else { drives };
         let inputs = self.inputs();

@@ -395,7 +395,7 @@ fn check_text<'a>(bytes: &'a [u8], label: &str, above: u64) -> Result<&'a [u8], 
         Err(error) => {
             let at = error.valid_up_to();
             let line = 1 + text[..at].iter().filter(|&&b| b == b'\n').count() as u64;
-            Err(refuse(line, format!("byte 0x{:02x} has no meaning there", text[at])))
+            Err(refuse(line, format!("invalid UTF-8 byte 0x{:02x}", text[at])))
         }
         Ok(_) => match text.iter().position(|&b| b == 0) {
             Some(at) => {

@@ -207,7 +207,7 @@ pub enum RecordingError {
     },
     /// Squares of the values, or the sampling's frequencies, would leave the range of numbers.
     #[error(
-        "{place}: {what} of {found:e} is no size to compute with (1e-100 to 1e100 is); check the export, or write the \
+        "{place}: {what} of {found:e} is outside the supported range (1e-100 to 1e100); check the export, or write the \
          column in another unit"
     )]
     Scale {

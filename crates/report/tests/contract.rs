@@ -31,6 +31,15 @@ fn a_report_satisfies_the_schema_and_comes_back_unchanged() {
     assert_eq!(Report::from_json(&report.to_json().unwrap()).unwrap(), report);
 }
 
+/// The key of `help` had another name.
+#[test]
+fn findings_of_earlier_versions_are_read() {
+    let finding =
+        r#"{"severity": "warning", "code": "clipping", "message": "clipped", "mend": "turn it down"}"#;
+    let read: greybox_report::contract::Finding = serde_json::from_str(finding).unwrap();
+    assert_eq!(read.help.as_deref(), Some("turn it down"));
+}
+
 /// The promised keys, in the words of the design; renaming a field must fail here.
 #[test]
 fn the_promised_keys_are_there() {

@@ -401,7 +401,7 @@ fn summary(answers: &[&Answer]) -> String {
     let count = |told: &Told| answers.iter().filter(|a| a.told == *told).count();
     let mut text = format!("{} of {} named", count(&Told::Named), answers.len());
     if count(&Told::Equal) > 0 {
-        text += &format!(", {} told as an equal", count(&Told::Equal));
+        text += &format!(", {} reported as equivalent", count(&Told::Equal));
     }
     let mut others = BTreeMap::new();
     for answer in answers {

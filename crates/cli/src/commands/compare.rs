@@ -102,9 +102,8 @@ fn read(path: &Path) -> Result<Report, Failure> {
     let file = if path.is_dir() { path.join("report.json") } else { path.to_owned() };
     let help = "name a folder that `greybox diagnose` wrote, or its report.json";
     let text = loading::text(&file).map_err(|failure| failure.help(help))?;
-    Report::from_json(&text).map_err(|e| {
-        Failure::file(&file, format!("this is no report of a diagnosis: {}", cause(&e))).help(help)
-    })
+    Report::from_json(&text)
+        .map_err(|e| Failure::file(&file, format!("not a diagnosis report: {}", cause(&e))).help(help))
 }
 
 /// What the JSON lacks; the file has another name than the reader thinks.

@@ -29,8 +29,8 @@ DIR receives report.json, report.html (self-contained, with plots) and improved.
 last fifth of each recording is held out. The same seed and inputs give the same results.
 
 A folder in the place of TRAIN.csv stands alone: each of its recordings (*.csv, *.mat, *.parquet) that is not held out
-is diagnosed by itself, into a folder of its own in DIR, and summary.html and summary.json say what all say together. A
-run that was ended is gone on with by the same command: what is done is not done again.
+is diagnosed by itself, into a folder of its own in DIR, and summary.html and summary.json say what all say together. The
+same command resumes an interrupted run: what is done is not done again.
 
 Something wrong? --save-case packs what another needs to see why, without one value of the recordings; with --with-data
 they are in it, and it runs again by the command in its README.md.")]
