@@ -5,32 +5,39 @@
 #[doc = include_str!("../README.md")]
 struct Readme;
 
+mod baseline;
+mod calibration;
 pub mod candidate;
 mod closure;
 pub mod diagnosis;
 pub mod discrepancy;
 pub mod evidence;
 mod explore;
+mod findings;
+mod gates;
+mod importance;
 pub mod library;
 pub mod locate;
 pub mod place;
 mod plausibility;
 pub mod proposal;
+mod remainder;
 pub mod screen;
 pub mod search;
 pub mod shapes;
 pub mod smoother;
 pub mod spectra;
+mod takeover;
 mod temperature;
 pub mod trajectory;
 mod turns;
 mod twins;
 mod uncertainty;
 mod validate;
+mod verdict;
 
-pub use diagnosis::{
-    Calibration, DiagnoseError, Diagnosis, Estimate, Options, Subset, Verdict, calibrate, diagnose,
-};
+pub use calibration::{Calibration, calibrate};
+pub use diagnosis::{DiagnoseError, Diagnosis, Estimate, Options, Subset, Verdict, diagnose};
 pub use library::{Mechanism, MechanismError, built_in};
 
 use std::sync::Arc;
