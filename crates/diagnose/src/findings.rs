@@ -272,11 +272,7 @@ pub(crate) fn curve(
 }
 
 /// Residual of an equation along the smoothed measurements, SI: what the improved model still lacks.
-fn left_over(
-    setup: &Setup,
-    smoothed_states: &TrajectoryEval<'_>,
-    equation: usize,
-) -> Option<Vec<Vec<f64>>> {
+fn left_over(setup: &Setup, smoothed_states: &TrajectoryEval<'_>, equation: usize) -> Option<Vec<Vec<f64>>> {
     let residual = setup.model.equations[equation].residual();
     // The highest derivatives come from the smoothed measurements, too.
     let highest: Vec<(&str, u8)> =
