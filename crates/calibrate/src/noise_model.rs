@@ -57,11 +57,11 @@ impl Autoregression {
     }
 
     fn grow(&mut self, reflection: f64) {
-        let kappa = reflection.clamp(-CLIP, CLIP);
+        let reflection = reflection.clamp(-CLIP, CLIP);
         let old = &self.predictors[self.order()];
-        let mut next: Vec<f64> = old.iter().zip(old.iter().rev()).map(|(a, b)| a - kappa * b).collect();
-        next.push(kappa);
-        self.variances.push(self.variance() * (1.0 - kappa * kappa));
+        let mut next: Vec<f64> = old.iter().zip(old.iter().rev()).map(|(a, b)| a - reflection * b).collect();
+        next.push(reflection);
+        self.variances.push(self.variance() * (1.0 - reflection * reflection));
         self.predictors.push(next);
     }
 
@@ -220,13 +220,13 @@ fn burg(runs: &[&[f64]], n: usize, most: usize) -> Autoregression {
         if sum <= 1e-20 * power * n as f64 {
             break;
         }
-        let kappa = (2.0 * cross / sum).clamp(-CLIP, CLIP);
-        model.grow(kappa);
+        let reflection = (2.0 * cross / sum).clamp(-CLIP, CLIP);
+        model.grow(reflection);
         for (f, b) in &mut errors {
             for k in (m..f.len()).rev() {
                 let (old_f, old_b) = (f[k], b[k - 1]);
-                f[k] = old_f - kappa * old_b;
-                b[k] = old_b - kappa * old_f;
+                f[k] = old_f - reflection * old_b;
+                b[k] = old_b - reflection * old_f;
             }
         }
     }
