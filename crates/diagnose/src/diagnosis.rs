@@ -17,7 +17,7 @@ use crate::evidence::Evidence;
 use crate::findings::{DOUBTED, findings, rank};
 use crate::gates::defend;
 use crate::importance::subsets_of;
-use crate::library::{Mechanism, MechanismError, built_in};
+use crate::library::{Excitation, Mechanism, MechanismError, built_in};
 use crate::locate::Location;
 use crate::place::Place;
 use crate::proposal::{Gate, Proposal, Rejected};
@@ -156,6 +156,8 @@ pub struct Alternative {
     pub expression: String,
     /// The recording that would.
     pub separate: String,
+    /// How that drives the machine, if its law states it.
+    pub excitation: Option<Excitation>,
     /// Where it would act.
     pub site: Site,
 }
@@ -217,6 +219,8 @@ pub struct IdentifiedMechanism {
     pub family: String,
     /// What it looks like.
     pub signature: String,
+    /// How an experiment that tells it from its rivals drives the machine, if its law states it.
+    pub excitation: Option<Excitation>,
     /// Names of the equations it enters.
     pub equations: Vec<String>,
     /// Channel, for a fault of a sensor.
@@ -699,6 +703,7 @@ fn conclude(
                 equivalent: false,
                 expression: law.instance.expression.to_string(),
                 separate: mechanism.separate(place.moves(&nominal.model)).to_string(),
+                excitation: mechanism.excitation.clone(),
                 site: Site::of(std::slice::from_ref(place), &nominal.model),
             });
             rank(&mut m.alternatives);

@@ -118,6 +118,7 @@ pub(crate) fn findings(
                         equivalent: r.equivalent,
                         expression: r.instance.expression.to_string(),
                         separate: m.separate(place.moves(nominal)).to_string(),
+                        excitation: m.excitation.clone(),
                         site: Site::of(std::slice::from_ref(place), nominal),
                     }
                 })
@@ -137,19 +138,21 @@ pub(crate) fn findings(
                         equivalent: true,
                         expression: String::new(),
                         separate: m.separate(moves).to_string(),
+                        excitation: m.excitation.clone(),
                         site: Site::of(&twin.places, nominal),
                     }
                 },
             );
             for kind in mechanism.wider() {
                 alternatives.retain(|a| a.kind != kind);
-                let separate = library.iter().find(|m| m.kind == kind).map(|m| m.separate(moves).to_string());
+                let wider = library.iter().find(|m| m.kind == kind);
                 alternatives.push(Alternative {
                     kind: kind.to_string(),
                     confidence,
                     equivalent: true,
                     expression: part.instance.expression.to_string(),
-                    separate: separate.unwrap_or_default(),
+                    separate: wider.map_or(String::new(), |m| m.separate(moves).to_string()),
+                    excitation: wider.and_then(|m| m.excitation.clone()),
                     site: site.clone(),
                 });
             }
@@ -192,6 +195,7 @@ pub(crate) fn findings(
                 kind: mechanism.kind.clone(),
                 family: mechanism.family.clone(),
                 signature: mechanism.about.signature.clone(),
+                excitation: mechanism.excitation.clone(),
                 equations: places,
                 channel: site.channels.first().cloned(),
                 input: site.input.clone(),
@@ -313,6 +317,7 @@ mod tests {
             equivalent,
             expression: String::new(),
             separate: String::new(),
+            excitation: None,
             site: Site { equations, ..Site::default() },
         }
     }

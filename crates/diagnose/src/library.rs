@@ -24,6 +24,9 @@
 //! high = "2*vs"
 //! [report]                       # further figures that users expect
 //! breakaway = "fc/s0"
+//! [experiment]                   # optional: how to drive the machine, to tell the law from its rivals
+//! drive = "beyond"               # slow, wide, loud, silent, again; around, ramp and beyond have `at`
+//! at = "2*fc"                    # a frequency in Hz (around), or a magnitude of the input
 //! [about]
 //! signature = "…"
 //! confused_with = ["…"]
@@ -326,6 +329,49 @@ pub struct Region {
     pub high: Option<Expr>,
 }
 
+/// How to drive the machine so that a recording tells a mechanism from its rivals (`[experiment]` in its file): with formulas of
+/// its parameters and of the figures of its report, or with numbers.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub enum Excitation<T = Expr> {
+    /// Slowly, up to the present amplitude.
+    Slow,
+    /// Slowly, and further than now.
+    Wide,
+    /// As now, and louder.
+    Loud,
+    /// The input at zero.
+    Silent,
+    /// The same again.
+    Again,
+    /// A sine around this frequency, Hz.
+    Around(T),
+    /// A slow ramp of the input to this magnitude.
+    Ramp(T),
+    /// Steps of the input beyond this magnitude.
+    Beyond(T),
+}
+
+impl Excitation {
+    /// In numbers (SI), where `value` has all that its formula holds and the number is positive.
+    pub fn evaluated(&self, value: &dyn Fn(&str) -> Option<f64>) -> Option<Excitation<f64>> {
+        let number = |formula: &Expr| {
+            let constant = |name: &str| (name == "pi").then_some(std::f64::consts::PI);
+            let found = formula.eval(&|name, _| constant(name).or_else(|| value(name)));
+            found.filter(|v| v.is_finite() && *v > 0.0)
+        };
+        Some(match self {
+            Excitation::Slow => Excitation::Slow,
+            Excitation::Wide => Excitation::Wide,
+            Excitation::Loud => Excitation::Loud,
+            Excitation::Silent => Excitation::Silent,
+            Excitation::Again => Excitation::Again,
+            Excitation::Around(at) => Excitation::Around(number(at)?),
+            Excitation::Ramp(at) => Excitation::Ramp(number(at)?),
+            Excitation::Beyond(at) => Excitation::Beyond(number(at)?),
+        })
+    }
+}
+
 /// Prose for the report and the book.
 #[derive(Debug, Clone, PartialEq, Default, Deserialize)]
 #[serde(deny_unknown_fields)]
@@ -411,6 +457,8 @@ pub struct Mechanism {
     /// Kinds of other physics whose law is this one at some values of their parameters, in the same form: they are
     /// equivalent alternatives wherever this one is found.
     pub special_case: Vec<(String, String, Expr)>,
+    /// The excitation that tells it from its rivals, if one is stated.
+    pub excitation: Option<Excitation>,
     /// Prose.
     pub about: About,
 }
@@ -511,6 +559,7 @@ struct File {
     inner: toml::map::Map<String, toml::Value>,
     shape: Option<ShapeFile>,
     location: Option<LocationFile>,
+    experiment: Option<ExperimentFile>,
     #[serde(default)]
     equals: toml::map::Map<String, toml::Value>,
     #[serde(default)]
@@ -535,6 +584,26 @@ struct LocationFile {
     variable: String,
     low: Option<String>,
     high: Option<String>,
+}
+
+#[derive(Deserialize)]
+#[serde(deny_unknown_fields)]
+struct ExperimentFile {
+    drive: Drive,
+    at: Option<String>,
+}
+
+#[derive(Deserialize, Clone, Copy)]
+#[serde(rename_all = "snake_case")]
+enum Drive {
+    Slow,
+    Wide,
+    Loud,
+    Silent,
+    Again,
+    Around,
+    Ramp,
+    Beyond,
 }
 
 #[derive(Deserialize)]
@@ -673,12 +742,14 @@ impl Mechanism {
             region: raw.location.map(region).transpose()?,
             equals: of_others("equals", raw.equals)?,
             special_case: of_others("special_case", raw.special_case)?,
+            excitation: raw.experiment.map(excitation).transpose()?,
             about: raw.about,
         };
         mechanism.own = mechanism.names().filter(|n| mechanism.uses(n)).map(str::to_string).collect();
         mechanism.check_names()?;
         mechanism.check_parameters()?;
         mechanism.check_data()?;
+        mechanism.check_excitation()?;
         mechanism.check_linear()?;
         if !mechanism.named && !mechanism.is_term() {
             return Err(Fault::new(
@@ -1026,6 +1097,27 @@ impl Mechanism {
         Ok(())
     }
 
+    /// Where an experiment drives the machine follows from what the report says of the mechanism.
+    fn check_excitation(&self) -> Result<(), Fault> {
+        let Some(Excitation::Around(at) | Excitation::Ramp(at) | Excitation::Beyond(at)) = &self.excitation
+        else {
+            return Ok(());
+        };
+        let figures = || self.report.iter().map(|(name, _)| name);
+        let known = |n: &str| n == "pi" || self.own.iter().chain(figures()).any(|own| own == n);
+        match stranger(at, known) {
+            Some(n) => Err(Fault::new(
+                "experiment",
+                "at",
+                format!(
+                    "[experiment] at: `{n}` is no parameter of the law (they are {}), and no figure of [report]",
+                    self.own.join(", ")
+                ),
+            )),
+            None => Ok(()),
+        }
+    }
+
     /// The law is linear in the `linear` parameters, through `[first]` if need be, and the states do not
     /// depend on them.
     fn check_linear(&self) -> Result<(), Fault> {
@@ -1338,6 +1430,30 @@ fn region(entry: LocationFile) -> Result<Region, Fault> {
         low: end(entry.low, "low")?,
         high: end(entry.high, "high")?,
     })
+}
+
+fn excitation(entry: ExperimentFile) -> Result<Excitation, Fault> {
+    let at = entry.at.map(|text| expression(&text, "experiment", "at")).transpose()?;
+    match (entry.drive, at) {
+        (Drive::Slow, None) => Ok(Excitation::Slow),
+        (Drive::Wide, None) => Ok(Excitation::Wide),
+        (Drive::Loud, None) => Ok(Excitation::Loud),
+        (Drive::Silent, None) => Ok(Excitation::Silent),
+        (Drive::Again, None) => Ok(Excitation::Again),
+        (Drive::Around, Some(at)) => Ok(Excitation::Around(at)),
+        (Drive::Ramp, Some(at)) => Ok(Excitation::Ramp(at)),
+        (Drive::Beyond, Some(at)) => Ok(Excitation::Beyond(at)),
+        (_, Some(_)) => Err(Fault::new(
+            "experiment",
+            "at",
+            "[experiment] at: only `around`, `ramp` and `beyond` have it; remove it",
+        )),
+        (_, None) => Err(Fault::new(
+            "experiment",
+            "drive",
+            "[experiment] drive: state the frequency in Hz, or the magnitude of the input, as `at = \"formula\"`",
+        )),
+    }
 }
 
 fn first_value(text: &str, name: &str) -> Result<First, Fault> {
@@ -1709,7 +1825,22 @@ mod tests {
                 5,
                 "the equation of the state `z` depends on a",
             ),
-            // [location], [report], [equals]
+            // [location], [experiment], [report], [equals]
+            (
+                "force = \"fc*d\"\nlinear = [\"fc\"]\n[experiment]\ndrive = \"around\"\nat = \"1/q\"",
+                8,
+                "[experiment] at: `q` is no parameter",
+            ),
+            (
+                "force = \"fc*d\"\nlinear = [\"fc\"]\n[experiment]\ndrive = \"ramp\"",
+                7,
+                "[experiment] drive: state the frequency",
+            ),
+            (
+                "force = \"fc*d\"\nlinear = [\"fc\"]\n[experiment]\ndrive = \"slow\"\nat = \"fc\"",
+                8,
+                "[experiment] at: only `around`",
+            ),
             (
                 "force = \"fc*d\"\nlinear = [\"fc\"]\n[location]\nvariable = \"v\"",
                 7,

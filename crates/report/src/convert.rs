@@ -8,6 +8,7 @@ use greybox_calibrate::{Data, FreeRun, Setup, input_noise};
 use greybox_diagnose::diagnosis::{
     Basis as Ground, Estimate as Estimated, IdentifiedMechanism, Role as RoleRuns, Run,
 };
+use greybox_diagnose::library::Excitation;
 use greybox_diagnose::locate::{Location as Located, spectrum};
 use greybox_diagnose::proposal::{self, Proposal};
 use greybox_diagnose::{Calibration, Diagnosis, Verdict as Answer};
@@ -229,21 +230,24 @@ fn plan(found: &IdentifiedMechanism, improved: &Model, reach: &Reach) -> Option<
         let figures = found.figures.iter().map(|(n, e)| (n, e));
         parameters.chain(figures).find(|(n, _)| is(n)).map(|(_, e)| e.value)
     };
-    // A threshold of an input is told in the input's unit.
+    // A threshold of an input is reported in the input's unit.
     let input = found.input.as_deref().or_else(|| reaching(improved, &found.equations));
     let unit = found.input.as_ref().and_then(|n| improved.input(n)).map(|i| &improved.inputs[i].unit);
-    let scaled = |name: &str| {
-        let threshold = unit.filter(|_| matches!(name, "udz" | "usat"));
-        value(name).map(|v| threshold.map_or(v, |u| u.from_si(v)))
+    let of_input = |v: f64| unit.map_or(v, |u| u.from_si(v));
+    let drive = |stated: &Option<Excitation>| {
+        Some(match stated.as_ref()?.evaluated(&value)? {
+            Excitation::Ramp(v) => Excitation::Ramp(of_input(v)),
+            Excitation::Beyond(v) => Excitation::Beyond(of_input(v)),
+            other => other,
+        })
     };
     let location = location(&found.location, improved);
     Some(suggest::experiment(
         &Subject {
-            kind: &found.kind,
-            rival: &rival.kind,
+            own: drive(&found.excitation),
+            rival: drive(&rival.excitation),
             input,
             location: &location,
-            value: &scaled,
             separate: &rival.separate,
         },
         reach,
@@ -895,6 +899,7 @@ mod tests {
             kind: "unmodeled_resonance".into(),
             family: "structure".into(),
             signature: String::new(),
+            excitation: Some(Excitation::Around(Expr::var("f0"))),
             equations: vec!["fall".into()],
             channel: None,
             input: None,
@@ -911,6 +916,7 @@ mod tests {
                 equivalent: false,
                 expression: String::new(),
                 separate: "a sine sweep".into(),
+                excitation: Some(Excitation::Around(Expr::var("ta"))),
                 site: greybox_diagnose::diagnosis::Site {
                     equations: vec!["fall".into()],
                     input: Some("u".into()),

@@ -7,6 +7,8 @@
 
 use std::f64::consts::PI;
 
+use greybox_diagnose::library::Excitation;
+
 use crate::contract::{Experiment, Interval, Location, Ordered};
 use crate::{expression, format};
 
@@ -77,115 +79,50 @@ impl InputRange {
 /// What is known of the mechanism.
 #[derive(Clone, Copy)]
 pub struct Subject<'a> {
-    /// Kind.
-    pub kind: &'a str,
-    /// The rival that the experiment is about; empty where there is none.
-    pub rival: &'a str,
+    /// What its own law asks for.
+    pub own: Drive,
+    /// What the law of the rival asks for that the experiment is about.
+    pub rival: Drive,
     /// The input that reaches it, where one is known.
     pub input: Option<&'a str>,
     /// Where it acts.
     pub location: &'a Location,
-    /// Value of a parameter or figure by its name in the library, SI.
-    pub value: &'a dyn Fn(&str) -> Option<f64>,
     /// The kinds' own words on the recording that separates them.
     pub separate: &'a str,
 }
 
-/// Ways to excite a machine.
-#[derive(Debug, Clone, Copy, PartialEq)]
-enum Excitation {
-    /// Slowly, up to the present amplitude.
-    Slow,
-    /// Slowly, and further than now.
-    Wide,
-    /// As now, and louder.
-    Loud,
-    /// Around a frequency, Hz.
-    Around(f64),
-    /// The input at zero.
-    Silent,
-    /// The same again.
-    Again,
-    /// A slow ramp of the input to this magnitude.
-    Ramp(f64),
-    /// Steps of the input beyond this magnitude.
-    Beyond(f64),
-    /// As the recordings are, at the frequencies where the mechanism acts.
-    AsNow,
-}
-
-/// What the rival asks for, as far as its figures are known; else what the mechanism itself does.
-fn excitation(subject: &Subject<'_>) -> Excitation {
-    match excitation_of(subject.rival, subject) {
-        Excitation::AsNow => excitation_of(subject.kind, subject),
-        found => found,
-    }
-}
-
-fn excitation_of(kind: &str, subject: &Subject<'_>) -> Excitation {
-    let corner = |name: &str| {
-        let time = (subject.value)(name).filter(|v| *v > 0.0);
-        time.map_or(Excitation::AsNow, |time| Excitation::Around(1.0 / (2.0 * PI * time)))
-    };
-    let threshold =
-        |name: &str, of: fn(f64) -> Excitation| (subject.value)(name).map_or(Excitation::AsNow, of);
-    match kind {
-        "coulomb_friction"
-        | "asymmetric_coulomb_friction"
-        | "stribeck_friction"
-        | "presliding_friction"
-        | "viscous_friction"
-        | "load_dependent_friction"
-        | "dead_zone"
-        | "end_stop"
-        | "bouc_wen_hysteresis"
-        | "cogging" => Excitation::Slow,
-        "linear_stiffness" | "quadratic_stiffness" | "cubic_stiffness" | "gravity" => Excitation::Wide,
-        "quadratic_drag" | "load_dependent_damping" | "position_dependent_inertia" => Excitation::Loud,
-        "actuator_lag" => corner("ta"),
-        "input_delay" => corner("tau"),
-        "sensor_delay" => corner("tsd"),
-        "feedback_delay" => corner("tau_f"),
-        "unmodeled_resonance" => {
-            (subject.value)("f0").filter(|f| *f > 0.0).map_or(Excitation::AsNow, Excitation::Around)
-        }
-        "constant_offset" | "input_offset" | "sensor_offset" | "periodic_disturbance" => Excitation::Silent,
-        "step_disturbance" | "parameter_drift" => Excitation::Again,
-        "input_dead_zone" => threshold("udz", |v| Excitation::Ramp(2.0 * v)),
-        "input_saturation" => threshold("usat", Excitation::Beyond),
-        _ => Excitation::AsNow,
-    }
-}
+/// How an experiment drives the machine. `None`: as the recordings do, at the frequencies where the mechanism acts.
+type Drive = Option<Excitation<f64>>;
 
 /// The part of an experiment that is about the input.
 #[derive(Debug, Clone, Copy, PartialEq)]
-struct Drive {
+struct Amplitude {
     /// From and to, in the input's unit.
-    amplitude: [f64; 2],
+    range: [f64; 2],
     /// It would go further if the input could.
     clipped: bool,
 }
 
 /// How far an experiment drives the input.
-fn drive(excitation: Excitation, input: &InputRange) -> Drive {
+fn amplitude(drive: Drive, input: &InputRange) -> Amplitude {
     if input.is_negative() {
-        let Drive { amplitude: [low, high], clipped } = drive(excitation, &input.turned());
-        return Drive { amplitude: [-low, -high], clipped };
+        let Amplitude { range: [low, high], clipped } = amplitude(drive, &input.turned());
+        return Amplitude { range: [-low, -high], clipped };
     }
     let (top, largest) = input.largest();
     let louder = (LOUDER * largest).min(top);
     let more = louder > MORE * largest;
-    let (amplitude, clipped) = match excitation {
-        Excitation::Slow => ([0.0, largest], false),
-        Excitation::Wide if more => ([largest, louder], false),
-        Excitation::Wide => ([0.0, largest], true),
-        Excitation::Loud if more => ([largest, louder], false),
-        Excitation::Loud => ([0.5 * largest, largest], true),
-        Excitation::Around(_) | Excitation::AsNow => ([input.rms.min(largest), largest], false),
-        Excitation::Silent => ([0.0, 0.0], false),
-        Excitation::Again => ([largest, largest], false),
-        Excitation::Ramp(end) => ([0.0, end.min(top)], end > top),
-        Excitation::Beyond(start) => {
+    let (range, clipped) = match drive {
+        Some(Excitation::Slow) => ([0.0, largest], false),
+        Some(Excitation::Wide) if more => ([largest, louder], false),
+        Some(Excitation::Wide) => ([0.0, largest], true),
+        Some(Excitation::Loud) if more => ([largest, louder], false),
+        Some(Excitation::Loud) => ([0.5 * largest, largest], true),
+        Some(Excitation::Around(_)) | None => ([input.rms.min(largest), largest], false),
+        Some(Excitation::Silent) => ([0.0, 0.0], false),
+        Some(Excitation::Again) => ([largest, largest], false),
+        Some(Excitation::Ramp(end)) => ([0.0, end.min(top)], end > top),
+        Some(Excitation::Beyond(start)) => {
             let wanted = LOUDER * start.max(largest);
             let end = wanted.min(top);
             let start = if start < end { start } else { 0.5 * end };
@@ -194,53 +131,56 @@ fn drive(excitation: Excitation, input: &InputRange) -> Drive {
     };
     // An input that is never zero stays where it can be.
     let least = input.allowed()[0].max(0.0);
-    Drive { amplitude: amplitude.map(|v| v.max(least)), clipped }
+    Amplitude { range: range.map(|v| v.max(least)), clipped }
 }
 
 /// The experiment for a mechanism.
 pub fn experiment(subject: &Subject<'_>, reach: &Reach) -> Experiment {
-    planned(excitation(subject), subject, reach)
+    planned(subject.rival.or(subject.own), subject, reach)
 }
 
 /// The experiment for a remainder without a name: the recordings again, louder.
 pub fn for_remainder(location: &Location, input: Option<&str>, reach: &Reach, shape: &str) -> Experiment {
     // Nobody sweeps time.
-    let (excitation, ask) = match shape.ends_with("with time") {
-        true => {
-            (Excitation::Again, "the same short experiment at the beginning and at the end of a long run")
+    let (drive, ask) = match shape.ends_with("with time") {
+        true => (
+            Some(Excitation::Again),
+            "the same short experiment at the beginning and at the end of a long run",
+        ),
+        false => {
+            (Some(Excitation::Loud), "slow sweeps over the whole range of that variable, at two amplitudes")
         }
-        false => (Excitation::Loud, "slow sweeps over the whole range of that variable, at two amplitudes"),
     };
     let separate = format!("the residual looks like {shape}: {ask}");
-    let subject = Subject { kind: "", rival: "", input, location, value: &|_| None, separate: &separate };
-    planned(excitation, &subject, reach)
+    let subject = Subject { own: drive, rival: drive, input, location, separate: &separate };
+    planned(drive, &subject, reach)
 }
 
-fn planned(excitation: Excitation, subject: &Subject<'_>, reach: &Reach) -> Experiment {
+fn planned(drive: Drive, subject: &Subject<'_>, reach: &Reach) -> Experiment {
     let input = reach.input(subject.input);
-    let drive = input.map(|input| drive(excitation, input));
+    let amplitude = input.map(|input| amplitude(drive, input));
     // Time is not for the experimenter to pass through; with the input at zero nothing else is either.
     let region = subject
         .location
         .region
         .iter()
         .next()
-        .filter(|(name, _)| *name != "t" && excitation != Excitation::Silent);
-    let band = match excitation {
-        Excitation::Slow => slow_band(region, reach),
-        Excitation::Around(f) => decade(f, reach),
-        Excitation::Loud | Excitation::AsNow => subject.location.band_hz.map(|b| [b.low, b.high]),
-        Excitation::Wide
-        | Excitation::Silent
-        | Excitation::Again
-        | Excitation::Ramp(_)
-        | Excitation::Beyond(_) => None,
+        .filter(|(name, _)| *name != "t" && drive != Some(Excitation::Silent));
+    let band = match drive {
+        Some(Excitation::Slow) => slow_band(region, reach),
+        Some(Excitation::Around(f)) => decade(f, reach),
+        Some(Excitation::Loud) | None => subject.location.band_hz.map(|b| [b.low, b.high]),
+        Some(Excitation::Wide)
+        | Some(Excitation::Silent)
+        | Some(Excitation::Again)
+        | Some(Excitation::Ramp(_))
+        | Some(Excitation::Beyond(_)) => None,
     };
     let mut found = Experiment {
         text: String::new(),
         input: input.map(|i| i.name.clone()),
-        amplitude: drive.and_then(|d| {
-            let [from, to] = d.amplitude;
+        amplitude: amplitude.and_then(|a| {
+            let [from, to] = a.range;
             interval([from.min(to), from.max(to)])
         }),
         band_hz: band.and_then(interval),
@@ -248,8 +188,8 @@ fn planned(excitation: Excitation, subject: &Subject<'_>, reach: &Reach) -> Expe
         range: region.map(|(_, range)| *range),
     };
     let unit = region.and_then(|(name, _)| subject.location.region_units.get(name));
-    let driven = input.zip(drive).filter(|_| found.amplitude.is_some());
-    found.text = words(excitation, &found, driven, unit.map_or("", String::as_str), subject.separate);
+    let driven = input.zip(amplitude).filter(|_| found.amplitude.is_some());
+    found.text = words(drive, &found, driven, unit.map_or("", String::as_str), subject.separate);
     found
 }
 
@@ -280,40 +220,40 @@ fn decade(frequency: f64, reach: &Reach) -> Option<[f64; 2]> {
 
 /// `Drive u slowly, 0.05 … 0.3 Hz, up to 2 V, with θ′ from −0.2 to 0.2; then …`.
 fn words(
-    excitation: Excitation,
+    drive: Drive,
     e: &Experiment,
-    driven: Option<(&InputRange, Drive)>,
+    driven: Option<(&InputRange, Amplitude)>,
     unit: &str,
     separate: &str,
 ) -> String {
     let mut text = String::new();
-    if let Some((input, Drive { amplitude: [low, high], clipped })) = driven {
+    if let Some((input, Amplitude { range: [low, high], clipped })) = driven {
         let name = expression::text(&input.name);
         let of = format::unit(&input.unit);
         let space = if of.is_empty() { "" } else { " " };
         let size = |v: f64| format!("{}{space}{of}", format::plain(v));
         let back = if input.is_negative() { -input.allowed()[1] } else { input.allowed()[0] };
         let (from, to) = (size(low), size(high));
-        text = match excitation {
-            Excitation::Slow => format!("drive {name} slowly, up to {to} as now"),
-            Excitation::Wide if clipped => format!("drive {name} slowly, up to {to}"),
-            Excitation::Wide => format!("drive {name} slowly, from {from} as now up to {to}"),
-            Excitation::Loud if clipped => format!("drive {name} at up to {from} and at up to {to}"),
-            Excitation::Loud => format!("drive {name} as now, {from}, and at up to {to}"),
-            Excitation::Around(_) => format!("sweep {name} as a sine of {from} to {to}"),
-            Excitation::AsNow => format!("drive {name} with {from} to {to}"),
-            Excitation::Silent if low == 0.0 => format!("record with {name} at zero"),
-            Excitation::Silent => format!("record with {name} held at {from}"),
-            Excitation::Again => format!("record the same again, {name} up to {to}"),
+        text = match drive {
+            Some(Excitation::Slow) => format!("drive {name} slowly, up to {to} as now"),
+            Some(Excitation::Wide) if clipped => format!("drive {name} slowly, up to {to}"),
+            Some(Excitation::Wide) => format!("drive {name} slowly, from {from} as now up to {to}"),
+            Some(Excitation::Loud) if clipped => format!("drive {name} at up to {from} and at up to {to}"),
+            Some(Excitation::Loud) => format!("drive {name} as now, {from}, and at up to {to}"),
+            Some(Excitation::Around(_)) => format!("sweep {name} as a sine of {from} to {to}"),
+            None => format!("drive {name} with {from} to {to}"),
+            Some(Excitation::Silent) if low == 0.0 => format!("record with {name} at zero"),
+            Some(Excitation::Silent) => format!("record with {name} held at {from}"),
+            Some(Excitation::Again) => format!("record the same again, {name} up to {to}"),
             // To the other side only as far as the input goes there.
-            Excitation::Ramp(_) if back <= -high.abs() => {
+            Some(Excitation::Ramp(_)) if back <= -high.abs() => {
                 format!("ramp {name} slowly between {} and {to}", size(-high))
             }
-            Excitation::Ramp(_) if back < 0.0 => {
+            Some(Excitation::Ramp(_)) if back < 0.0 => {
                 format!("ramp {name} slowly between {} and {to}", size(back))
             }
-            Excitation::Ramp(_) => format!("ramp {name} slowly between {from} and {to}"),
-            Excitation::Beyond(_) => format!("step {name} from {from} up to {to}"),
+            Some(Excitation::Ramp(_)) => format!("ramp {name} slowly between {from} and {to}"),
+            Some(Excitation::Beyond(_)) => format!("step {name} from {from} up to {to}"),
         };
         if clipped {
             text.push_str(match input.stated {
@@ -329,10 +269,10 @@ fn words(
             });
         }
         if let (Some(variable), Some(range)) = (&e.variable, e.range)
-            && !matches!(excitation, Excitation::Silent | Excitation::Ramp(_) | Excitation::Beyond(_))
+            && !matches!(drive, Some(Excitation::Silent | Excitation::Ramp(_) | Excitation::Beyond(_)))
             && let Some(condition) = crate::sentence::condition(variable, range, unit)
         {
-            let further = excitation == Excitation::Wide && driven.is_some_and(|(_, d)| !d.clipped);
+            let further = drive == Some(Excitation::Wide) && driven.is_some_and(|(_, d)| !d.clipped);
             let through = if further { "beyond" } else { "through" };
             text.push_str(&format!(", {through} {condition}"));
         }
@@ -387,18 +327,21 @@ mod tests {
     ) -> Experiment {
         let region = region.iter().map(|(n, r)| ((*n).to_owned(), *r)).collect();
         let location = Location { region, band_hz: Some(Interval::new(0.5, 3.0)), ..Location::default() };
-        let value = |name: &str| values.iter().find(|v| v.0 == name).map(|v| v.1);
-        experiment(
-            &Subject {
-                kind,
-                rival: "",
-                input: Some("v"),
-                location: &location,
-                value: &value,
-                separate: "look.",
-            },
-            reach,
-        )
+        let subject = Subject {
+            own: drive(kind, values),
+            rival: None,
+            input: Some("v"),
+            location: &location,
+            separate: "look.",
+        };
+        experiment(&subject, reach)
+    }
+
+    /// What a law of the library asks for.
+    fn drive(kind: &str, values: &[(&str, f64)]) -> Drive {
+        let library = greybox_diagnose::built_in().unwrap();
+        let stated = library.iter().find(|m| m.kind == kind).and_then(|m| m.excitation.as_ref());
+        stated?.evaluated(&|name| values.iter().find(|v| v.0 == name).map(|v| v.1))
     }
 
     fn near(found: Option<Interval>, [low, high]: [f64; 2]) {
@@ -509,10 +452,8 @@ mod tests {
     fn the_rival_says_what_to_do() {
         let (location, b) = (Location::default(), reach());
         let subject = |kind, rival| {
-            experiment(
-                &Subject { kind, rival, input: None, location: &location, value: &|_| None, separate: "" },
-                &b,
-            )
+            let (own, rival) = (drive(kind, &[]), drive(rival, &[]));
+            experiment(&Subject { own, rival, input: None, location: &location, separate: "" }, &b)
         };
         assert_eq!(subject("step_disturbance", "periodic_disturbance").text, "record with v at zero");
         assert_eq!(subject("step_disturbance", "my_own").text, "record the same again, v up to 2 V");
@@ -537,11 +478,10 @@ mod tests {
     fn without_an_input_the_words_remain() {
         let location = Location::default();
         let subject = Subject {
-            kind: "gravity",
-            rival: "",
+            own: Some(Excitation::Wide),
+            rival: None,
             input: None,
             location: &location,
-            value: &|_| None,
             separate: "turn it.",
         };
         let mut two = reach();
