@@ -13,6 +13,11 @@ use rayon::prelude::*;
 use crate::ProgressListener;
 use crate::search::{FittedModel, Found, MISFIT, Search, rms};
 
+/// Limits of the fit at each horizon.
+const HORIZON: Limits = Limits { iterations: 30, tolerance: 1e-6 };
+/// Limits of the best of these fits, where it has not ended.
+const FURTHER: Limits = Limits { iterations: 100, tolerance: 1e-6 };
+
 /// RMS of the residual by channel, at least 0.7 of the noise; of a whitened residual the scale of the innovations.
 pub(crate) fn residual_scale(fitted: &FittedModel, scale: &[f64]) -> Vec<f64> {
     if fitted.setup.noise.is_some() {
@@ -197,12 +202,6 @@ fn best_horizon(
         None => WholeRecordFit::kept(fitted.clone()),
     }
 }
-
-/// Limits of the fit at each horizon.
-const HORIZON: Limits = Limits { iterations: 30, tolerance: 1e-6 };
-
-/// Limits of the best of these fits, where it has not ended.
-const FURTHER: Limits = Limits { iterations: 100, tolerance: 1e-6 };
 
 /// The improved model refitted at growing horizons.
 pub(crate) fn polish(fitted: &FittedModel, scale: &[f64], judge: &Judge) -> WholeRecordFit {

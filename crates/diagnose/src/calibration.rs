@@ -44,7 +44,7 @@ pub struct Calibration {
 }
 
 /// Scores and free runs of two models.
-pub(crate) type Both = ((Vec<Score>, Vec<Score>), (FreeRun, FreeRun));
+type Both = ((Vec<Score>, Vec<Score>), (FreeRun, FreeRun));
 
 /// Refits the parameters of a model, with uncertainties.
 ///

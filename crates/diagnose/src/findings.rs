@@ -13,6 +13,9 @@ use crate::trajectory::TrajectoryEval;
 use crate::twins::{Twin, twins};
 use crate::uncertainty::Uncertainty;
 
+/// Most confidence in a mechanism beside which something unexplained remains, or that may be part of another law.
+pub(crate) const DOUBTED: f64 = 0.8;
+
 /// Equivalents first, then the likelier.
 pub(crate) fn rank(alternatives: &mut [Alternative]) {
     alternatives.sort_by(|a, b| b.equivalent.cmp(&a.equivalent).then(b.confidence.total_cmp(&a.confidence)));
@@ -301,9 +304,6 @@ fn left_over(setup: &Setup, smoothed_states: &TrajectoryEval<'_>, equation: usiz
     }
     Some(total)
 }
-
-/// Most confidence in a mechanism beside which something unexplained remains, or that may be part of another law.
-pub(crate) const DOUBTED: f64 = 0.8;
 
 #[cfg(test)]
 mod tests {

@@ -16,6 +16,31 @@ use crate::search::{
     FittedModel, Found, MISFIT, MechanismTerm, Search, UNDECIDED, log_likelihood_gain, raw_rms, raw_rss,
 };
 
+/// Mean over standard error of the folds' gains from which free shapes are taken seriously.
+const STEADY_SHAPE: f64 = 2.0;
+/// Gain of free shapes over that of the mechanisms from which these are imitations: laws of the state, and
+/// mechanisms with a memory or a delay (which no shape of the state should come near).
+const RIVALS_LAW: f64 = 1.1;
+const RIVALS_MEMORY: f64 = 0.97;
+/// Share of the calibrated model's misfit up to which a mechanism counts as a small correction.
+const CORRECTION: f64 = 0.02;
+/// Forces on one motion that make a patchwork (and mechanisms in one equation that cast doubt on each other).
+const PATCHES: usize = 3;
+/// What two laws explain together over the sum of what each adds to the other, from which they do one work.
+const REDUNDANT: f64 = 4.0;
+/// Mean over standard error of the folds' gains from which free shapes cast doubt on what was found, and from
+/// which what they predict of innovations is called missing; and their held-out gain in log-likelihood (twice):
+/// by chance fourteen columns lose fourteen, give or take five.
+const STEADY_DOUBT: f64 = 1.5;
+const STEADY_INNOVATIONS: f64 = 2.5;
+const LIKELIER: f64 = 20.0;
+/// Share of the calibrated model's misfit that laws must explain to be the answer where every model errs.
+const EXPLAINED: f64 = 0.5;
+/// Residual over noise from which a residual is a misfit where samples hold so little information each that it must be
+/// slow.
+const SLOW_MISFIT: f64 = 1.2;
+const SLOW: f64 = 0.05;
+
 /// For each part that is named, the law without a name that does its work, or that of all parts together, better. (Beside an
 /// error of the model and in a closure, such laws were among the candidates.)
 pub(crate) fn outdone(search: &Search<'_>, found: &Found, verdict: Verdict) -> Vec<Option<MechanismTerm>> {
@@ -257,24 +282,6 @@ fn beaten_by_discrepancy(
     }
 }
 
-/// Mean over standard error of the folds' gains from which free shapes are taken seriously.
-const STEADY_SHAPE: f64 = 2.0;
-
-/// Gain of free shapes over that of the mechanisms from which these are imitations: laws of the state, and
-/// mechanisms with a memory or a delay (which no shape of the state should come near).
-const RIVALS_LAW: f64 = 1.1;
-
-const RIVALS_MEMORY: f64 = 0.97;
-
-/// Share of the calibrated model's misfit up to which a mechanism counts as a small correction.
-const CORRECTION: f64 = 0.02;
-
-/// Forces on one motion that make a patchwork (and mechanisms in one equation that cast doubt on each other).
-const PATCHES: usize = 3;
-
-/// What two laws explain together over the sum of what each adds to the other, from which they do one work.
-const REDUNDANT: f64 = 4.0;
-
 /// What the improved model leaves over.
 pub(crate) struct ResidualDiagnostics {
     /// Largest residual RMS over the noise.
@@ -358,24 +365,6 @@ impl ResidualDiagnostics {
         }
     }
 }
-
-/// Mean over standard error of the folds' gains from which free shapes cast doubt on what was found, and from
-/// which what they predict of innovations is called missing; and their held-out gain in log-likelihood (twice):
-/// by chance fourteen columns lose fourteen, give or take five.
-const STEADY_DOUBT: f64 = 1.5;
-
-const STEADY_INNOVATIONS: f64 = 2.5;
-
-const LIKELIER: f64 = 20.0;
-
-/// Share of the calibrated model's misfit that laws must explain to be the answer where every model errs.
-const EXPLAINED: f64 = 0.5;
-
-/// Residual over noise from which a residual is a misfit where samples hold so little information each that it must be
-/// slow.
-const SLOW_MISFIT: f64 = 1.2;
-
-const SLOW: f64 = 0.05;
 
 /// What free shapes explain of a residual.
 pub(crate) fn discrepancy_of(fitted: &FittedModel, scale: &[f64]) -> Option<Discrepancy> {
