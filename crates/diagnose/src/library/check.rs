@@ -56,7 +56,7 @@ impl Mechanism {
         Ok(())
     }
 
-    pub(super) fn unknown(&self, what: &str, name: &str) -> String {
+    fn unknown(&self, what: &str, name: &str) -> String {
         format!(
             "{what} uses `{name}`, which is neither a parameter (list it under `linear`, `[inner]` or `[first]`), nor a state, nor one of {}",
             self.on.placeholders().join(", ")
@@ -352,12 +352,12 @@ impl Mechanism {
 }
 
 /// The first name of an expression that `known` does not know.
-pub(super) fn stranger(e: &Expr, known: impl Fn(&str) -> bool) -> Option<String> {
+fn stranger(e: &Expr, known: impl Fn(&str) -> bool) -> Option<String> {
     e.variables().into_iter().find(|(n, _)| !known(n)).map(|(n, _)| n.to_string())
 }
 
 /// Highest derivative of a state in its own equation.
-pub(super) fn state_order(state: &Memory) -> u8 {
+fn state_order(state: &Memory) -> u8 {
     let primes = [&state.lhs, &state.rhs].into_iter().flat_map(|e| e.variables());
     primes.filter(|(n, _)| **n == *state.name).map(|(_, p)| p).max().unwrap_or(0)
 }

@@ -49,87 +49,87 @@ pub(super) fn line_of(text: &str, section: &str, key: &str) -> Option<usize> {
 
 #[derive(Deserialize)]
 #[serde(deny_unknown_fields)]
-pub(super) struct File {
-    pub(super) kind: String,
-    pub(super) family: String,
-    pub(super) domain: Option<Domain>,
-    pub(super) on: On,
+struct File {
+    kind: String,
+    family: String,
+    domain: Option<Domain>,
+    on: On,
     #[serde(default = "yes")]
-    pub(super) named: bool,
-    pub(super) force: Option<String>,
-    pub(super) reaction: Option<String>,
-    pub(super) replace: Option<String>,
+    named: bool,
+    force: Option<String>,
+    reaction: Option<String>,
+    replace: Option<String>,
     #[serde(default)]
-    pub(super) states: toml::map::Map<String, toml::Value>,
+    states: toml::map::Map<String, toml::Value>,
     #[serde(default)]
-    pub(super) first: toml::map::Map<String, toml::Value>,
+    first: toml::map::Map<String, toml::Value>,
     #[serde(default)]
-    pub(super) report: toml::map::Map<String, toml::Value>,
+    report: toml::map::Map<String, toml::Value>,
     #[serde(default)]
-    pub(super) rank: Option<u8>,
+    rank: Option<u8>,
     #[serde(default)]
-    pub(super) rare: bool,
+    rare: bool,
     #[serde(default)]
-    pub(super) steady: bool,
+    steady: bool,
     #[serde(default)]
-    pub(super) absolute: bool,
+    absolute: bool,
     #[serde(default)]
-    pub(super) reversals: usize,
+    reversals: usize,
     #[serde(default)]
-    pub(super) linear: Vec<String>,
+    linear: Vec<String>,
     #[serde(default)]
-    pub(super) positive: Vec<String>,
+    positive: Vec<String>,
     #[serde(default)]
-    pub(super) mirror: bool,
+    mirror: bool,
     #[serde(default)]
-    pub(super) refines: Vec<String>,
+    refines: Vec<String>,
     #[serde(default)]
-    pub(super) doubts: Vec<String>,
+    doubts: Vec<String>,
     #[serde(default)]
-    pub(super) require: Vec<String>,
+    require: Vec<String>,
     #[serde(default)]
-    pub(super) surcharge: f64,
+    surcharge: f64,
     #[serde(default)]
-    pub(super) inner: toml::map::Map<String, toml::Value>,
-    pub(super) shape: Option<ShapeFile>,
-    pub(super) location: Option<LocationFile>,
-    pub(super) experiment: Option<ExperimentFile>,
+    inner: toml::map::Map<String, toml::Value>,
+    shape: Option<ShapeFile>,
+    location: Option<LocationFile>,
+    experiment: Option<ExperimentFile>,
     #[serde(default)]
-    pub(super) equals: toml::map::Map<String, toml::Value>,
+    equals: toml::map::Map<String, toml::Value>,
     #[serde(default)]
-    pub(super) special_case: toml::map::Map<String, toml::Value>,
+    special_case: toml::map::Map<String, toml::Value>,
     #[serde(default)]
-    pub(super) about: About,
+    about: About,
 }
 
-pub(super) fn yes() -> bool {
+fn yes() -> bool {
     true
 }
 
 #[derive(Deserialize)]
 #[serde(deny_unknown_fields)]
-pub(super) struct ShapeFile {
-    pub(super) of: String,
+struct ShapeFile {
+    of: String,
 }
 
 #[derive(Deserialize)]
 #[serde(deny_unknown_fields)]
-pub(super) struct LocationFile {
-    pub(super) variable: String,
-    pub(super) low: Option<String>,
-    pub(super) high: Option<String>,
+struct LocationFile {
+    variable: String,
+    low: Option<String>,
+    high: Option<String>,
 }
 
 #[derive(Deserialize)]
 #[serde(deny_unknown_fields)]
-pub(super) struct ExperimentFile {
-    pub(super) drive: Drive,
-    pub(super) at: Option<String>,
+struct ExperimentFile {
+    drive: Drive,
+    at: Option<String>,
 }
 
 #[derive(Deserialize, Clone, Copy)]
 #[serde(rename_all = "snake_case")]
-pub(super) enum Drive {
+enum Drive {
     Slow,
     Wide,
     Loud,
@@ -142,24 +142,24 @@ pub(super) enum Drive {
 
 #[derive(Deserialize)]
 #[serde(deny_unknown_fields)]
-pub(super) struct StateFile {
-    pub(super) equation: String,
-    pub(super) unit: String,
+struct StateFile {
+    equation: String,
+    unit: String,
     #[serde(default)]
-    pub(super) start: Vec<String>,
+    start: Vec<String>,
 }
 
 #[derive(Deserialize)]
 #[serde(deny_unknown_fields)]
-pub(super) struct InnerFile {
+struct InnerFile {
     #[serde(default)]
-    pub(super) grid: Vec<f64>,
-    pub(super) spectral: Option<String>,
-    pub(super) carrier: Option<String>,
+    grid: Vec<f64>,
+    spectral: Option<String>,
+    carrier: Option<String>,
     #[serde(default)]
-    pub(super) scale: Option<String>,
-    pub(super) low: Option<f64>,
-    pub(super) high: Option<f64>,
+    scale: Option<String>,
+    low: Option<f64>,
+    high: Option<f64>,
 }
 
 impl Mechanism {
@@ -181,7 +181,7 @@ impl Mechanism {
         })
     }
 
-    pub(super) fn from_file(raw: File) -> Result<Mechanism, Fault> {
+    fn from_file(raw: File) -> Result<Mechanism, Fault> {
         let law = match (&raw.force, &raw.replace) {
             (Some(force), None) if !raw.on.replaces() => expression(force, "", "force")?,
             (None, Some(replace)) if raw.on.replaces() => expression(replace, "", "replace")?,
@@ -297,7 +297,7 @@ impl Mechanism {
 }
 
 /// A section that gives values to the parameters of other kinds: (kind, parameter, value).
-pub(super) fn of_others(
+fn of_others(
     section: &str,
     raw: toml::map::Map<String, toml::Value>,
 ) -> Result<Vec<(String, String, Expr)>, Fault> {
@@ -313,11 +313,11 @@ pub(super) fn of_others(
     Ok(all)
 }
 
-pub(super) fn expression(text: &str, section: &str, key: &str) -> Result<Expr, Fault> {
+fn expression(text: &str, section: &str, key: &str) -> Result<Expr, Fault> {
     parse(text).map(|p| p.expr).map_err(|e| Fault::new(section, key, format!("`{key} = \"{text}\"`: {e}")))
 }
 
-pub(super) fn memory(name: String, value: toml::Value) -> Result<Memory, Fault> {
+fn memory(name: String, value: toml::Value) -> Result<Memory, Fault> {
     let section = format!("states.{name}");
     let entry: StateFile = value
         .try_into()
@@ -341,7 +341,7 @@ pub(super) fn memory(name: String, value: toml::Value) -> Result<Memory, Fault> 
     })
 }
 
-pub(super) fn inner(name: String, value: toml::Value) -> Result<Inner, Fault> {
+fn inner(name: String, value: toml::Value) -> Result<Inner, Fault> {
     let fault = |message: String| Fault::new("inner", &name, format!("[inner] {name}: {message}"));
     let entry: InnerFile = value.try_into().map_err(|e: toml::de::Error| fault(e.message().to_string()))?;
     let of = |text: &Option<String>| text.as_deref().map(|t| expression(t, "inner", &name)).transpose();
@@ -364,7 +364,7 @@ pub(super) fn inner(name: String, value: toml::Value) -> Result<Inner, Fault> {
     Ok(Inner { name, grid: entry.grid, scale, low, high, spectral, carrier, fixed: false })
 }
 
-pub(super) fn scale(text: &str, name: &str) -> Result<Scale, Fault> {
+fn scale(text: &str, name: &str) -> Result<Scale, Fault> {
     let fault = |message: String| Err(Fault::new("inner", name, format!("[inner] {name}: {message}")));
     let (function, rest) = match (text, text.split_once('(')) {
         ("1", _) => return Ok(Scale::One),
@@ -392,7 +392,7 @@ pub(super) fn scale(text: &str, name: &str) -> Result<Scale, Fault> {
     }
 }
 
-pub(super) fn region(entry: LocationFile) -> Result<Region, Fault> {
+fn region(entry: LocationFile) -> Result<Region, Fault> {
     let end = |text: Option<String>, key: &str| text.map(|t| expression(&t, "location", key)).transpose();
     Ok(Region {
         variable: expression(&entry.variable, "location", "variable")?,
@@ -401,7 +401,7 @@ pub(super) fn region(entry: LocationFile) -> Result<Region, Fault> {
     })
 }
 
-pub(super) fn excitation(entry: ExperimentFile) -> Result<Excitation, Fault> {
+fn excitation(entry: ExperimentFile) -> Result<Excitation, Fault> {
     let at = entry.at.map(|text| expression(&text, "experiment", "at")).transpose()?;
     match (entry.drive, at) {
         (Drive::Slow, None) => Ok(Excitation::Slow),
@@ -425,7 +425,7 @@ pub(super) fn excitation(entry: ExperimentFile) -> Result<Excitation, Fault> {
     }
 }
 
-pub(super) fn first_value(text: &str, name: &str) -> Result<First, Fault> {
+fn first_value(text: &str, name: &str) -> Result<First, Fault> {
     let whole = || expression(text, "first", name).map(First::Value);
     let Some(inside) = text.trim().strip_prefix("angle(").and_then(|t| t.strip_suffix(')')) else {
         return whole();
