@@ -8,22 +8,19 @@ use greybox_calibrate::{
 use greybox_model::{Hold, Model};
 use greybox_recording::Recording;
 
-use crate::baseline::{
-    Baseline, Judge, WholeRecordFit, WorkOnlyListener, alone, leaves_noise, polish, residual_scale,
-};
-use crate::candidate::{Candidate, Instance};
+use crate::answer::Answer;
+use crate::baseline::{Baseline, Judge, WholeRecordFit, alone, residual_scale};
+use crate::candidate::Instance;
 use crate::discrepancy::Discrepancy;
 use crate::evidence::Evidence;
 use crate::findings::{DOUBTED, findings, rank};
-use crate::gates::defend;
 use crate::importance::subsets_of;
 use crate::library::{Excitation, Mechanism, MechanismError, built_in};
 use crate::locate::Location;
 use crate::place::Place;
-use crate::proposal::{Gate, Proposal, Rejected};
+use crate::proposal::{Proposal, Rejected};
 use crate::remainder::{only_variable, remainder};
-use crate::search::{FittedModel, Found, MISFIT, MOST_WORK, MechanismTerm, Search, UNDECIDED};
-use crate::takeover::{Closed, Explored, explored};
+use crate::search::{FittedModel, Found, MOST_WORK, MechanismTerm, Search, UNDECIDED};
 use crate::trajectory::TrajectoryEval;
 use crate::uncertainty::Uncertainty;
 use crate::verdict::{Judged, discrepancy_of, is_crowded, is_shared, outdone};
@@ -406,7 +403,7 @@ pub fn diagnose(
         true => alone(&nominal, false, options.work, listener),
         false => search.run(),
     };
-    conclude(&nominal, holdout, source, &library, &search, found, options, listener)
+    conclude(&nominal, holdout, source, &search, found, options)
 }
 
 /// Training and held-out data.
@@ -477,117 +474,17 @@ fn conclude(
     nominal: &Setup,
     holdout: Arc<Data>,
     holdout_source: String,
-    library: &[Mechanism],
     search: &Search<'_>,
     found: Found,
     options: &Options,
-    listener: &dyn ProgressListener,
 ) -> Result<Diagnosis, DiagnoseError> {
-    let train = nominal.data.clone();
-    listener.stage(Stage::Simulating);
+    let (train, library) = (nominal.data.clone(), search.library);
+    search.listener.stage(Stage::Simulating);
     // The model that fits best knows best how errors grow.
     let judge = Judge::of(&found.improved, &residual_scale(&found.improved, &found.scale));
     let window = judge.window;
-    let values = nominal.values();
-    // The search fits the baseline with a scale that its mechanisms made small, and only where it goes on with it. What is
-    // compared with is the best that the equations can do alone.
-    let has_parts = !found.improved.parts.is_empty();
-    let alone = has_parts.then(|| alone(nominal, false, options.work, &WorkOnlyListener(listener)));
-    let baseline_of = |found: &Found| Baseline::of(found, &values, &judge);
-    let (mut baseline, (alone, polished)) = rayon::join(
-        || baseline_of(&found),
-        || {
-            rayon::join(
-                || alone.as_ref().map(|alone| (alone.limited, baseline_of(alone))),
-                || has_parts.then(|| polish(&found.improved, &found.scale, &judge)),
-            )
-        },
-    );
-    let mut limited = found.limited;
-    let mut found = found;
-    // What no round believed may still be what the equations lack: where the noise does not explain the rest, it is
-    // held against data that it was not fitted to.
-    let mut named = true;
-    let mut proposed = None;
-    if found.improved.parts.is_empty() && baseline.polished.fitted.misfit(&found.scale) > MISFIT {
-        for rejected in std::mem::take(&mut found.rejected).into_iter().rev() {
-            found.improved = rejected;
-            let polished = polish(&found.improved, &found.scale, &judge);
-            let polished = defend(search, &mut found, polished, &baseline, &judge, false);
-            if !polished.fitted.parts.is_empty() {
-                (named, proposed) = (false, Some(polished));
-                break;
-            }
-        }
-    }
-    let mut polished = if let Some(proposed) = proposed {
-        proposed
-    } else if let (Some((is_limited, alone)), Some(polished)) = (alone, polished) {
-        limited |= is_limited;
-        if alone.misfit.total_cmp(&baseline.misfit).is_lt() {
-            baseline = alone;
-        }
-        defend(search, &mut found, polished, &baseline, &judge, true)
-    } else {
-        baseline.polished.clone()
-    };
-    let judged_of = |found: &Found, polished: &WholeRecordFit, named: &dyn Fn(&MechanismTerm) -> bool| {
-        let scale = residual_scale(&polished.fitted, &found.scale);
-        Judged::of(search, found, &polished.fitted, &scale, (&baseline.polished.fitted, named), library)
-    };
-    let scale = residual_scale(&polished.fitted, &found.scale);
-    let scores = judge.scores(&polished.fitted.setup, &polished.fitted.fit.point.parameters, &scale);
-    let mut judged = judged_of(&found, &polished, &|_| named);
-    // Where more than noise is left, every model of the machine errs, and output errors do not compare them.
-    let errs = !leaves_noise(&scores, &polished.origin, &scale);
-    let names = judged.verdict == Verdict::MissingPhysics;
-    let agreed: Vec<_> = match errs && names {
-        true => polished.fitted.parts.iter().map(|p| named_as(p, library, &nominal.model)).collect(),
-        false => Vec::new(),
-    };
-    // Of laws that are not believed together those stand that another comparison has named.
-    let believed = |judged: &Judged, found: &Found, fitted: &FittedModel| -> Vec<bool> {
-        let all = judged.verdict == Verdict::MissingPhysics;
-        let stands =
-            |part: &MechanismTerm| found.errs && agreed.contains(&named_as(part, library, &nominal.model));
-        let parts = fitted.parts.iter().zip(&judged.named);
-        parts.map(|(part, named)| (all && *named) || stands(part)).collect()
-    };
-    let mut rejected = None;
-    // (What passes for coloured noise may hold what no name explains.)
-    let unnamed = polished.fitted.parts.is_empty();
-    if errs || judged.verdict == Verdict::Unexplained || unnamed && judged.left.significant(0) {
-        let closed = Closed::of(search, &found, &polished, &baseline, &judge);
-        // What reaches the noise leaves no error of the model to be believed beside.
-        if errs && !options.terms_only && !closed.as_ref().is_ok_and(|closed| closed.leaves_noise) {
-            let in_both = |part: &MechanismTerm| agreed.contains(&named_as(part, library, &nominal.model));
-            let standing = (&found, &polished);
-            let explored = explored(search, standing, in_both, names, &baseline, &judge);
-            if let Some(Explored { found: other, polished: simulates, named }) = explored {
-                judged = judged_of(&other, &simulates, &|part| named.contains(&part.candidate));
-                (found, polished) = (other, simulates);
-            }
-        }
-        rejected = match closed {
-            Err(failed) => failed,
-            Ok(closed) => {
-                let standing = believed(&judged, &found, &polished.fitted);
-                let standing = polished.fitted.parts.iter().zip(standing).filter(|part| part.1);
-                let standing: Vec<&Candidate> = standing.map(|(part, _)| &part.candidate).collect();
-                if !closed.outdoes((&found, &polished), !standing.is_empty(), &judge) {
-                    Some(Rejected::at(Gate::Comparison, search, &closed.polished.fitted))
-                } else if let Some(named) = closed.names(search, &standing) {
-                    let Closed { found: other, polished: simulates, .. } = closed;
-                    judged = judged_of(&other, &simulates, &|part| named.contains(&part.candidate));
-                    (found, polished) = (other, simulates);
-                    None
-                } else {
-                    Some(Rejected::at(Gate::Names, search, &closed.polished.fitted))
-                }
-            }
-        };
-        limited |= found.limited;
-    }
+    let Answer { found, polished, baseline, judged, believed, rejected, limited } =
+        Answer::of(nominal, search, found, options, &judge);
     let WholeRecordFit { fitted: improved, origin } = &polished;
     let scale = residual_scale(improved, &found.scale);
     let Baseline {
@@ -661,7 +558,6 @@ fn conclude(
     let criterion = if elsewhere == Criterion::Windowed { elsewhere } else { judge.criterion };
 
     // Mechanisms, remainder, verdict.
-    let believed = believed(&judged, &found, improved);
     let verdict = if believed.contains(&true) { Verdict::MissingPhysics } else { judged.verdict };
     let Judged { shares, left, discrepancy, alone, without, full, base, doubts, .. } = judged;
     let share = |rss: f64| (rss / base.max(1e-300)).clamp(0.0, 1.0);
@@ -781,16 +677,6 @@ fn conclude(
         seed: options.seed,
         limited,
     })
-}
-
-/// The name of a part and the equations that it enters.
-pub(crate) fn named_as(
-    part: &MechanismTerm,
-    library: &[Mechanism],
-    nominal: &Model,
-) -> (String, Vec<String>) {
-    let kind = library[part.candidate.mechanism].kind.clone();
-    (kind, part.candidate.place.equations(nominal))
 }
 
 /// Residual over the estimated noise below which the estimate was not of noise alone.

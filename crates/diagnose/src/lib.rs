@@ -5,6 +5,7 @@
 #[doc = include_str!("../README.md")]
 struct Readme;
 
+mod answer;
 mod baseline;
 mod calibration;
 pub mod candidate;
