@@ -49,7 +49,7 @@ type Both = ((Vec<Score>, Vec<Score>), (FreeRun, FreeRun));
 /// Refits the parameters of a model, with uncertainties.
 ///
 /// # Errors
-/// As [`diagnose`].
+/// As [`diagnose`](crate::diagnose).
 pub fn calibrate(
     model: &Model,
     train: &[Recording],

@@ -167,7 +167,7 @@ impl Mechanism {
     ///
     /// # Errors
     /// [`MechanismError`] names the file, the line, and what is wrong with the fix. What depends on other
-    /// files (`refines`, `doubts`, `[equals]`, `[special_case]`) is checked by [`combine`].
+    /// files (`refines`, `doubts`, `[equals]`, `[special_case]`) is checked by [`combine`](super::combine).
     pub fn from_toml(text: &str, file: &str) -> Result<Mechanism, MechanismError> {
         let raw: File = toml::from_str(text).map_err(|e| MechanismError {
             file: file.to_string(),
