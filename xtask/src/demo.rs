@@ -11,7 +11,8 @@ use greybox_report::Report;
 use greybox_report::contract::Verdict;
 use serde_json::Value;
 
-use crate::{Ending, process, readme};
+use crate::reproduce::{Axis, Plot, Series, Style};
+use crate::{Ending, book, process, readme};
 
 /// What `greybox demo` leaves, sorted.
 const FILES: [&str; 6] = [
@@ -53,11 +54,11 @@ impl Demo {
 }
 
 /// Checks what `greybox demo --out OUT` printed (into the file `answer`) and left: the README shows this answer, and the
-/// files simulate as well as the report says.
+/// files simulate as well as the report says. Draws the README's figure of these simulations, if it is to be written.
 ///
 /// # Errors
 /// What is not so, in words.
-pub(crate) fn check(root: &Path, answer: &Path, out: &Path) -> Result<Ending> {
+pub(crate) fn check(root: &Path, answer: &Path, out: &Path, write_docs: bool) -> Result<Ending> {
     let text = |path: &Path| {
         std::fs::read_to_string(path).with_context(|| format!("{} cannot be read", path.display()))
     };
@@ -89,6 +90,7 @@ pub(crate) fn check(root: &Path, answer: &Path, out: &Path) -> Result<Ending> {
     let command = process::build(root)?;
     let scratch = process::target(root).join("demo.csv");
     let held_out = &report.fit.holdout;
+    let mut simulated = Vec::new();
     for (model, said) in [("improved.toml", &held_out.improved), ("rotary_link.toml", &held_out.nominal)] {
         let said = said.get("theta").with_context(|| format!("no score of θ with {model}"))?.nrmse;
         let run = Command::new(&command)
@@ -102,9 +104,36 @@ pub(crate) fn check(root: &Path, answer: &Path, out: &Path) -> Result<Ending> {
         let run: Value = serde_json::from_slice(&run.stdout)?;
         let nrmse = run["fit"]["theta"]["nrmse"].as_f64().context("a simulation without a score of θ")?;
         ensure!((nrmse / said - 1.0).abs() < 0.05, "{model} simulates θ to {nrmse}; the report says {said}");
+        simulated.push(read_csv(&scratch)?);
+    }
+    if write_docs {
+        let measured = read_csv(out.join("rotary_link_test.csv"))?;
+        let [improved, nominal] = &simulated[..] else { bail!("two simulations are drawn") };
+        book::put_file(root, "demo.svg", &figure(&measured, nominal, improved)?)?;
     }
     println!("the answer is the README's, and its files simulate as the report says");
     Ok(Ending::Done)
+}
+
+/// θ of the recording that was held out, as measured and as two models simulate it.
+fn figure(measured: &Recording, nominal: &Recording, improved: &Recording) -> Result<String> {
+    // Every tenth sample shows the motion.
+    let series = |label: &str, style: Style, of: &Recording| -> Result<Series> {
+        let theta = &of.channel("theta").context("no channel theta")?.values;
+        let points = of.time.iter().zip(theta).step_by(10).map(|(t, v)| [*t, *v]).collect();
+        Ok(Series::new(label, style, points))
+    };
+    let plot = Plot {
+        alt: "The hub's angle in the held-out recording: measured, by the model as given, and by the improved model".into(),
+        x: Axis::linear("time in s"),
+        y: Axis::linear("θ in rad"),
+        series: vec![
+            series("model as given", Style::Dashed, nominal)?,
+            series("measured", Style::Points, measured)?,
+            series("improved model", Style::Line, improved)?,
+        ],
+    };
+    plot.to_svg().context("nothing to draw")
 }
 
 /// The README shows this answer; its last digits may be another machine's.

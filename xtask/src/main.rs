@@ -59,6 +59,9 @@ enum Task {
         answer: PathBuf,
         /// The folder that it wrote
         out: PathBuf,
+        /// Draw the README's figure of its simulations (docs/src/demo.svg)
+        #[arg(long)]
+        write_docs: bool,
     },
     /// Run what the continuous integration runs (.ci/run)
     Ci,
@@ -89,7 +92,7 @@ fn main() -> ExitCode {
         Task::Python => python(&root()),
         Task::Crates(arguments) => crates::run(&root(), &arguments),
         Task::PythonPackage => package::run(&root()),
-        Task::Demo { answer, out } => demo::check(&root(), &answer, &out),
+        Task::Demo { answer, out, write_docs } => demo::check(&root(), &answer, &out, write_docs),
         Task::Ci => ci(&root()),
         Task::ReadmeCommand { marker } => print_command(&root(), &marker),
     };
