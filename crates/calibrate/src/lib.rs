@@ -8,6 +8,7 @@ struct Readme;
 pub mod data;
 pub mod free;
 pub mod free_run;
+mod holdout;
 pub mod horizon;
 pub mod input_noise;
 pub mod noise_model;
@@ -20,6 +21,7 @@ mod student;
 pub use data::{Data, DataError, PieceData, SmoothedStates, spread};
 pub use free::free_parameters;
 pub use free_run::{Criterion, FreeRun, Score, window_length, window_of};
+pub use holdout::{HELD_OUT_SHARE, HoldoutSource};
 pub use horizon::Horizon;
 pub use noise_model::Autoregression;
 pub use problem::{

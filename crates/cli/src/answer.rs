@@ -36,7 +36,7 @@ impl Answer {
         Answer { met, ..self }
     }
 
-    /// Help or version: the same words in either output.
+    /// Help or version: the same words in either format.
     pub(crate) fn words(text: String) -> Answer {
         Answer { text, json: None, met: Vec::new() }
     }
@@ -50,8 +50,8 @@ impl Answer {
     ///
     /// # Errors
     /// Bad input: standard output cannot be written.
-    pub(crate) fn print(&self, output: OutputFormat) -> Result<ExitCode, Failure> {
-        let printed = match (&self.json, output) {
+    pub(crate) fn print(&self, format: OutputFormat) -> Result<ExitCode, Failure> {
+        let printed = match (&self.json, format) {
             (Some(json), OutputFormat::Json) => print(&format!("{json:#}\n")),
             _ => print(&self.text),
         };

@@ -14,8 +14,8 @@ pub(crate) fn usage(rendered: &str) -> Failure {
 }
 
 /// Prints on standard error, and in JSON on standard output too where that is spoken.
-pub(crate) fn print(failure: &Failure, output: OutputFormat) -> ExitCode {
-    if output == OutputFormat::Json {
+pub(crate) fn print(failure: &Failure, format: OutputFormat) -> ExitCode {
+    if format == OutputFormat::Json {
         // Where standard output cannot be written, standard error says what is wrong.
         let _ = answer::print(&format!("{:#}\n", failure.to_json()));
     }

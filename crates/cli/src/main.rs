@@ -23,13 +23,13 @@ use greybox_commands::{loading, story};
 
 fn main() -> ExitCode {
     let arguments: Vec<OsString> = std::env::args_os().collect();
-    let output =
+    let format =
         if arguments.iter().any(|a| a == "--json") { OutputFormat::Json } else { OutputFormat::Text };
     // The default hook has said on standard error where a panic was.
     let outcome = std::panic::catch_unwind(|| run(arguments)).unwrap_or_else(|_| Err(Failure::fault()));
-    match outcome.and_then(|answer| answer.print(output)) {
+    match outcome.and_then(|answer| answer.print(format)) {
         Ok(status) => status,
-        Err(failure) => failure::print(&failure, output),
+        Err(failure) => failure::print(&failure, format),
     }
 }
 

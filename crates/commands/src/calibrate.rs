@@ -6,7 +6,7 @@ use greybox_diagnose::diagnosis::ParameterChange;
 use greybox_model::{Model, WriteOptions};
 use greybox_recording::Recording;
 use greybox_report::contract::{self, FitSet, Interval, ModelId, Ordered, Parameter, Producer};
-use greybox_report::convert::{calibrated_recordings, health_finding, health_findings, scores};
+use greybox_report::convert::{calibrated_recordings, health_finding, health_findings, held_out, scores};
 use greybox_report::page;
 use serde::Serialize;
 
@@ -113,7 +113,7 @@ fn report(loaded: &LoadedModel, calibration: &Calibration, findings: Vec<contrac
             holdout: fit_set(&calibration.holdout),
             window_s: Some(calibration.window),
             criterion: greybox_report::convert::criterion(calibration.criterion),
-            holdout_source: calibration.holdout_source.clone(),
+            holdout_source: held_out(calibration.holdout_source, &calibration.held.recordings),
             recordings: Ordered::new(),
         },
         noise_floor: data.channels.iter().map(|c| c.name.clone()).zip(floor).collect(),

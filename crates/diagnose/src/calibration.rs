@@ -2,7 +2,7 @@
 
 use std::sync::Arc;
 
-use greybox_calibrate::{Criterion, Data, Ending, FreeRun, Score, Setup, free_parameters};
+use greybox_calibrate::{Criterion, Data, Ending, FreeRun, HoldoutSource, Score, Setup, free_parameters};
 use greybox_model::Model;
 use greybox_recording::Recording;
 
@@ -24,7 +24,7 @@ pub struct Calibration {
     /// Scores on the held-out recordings.
     pub holdout: (Vec<Score>, Vec<Score>),
     /// Where the held-out data come from.
-    pub holdout_source: String,
+    pub holdout_source: HoldoutSource,
     /// Window of the restarted simulations, s.
     pub window: f64,
     /// The data.

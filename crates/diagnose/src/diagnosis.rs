@@ -3,7 +3,8 @@
 use std::sync::Arc;
 
 use greybox_calibrate::{
-    Criterion, Data, DataError, FreeRun, Score, Setup, SetupError, Work, free_parameters,
+    Criterion, Data, DataError, FreeRun, HELD_OUT_SHARE, HoldoutSource, Score, Setup, SetupError, Work,
+    free_parameters,
 };
 use greybox_model::{Hold, Model};
 use greybox_recording::Recording;
@@ -25,9 +26,6 @@ use crate::trajectory::TrajectoryEval;
 use crate::uncertainty::Uncertainty;
 use crate::verdict::{Judged, discrepancy_of, is_crowded, is_shared, outdone};
 use crate::{ProgressListener, Stage};
-
-/// Share of each recording held out when no recording is.
-pub const HELD_OUT_SHARE: f64 = 0.2;
 
 /// What may be chosen.
 #[derive(Debug, Clone)]
@@ -361,7 +359,7 @@ pub struct Diagnosis {
     /// Held-out recordings.
     pub holdout: Role,
     /// Where the held-out data come from, in words.
-    pub holdout_source: String,
+    pub holdout_source: HoldoutSource,
     /// Window of the restarted simulations, s.
     pub window: f64,
     /// Noise over the spread of each channel, at most what the best of the models leaves.
@@ -413,7 +411,7 @@ pub(crate) struct Layout {
     /// Held out.
     pub holdout: Arc<Data>,
     /// Where the held-out data come from.
-    pub source: String,
+    pub source: HoldoutSource,
 }
 
 /// Lays the recordings out, holding out the last fifth of each when none is held out.
@@ -449,16 +447,12 @@ pub(crate) fn layout(
             return Ok(Layout {
                 train: Arc::new(Data::new(model, &head)?),
                 holdout: Arc::new(Data::new(model, &tail)?),
-                source: "the last fifth of each recording".to_string(),
+                source: HoldoutSource::LastFifth,
             });
         }
     }
     let held = Data::new(model, if holdout.is_empty() { train } else { holdout })?;
-    let source = if holdout.is_empty() {
-        "none: the recordings are too short to hold anything out; these are the training figures".to_string()
-    } else {
-        format!("recordings held out: {}", held.recordings.join(", "))
-    };
+    let source = if holdout.is_empty() { HoldoutSource::None } else { HoldoutSource::Given };
     Ok(Layout { train: Arc::new(whole), holdout: Arc::new(held), source })
 }
 
@@ -473,7 +467,7 @@ pub(crate) fn follows<const N: usize>(runs: [&FreeRun; N], data: &Data) -> Resul
 fn conclude(
     nominal: &Setup,
     holdout: Arc<Data>,
-    holdout_source: String,
+    holdout_source: HoldoutSource,
     search: &Search<'_>,
     found: Found,
     options: &Options,

@@ -2,7 +2,9 @@
 
 use std::sync::Arc;
 
-use greybox_calibrate::{Data, FreeRun, Score, Setup, SmoothedStates, Work, window_length};
+use greybox_calibrate::{
+    Data, FreeRun, HELD_OUT_SHARE, HoldoutSource, Score, Setup, SmoothedStates, Work, window_length,
+};
 use greybox_model::{Hold, Model, Unit};
 use greybox_recording::Recording;
 use greybox_sparse::{folds, select};
@@ -161,19 +163,6 @@ pub struct Role {
     pub by_recording: Vec<Vec<Score>>,
 }
 
-/// Where the held-out recordings came from.
-#[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub enum HoldoutSource {
-    /// Recordings of their own.
-    Given,
-    /// The last fifth of each training recording.
-    LastFifth,
-    /// The last block of recordings that were read in blocks.
-    LastBlock,
-    /// None: the recordings are too short to cut.
-    None,
-}
-
 /// Recordings that were read in blocks.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct Blocks {
@@ -303,7 +292,7 @@ fn split(train: &[Recording], holdout: &[Recording]) -> (Vec<Recording>, Vec<Rec
     if !holdout.is_empty() {
         return (train.to_vec(), holdout.to_vec(), HoldoutSource::Given);
     }
-    let (head, tail) = Data::split_tail(train, 0.2);
+    let (head, tail) = Data::split_tail(train, HELD_OUT_SHARE);
     if head.len() == train.len() {
         (head, tail, HoldoutSource::LastFifth)
     } else {

@@ -10,7 +10,7 @@
 
 use std::sync::Arc;
 
-use greybox_calibrate::{Data, Limits, Point, Setup, qr};
+use greybox_calibrate::{Data, HoldoutSource, Limits, Point, Setup, qr};
 use greybox_recording::Recording;
 use rayon::prelude::*;
 use serde::{Deserialize, Serialize};
@@ -18,9 +18,7 @@ use serde::{Deserialize, Serialize};
 use crate::choose::Reduced;
 use crate::correlation::{LONGEST, Lagged};
 use crate::error::IdentifyError;
-use crate::identify::{
-    self, Blocks, HoldoutSource, Identification, Options, ProgressListener, Search, conclude, search,
-};
+use crate::identify::{self, Blocks, Identification, Options, ProgressListener, Search, conclude, search};
 use crate::output_error::{self, Linearised, Refined, either, floor, stack, triangle_of, widen};
 use crate::precision::{self, BLOCKS, Precision, Spread};
 

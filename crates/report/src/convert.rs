@@ -4,7 +4,7 @@
 pub mod control;
 pub mod identification;
 
-use greybox_calibrate::{Data, FreeRun, Setup, input_noise};
+use greybox_calibrate::{Data, FreeRun, HoldoutSource, Setup, input_noise};
 use greybox_diagnose::diagnosis::{
     Basis as Ground, Estimate as Estimated, IdentifiedMechanism, Role as RoleRuns, Run,
 };
@@ -13,7 +13,7 @@ use greybox_diagnose::locate::{Location as Located, spectrum};
 use greybox_diagnose::proposal::{self, Proposal};
 use greybox_diagnose::{Calibration, Diagnosis, Verdict as Answer};
 use greybox_model::{Dimension, Expr, Func, Model, Unit, WriteOptions};
-use greybox_recording::{Correlation, Recording, Severity as Segmentation, health};
+use greybox_recording::{Correlation, Recording, health};
 
 use crate::contract::*;
 use crate::page::{self, Lagged, MechanismPlot, ModelTexts, Page, Residual, Spectrum, StateMap};
@@ -455,6 +455,19 @@ fn fit_set(role: &RoleRuns, of: impl Fn(&Run) -> Vec<greybox_calibrate::Score>) 
     }
 }
 
+/// Where the held-out data come from, in words.
+pub fn held_out(source: HoldoutSource, recordings: &[String]) -> String {
+    match source {
+        HoldoutSource::Given => format!("recordings held out: {}", recordings.join(", ")),
+        HoldoutSource::LastFifth => "the last fifth of each recording".to_owned(),
+        HoldoutSource::LastBlock => "the last block of the recordings".to_owned(),
+        HoldoutSource::None => {
+            "none: the recordings are too short to hold anything out; these are the training figures"
+                .to_owned()
+        }
+    }
+}
+
 /// The figure that judges simulations, in the contract's words.
 pub fn criterion(of: greybox_calibrate::Criterion) -> Criterion {
     match of {
@@ -478,7 +491,7 @@ fn fit(d: &Diagnosis) -> Fit {
         holdout: fit_set(&d.holdout, |run| run.scores.clone()),
         window_s: Some(d.window),
         criterion: criterion(d.criterion),
-        holdout_source: d.holdout_source.clone(),
+        holdout_source: held_out(d.holdout_source, &d.holdout.data.recordings),
         recordings,
     }
 }
@@ -550,9 +563,9 @@ fn findings(d: &Diagnosis, sources: &Sources<'_>) -> Vec<Finding> {
 pub fn health_finding(f: greybox_recording::Finding, recording: Option<String>) -> Finding {
     Finding {
         severity: match f.severity {
-            Segmentation::Info => Severity::Info,
-            Segmentation::Warning => Severity::Warning,
-            Segmentation::Problem => Severity::Error,
+            greybox_recording::Severity::Info => Severity::Info,
+            greybox_recording::Severity::Warning => Severity::Warning,
+            greybox_recording::Severity::Problem => Severity::Error,
         },
         code: f.code.to_string(),
         recording,

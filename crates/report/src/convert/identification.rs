@@ -3,7 +3,8 @@
 
 use std::sync::Arc;
 
-use greybox_identify::{FoundDelay, FoundEquation, HoldoutSource, Identification, Role as RoleRun};
+use greybox_calibrate::HoldoutSource;
+use greybox_identify::{FoundDelay, FoundEquation, Identification, Role as RoleRun};
 use greybox_model::{Hold, Model, Unit, WriteOptions};
 use greybox_recording::Recording;
 
@@ -247,12 +248,9 @@ fn fit(found: &Identification) -> Fit {
         window_s: Some(found.window),
         criterion: Criterion::FreeRun,
         holdout_source: match (&found.holdout, found.holdout_source) {
-            (Some(role), HoldoutSource::Given) => {
-                format!("recordings held out: {}", role.data.recordings.join(", "))
-            }
-            (_, HoldoutSource::LastFifth) => "the last fifth of each recording".to_owned(),
-            (Some(_), HoldoutSource::LastBlock) => "the last block of the recordings".to_owned(),
-            _ => "none: the recordings are too short to hold anything out".to_owned(),
+            (Some(role), source) => super::held_out(source, &role.data.recordings),
+            (None, HoldoutSource::LastFifth) => super::held_out(HoldoutSource::LastFifth, &[]),
+            (None, _) => "none: the recordings are too short to hold anything out".to_owned(),
         },
         recordings: by_name,
     }
