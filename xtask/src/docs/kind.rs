@@ -4,7 +4,7 @@ use std::fmt::Write;
 
 use anyhow::{Context, Result};
 use greybox_diagnose::candidate::{Candidate, candidates};
-use greybox_diagnose::library::{Domain, First, Inner, Mechanism, On, Scale};
+use greybox_diagnose::library::{Domain, Excitation, First, Inner, Mechanism, On, Scale};
 use greybox_diagnose::place::{Place, places};
 use greybox_model::{Model, WriteOptions};
 use greybox_report::format;
@@ -60,6 +60,9 @@ fn form(page: &mut String, file: &str, m: &Mechanism, all: &[Kind]) -> Result<()
         writeln!(page, "\n**Taken for:** {}.", links.join(", "))?;
     }
     writeln!(page, "\n**The recording that separates them:** {}.", m.about.separate)?;
+    if let Some(excitation) = &m.excitation {
+        writeln!(page, "\n**How it drives the machine:** {}.", drive(excitation))?;
+    }
     if !m.about.elsewhere.is_empty() {
         writeln!(
             page,
@@ -279,4 +282,18 @@ fn located(m: &Mechanism) -> String {
     let rate = [&region.low, &region.high].into_iter().flatten().any(|e| e.mentions("rms_rate"));
     let note = if rate { " (`rms_rate`: RMS of the rate)" } else { "" };
     format!("{range}{note}, with the instants and the frequency band of its force.")
+}
+
+/// An excitation in words.
+fn drive(excitation: &Excitation) -> String {
+    match excitation {
+        Excitation::Slow => "slowly, up to the present amplitude".to_owned(),
+        Excitation::Wide => "slowly, and further than now".to_owned(),
+        Excitation::Loud => "as now, and louder".to_owned(),
+        Excitation::Silent => "the input at zero".to_owned(),
+        Excitation::Again => "the same again".to_owned(),
+        Excitation::Around(at) => format!("a sine around `{at}` Hz"),
+        Excitation::Ramp(at) => format!("a slow ramp of the input to `{at}`"),
+        Excitation::Beyond(at) => format!("steps of the input beyond `{at}`"),
+    }
 }
