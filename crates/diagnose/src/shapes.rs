@@ -5,7 +5,7 @@
 //! a gain of d, d', d² and each input).
 //!
 //! As a hypothesis, a shape is a Gaussian process (Rasmussen and Williams, *Gaussian Processes for Machine Learning*, 2006,
-//! ch. 2): its values a at the knots are normal with covariance K. TrajectoryEval a fitted model the residuals r are linear in them,
+//! ch. 2): its values a at the knots are normal with covariance K. Along a fitted model the residuals r are linear in them,
 //! r = G a + e, with e of unit variance and every square worth w of one that is independent. With the parameters projected
 //! off, what the shape adds to the logarithm of the marginal likelihood is
 //!
