@@ -42,6 +42,10 @@ pub fn candidates(model: &Model, library: &[Mechanism], places: &[Place]) -> Vec
                 (On::Spring, Place::Spring { motion, level: 0, alone: true, .. })
                 | (On::Feedback, Place::Spring { motion, .. }) => has(mechanism, "d", motion),
                 (On::Load, Place::Load { motion, .. }) => has(mechanism, "d", motion),
+                (On::Drive, Place::Load { motion, load }) => {
+                    let is_driven = model.inputs.iter().any(|input| load.mentions(&input.name));
+                    is_driven && has(mechanism, "d", motion)
+                }
                 (On::Pair, Place::Pair { own, other }) => {
                     let seen = symmetric && pairs.contains(&(other, own));
                     pairs.push((own, other));

@@ -42,6 +42,7 @@
 //! |---|---|---|
 //! | `motion` | a coordinate or a difference of coordinates d | `d`, `d'`, `d''` |
 //! | `load` | a motion and the torque that its joint transmits | `d`, `d'`, `load` |
+//! | `drive` | the same, where that torque comes from an input | `d`, `d'`, `load` |
 //! | `pair` | the equation of a motion d, from another coordinate o; `reaction` acts on o's equation | `d`, `o` and primes |
 //! | `spring` | the term k·d of an existing spring, which `replace` stands in for | `k`, `d` |
 //! | `feedback` | the same, also of a damper or of a gain on a difference from a reference | `k`, `d` |
@@ -85,6 +86,8 @@ pub enum On {
     Pair,
     /// A motion together with the force that its joint transmits.
     Load,
+    /// The same where that force drives the motion: terms that hold an input.
+    Drive,
 }
 
 impl On {
@@ -98,7 +101,7 @@ impl On {
             On::Parameter => &["p", "t", "pi"],
             On::Spring | On::Feedback => &["k", "d", "t", "pi"],
             On::Pair => &["d", "o", "t", "pi"],
-            On::Load => &["d", "load", "t", "pi"],
+            On::Load | On::Drive => &["d", "load", "t", "pi"],
         }
     }
 
@@ -114,6 +117,7 @@ impl On {
             On::Feedback => "feedback",
             On::Pair => "pair",
             On::Load => "load",
+            On::Drive => "drive",
         }
     }
 

@@ -102,6 +102,7 @@ fn acts_on(on: On) -> &'static str {
         On::Feedback => "What stands in for the term `k*d` of a spring, a damper or a feedback gain",
         On::Pair => "A force in the equation of the coordinate `d`, from another coordinate `o`",
         On::Load => "A force on a motion `d` whose joint transmits the force `load`",
+        On::Drive => "A force on a motion `d` that an input drives with the force `load`",
     }
 }
 
@@ -111,7 +112,7 @@ fn role(on: On) -> &'static str {
         On::Measurement => "y →",
         On::Parameter => "p →",
         On::Spring | On::Feedback => "k*d →",
-        On::Motion | On::Equation | On::Pair | On::Load => "force",
+        On::Motion | On::Equation | On::Pair | On::Load | On::Drive => "force",
     }
 }
 
