@@ -299,7 +299,6 @@ fn no_file_names_a_path_of_one_machine() {
     assert!(found.is_empty(), "paths of one machine:\n{}", found.join("\n"));
 }
 
-/// Whether a line holds the path as an absolute one (`../work/x` and `a/work/x` are relative).
 /// Words that stood where the field has a term, and the term.
 const REPLACED: [(&str, &str); 15] = [
     ("anneal", "restart_short_segments"),
@@ -363,6 +362,7 @@ fn no_word_of_our_own_stands_for_a_term_of_the_field() {
     assert!(found.is_empty(), "{}", found.join("\n"));
 }
 
+/// Whether a line holds the path as an absolute one (`../work/x` and `a/work/x` are relative).
 fn mentions(line: &str, path: &str) -> bool {
     line.match_indices(path).any(|(at, _)| {
         !line[..at].chars().next_back().is_some_and(|c| c.is_alphanumeric() || "._-$}".contains(c))

@@ -397,9 +397,9 @@ mod tests {
     use super::*;
     use crate::place::places;
 
-    /// A damper's law is collinear with the damper's parameter; a force that does not turn with the motion has not.
+    /// A damper's law is collinear with the damper's parameter. A force that does not turn with the motion is not.
     #[test]
-    fn an_even_force_is_no_parameter_under_another_name() {
+    fn an_even_force_is_collinear_with_no_parameter() {
         let text = "[inputs]\nf = { unit = \"N\" }\n[states]\nx = { unit = \"m\" }\n[parameters]\n\
                     m = { value = 1.0, unit = \"kg\" }\nc = { value = 1.0, unit = \"N s/m\" }\n\
                     k = { value = 9.0, unit = \"N/m\" }\n[equations]\nmass = \"m*x'' + c*x' + k*x = f\"\n";
@@ -409,5 +409,24 @@ mod tests {
         let is_offered = |kind: &str| all.iter().any(|c| library[c.mechanism].kind == kind);
         assert!(!is_offered("viscous_friction") && !is_offered("linear_stiffness"));
         assert!(is_offered("asymmetric_damping") && is_offered("asymmetric_stiffness"));
+    }
+
+    /// The force of a spring is a load as that of an input is, and only the latter drives.
+    #[test]
+    fn what_acts_on_a_drive_is_offered_where_an_input_is() {
+        let offered = |right: &str| {
+            let text = format!(
+                "[inputs]\nf = {{ unit = \"N\" }}\n[states]\nx = {{ unit = \"m\" }}\n[parameters]\n\
+                 m = {{ value = 1.0, unit = \"kg\" }}\nk = {{ value = 9.0, unit = \"N/m\" }}\n\
+                 [equations]\nmass = \"m*x'' + k*x = {right}\"\n"
+            );
+            let model = Model::from_toml(&text, "mass.toml").unwrap();
+            let library = crate::built_in().unwrap();
+            let all = candidates(&model, &library, &places(&model));
+            ["load_dependent_friction", "load_dependent_damping"]
+                .map(|kind| all.iter().filter(|c| library[c.mechanism].kind == kind).count())
+        };
+        assert_eq!(offered("f"), [2, 1]);
+        assert_eq!(offered("0"), [1, 0]);
     }
 }

@@ -930,6 +930,16 @@ mod tests {
 
     /// Every way to be wrong, the line it is found on (three stand before the text), and what must be said.
     #[test]
+    fn an_excitation_has_a_number_where_its_formula_has_all_its_values() {
+        let around = Excitation::Around(greybox_model::parse("1/(2*pi*ta)").unwrap().expr);
+        let at = |ta: Option<f64>| around.evaluated(&|name| ta.filter(|_| name == "ta"));
+        let Some(Excitation::Around(frequency)) = at(Some(0.05)) else { panic!("no frequency") };
+        assert!((frequency - 10.0 / std::f64::consts::PI).abs() < 1e-12, "{frequency}");
+        assert_eq!([at(None), at(Some(-0.05)), at(Some(0.0))], [None; 3]);
+        assert_eq!(Excitation::Slow.evaluated(&|_| None), Some(Excitation::Slow));
+    }
+
+    #[test]
     fn wrong_files_are_refused_with_line_and_help() {
         let state = "force = \"k*z\"\nlinear = [\"k\"]\n[states.z]\n";
         let first = "force = \"fc*sign(d')\"\nlinear = [\"a\"]\n";

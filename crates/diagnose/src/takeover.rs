@@ -1,5 +1,5 @@
-//! What takes the place of what a search found: a closure that passes the gates and simulates better, or the laws that are likeliest
-//! beside an error of the model.
+//! Replacements for what a search found: a closure that passes the gates and simulates better, or the laws that are likeliest beside
+//! an error of the model.
 
 use crate::baseline::{Baseline, Judge, WholeRecordFit, leaves_noise, polish, residual_scale};
 use crate::candidate::Candidate;

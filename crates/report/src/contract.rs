@@ -1,7 +1,7 @@
 //! `report.json`: the machine-readable result of a diagnosis.
 //!
-//! The types here *are* the contract. Keys may be added; a renamed key is still read under its old name; `docs/report.schema.json` is
-//! generated from them by [`schema`]. They hold plain data, so that whatever produces a diagnosis can fill
+//! The types here *are* the contract. Keys may be added, and a renamed key is still read under its old name.
+//! `docs/report.schema.json` is generated from them by [`schema`]. They hold plain data, so that whatever produces a diagnosis can fill
 //! them field by field, and they decide nothing.
 //!
 //! Conventions:

@@ -61,7 +61,7 @@ fn form(page: &mut String, file: &str, m: &Mechanism, all: &[Kind]) -> Result<()
     }
     writeln!(page, "\n**The recording that separates them:** {}.", m.about.separate)?;
     if let Some(excitation) = &m.excitation {
-        writeln!(page, "\n**How it drives the machine:** {}.", drive(excitation))?;
+        writeln!(page, "\n**Its excitation:** {}.", drive(excitation))?;
     }
     if !m.about.elsewhere.is_empty() {
         writeln!(

@@ -1,4 +1,4 @@
-//! Fits of models with mechanisms: how one is assembled, extended by a law, relieved of one, and which are physical.
+//! Fits of models with mechanisms: how one is assembled, extended or reduced by a law, and which are physical.
 
 use std::cell::LazyCell;
 

@@ -1,4 +1,4 @@
-//! Second thoughts: every mechanism against its rivals, without it, and by simpler laws.
+//! Reconsideration: the model with a rival in place of each mechanism, without it, and with simpler laws.
 
 use rayon::prelude::*;
 
