@@ -77,7 +77,7 @@ impl Finding {
     }
 }
 
-/// `warning [clipping] y: message Fix: …`, one line.
+/// `warning [clipping] y: message Help: …`, one line.
 impl fmt::Display for Finding {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         write!(f, "{} [{}] ", self.severity, self.code)?;
