@@ -8,7 +8,7 @@ use std::path::PathBuf;
 
 use rayon::prelude::*;
 
-use crate::root;
+use greybox_dev::root;
 
 /// The files of a target, sorted.
 fn corpus(target: &str) -> Vec<PathBuf> {

@@ -5,7 +5,7 @@ use std::process::Command;
 
 use anyhow::{Context, Result};
 
-use crate::{Ending, process};
+use greybox_dev::{Ending, process};
 
 /// What to leave out.
 #[derive(Debug, clap::Args)]

@@ -1,18 +1,16 @@
-//! What `greybox demo` diagnoses, and what its answer must be.
+//! What the answer of `greybox demo` must be.
 
 use std::path::Path;
 use std::process::Command;
 
 use anyhow::{Context, Result, bail, ensure};
-use greybox_diagnose::{Diagnosis, Options, Quiet, diagnose};
-use greybox_model::Model;
 use greybox_recording::{Recording, read_csv};
 use greybox_report::Report;
 use greybox_report::contract::Verdict;
 use serde_json::Value;
 
-use crate::reproduce::{Axis, Plot, Series, Style};
-use crate::{Ending, book, process, readme};
+use greybox_dev::figure::{Axis, Plot, Series, Style};
+use greybox_dev::{Ending, book, process, readme};
 
 /// What `greybox demo` leaves, sorted.
 const FILES: [&str; 6] = [
@@ -28,30 +26,6 @@ const FRICTION: f64 = 0.01478;
 const NEAR: f64 = 0.01;
 /// Held-out error over the noise.
 const HELD_OUT: f64 = 1.2;
-
-/// The embedded model and its recordings.
-pub(crate) struct Demo {
-    pub(crate) model: Model,
-    pub(crate) train: [Recording; 1],
-    pub(crate) holdout: [Recording; 1],
-}
-
-impl Demo {
-    pub(crate) fn read() -> Result<Self> {
-        let folder = crate::root().join("crates").join("cli").join("demo");
-        let path = folder.join("rotary_link.toml");
-        let recording = |name: &str| -> Result<_> { Ok([read_csv(folder.join(name))?]) };
-        Ok(Self {
-            model: Model::from_toml(&std::fs::read_to_string(&path)?, "rotary_link.toml")?,
-            train: recording("rotary_link_train.csv")?,
-            holdout: recording("rotary_link_test.csv")?,
-        })
-    }
-
-    pub(crate) fn diagnose(&self) -> Result<Diagnosis> {
-        Ok(diagnose(&self.model, &self.train, &self.holdout, &Options::default(), &Quiet)?)
-    }
-}
 
 /// Checks what `greybox demo --out OUT` printed (into the file `answer`) and left: the README shows this answer, and the
 /// files simulate as well as the report says. Draws the README's figure of these simulations, if it is to be written.

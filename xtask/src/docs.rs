@@ -10,7 +10,7 @@ use anyhow::{Context, Result};
 use greybox_diagnose::{Mechanism, library};
 use greybox_report::format;
 
-use crate::Ending;
+use greybox_dev::Ending;
 
 /// The model that the pages show each mechanism in: a motor that turns a load through a shaft.
 const EXAMPLE: &str = r#"name = "Motor, shaft and load"

@@ -3,18 +3,12 @@
 // This is a command that measures: its answers go to standard output, its complaints to standard error.
 #![allow(clippy::disallowed_methods, clippy::print_stdout, clippy::print_stderr)]
 
-mod bench;
-mod book;
 #[cfg(test)]
 mod corpus;
 mod crates;
 mod demo;
 mod docs;
 mod package;
-mod process;
-mod prove;
-mod readme;
-mod reproduce;
 #[cfg(test)]
 mod supply;
 #[cfg(test)]
@@ -25,6 +19,8 @@ use std::process::ExitCode;
 
 use anyhow::{Context, Result};
 use clap::{Parser, Subcommand};
+use greybox_dev::{Ending, process, readme, root};
+use {greybox_bench as bench, greybox_prove as prove, greybox_reproduce as reproduce};
 
 #[derive(Debug, Parser)]
 #[command(name = "cargo xtask", about = "Developer commands of greybox", disable_help_subcommand = true)]
@@ -47,7 +43,7 @@ enum Task {
         #[arg(long)]
         check: bool,
     },
-    /// Make a Python with NumPy, SciPy and a reader of Modelica, as bench/requirements.txt pins them, and print its path for $GREYBOX_PYTHON
+    /// Make a Python with NumPy, SciPy and a reader of Modelica, as dev/bench/requirements.txt pins them, and print its path for $GREYBOX_PYTHON
     Python,
     /// Build the wheel of the Python package, install it in an environment of its own, and run its tests and notebooks
     PythonPackage,
@@ -70,17 +66,6 @@ enum Task {
         /// For example "test command"
         marker: String,
     },
-}
-
-/// How a task ended.
-#[derive(Debug, Clone, Copy, PartialEq, Eq)]
-enum Ending {
-    /// All is well.
-    Done,
-    /// The task ran, and its answer is no.
-    Missed,
-    /// It could not run as asked.
-    Refused,
 }
 
 fn main() -> ExitCode {
@@ -107,18 +92,12 @@ fn main() -> ExitCode {
     }
 }
 
-/// The workspace: this crate's parent.
-fn root() -> PathBuf {
-    let here = Path::new(env!("CARGO_MANIFEST_DIR"));
-    here.parent().unwrap_or(here).to_path_buf()
-}
-
 fn python(root: &Path) -> Result<Ending> {
     let folder = process::target(root).join("python");
-    let list = root.join("bench").join("requirements.txt");
+    let list = root.join("dev").join("bench").join("requirements.txt");
     println!(
         "{}",
-        bench::peer::environment(
+        greybox_dev::python::environment(
             &list,
             &folder,
             &["numpy", "scipy", "antlr4-python3-runtime", "casadi", "pymoca"]

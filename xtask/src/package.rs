@@ -6,7 +6,7 @@ use std::process::Command;
 
 use anyhow::{Context, Result, bail};
 
-use crate::{Ending, bench, process};
+use greybox_dev::{Ending, process, python};
 
 /// Builds the wheel and tests it beside the command, in an environment that has nothing else of greybox.
 pub(crate) fn run(root: &Path) -> Result<Ending> {
@@ -14,15 +14,15 @@ pub(crate) fn run(root: &Path) -> Result<Ending> {
     let target = process::target(root);
     let command = process::build(root)?;
     let list = package.join("requirements.txt");
-    let python = bench::peer::environment(&list, &target.join("python-package"), &[])?;
+    let interpreter = python::environment(&list, &target.join("python-package"), &[])?;
 
     let wheels = target.join("wheels");
     // An older wheel must not be taken for this one.
     if wheels.exists() {
         fs::remove_dir_all(&wheels).with_context(|| format!("{} cannot be cleared", wheels.display()))?;
     }
-    let mut build = Command::new(&python);
-    build.args(["-m", "maturin", "build", "--release", "--locked", "--interpreter"]).arg(&python);
+    let mut build = Command::new(&interpreter);
+    build.args(["-m", "maturin", "build", "--release", "--locked", "--interpreter"]).arg(&interpreter);
     build.arg("--out").arg(&wheels).current_dir(&package).env("CARGO_TARGET_DIR", &target);
     if !passes(&mut build)? {
         bail!("the wheel does not build");
@@ -31,12 +31,12 @@ pub(crate) fn run(root: &Path) -> Result<Ending> {
     let bytes = fs::metadata(&wheel).with_context(|| format!("{} cannot be read", wheel.display()))?.len();
     println!("{}: {:.1} MB", wheel.display(), bytes as f64 / 1e6);
 
-    let mut install = Command::new(&python);
+    let mut install = Command::new(&interpreter);
     install.args(["-m", "pip", "install", "--quiet", "--no-deps", "--force-reinstall"]).arg(&wheel);
     if !passes(&mut install)? {
         bail!("the wheel cannot be installed");
     }
-    let mut tests = Command::new(&python);
+    let mut tests = Command::new(&interpreter);
     // In a folder from which `import greybox` finds the installed package, not the sources.
     tests.args(["-m", "pytest", "-q", "-p", "no:cacheprovider", "--rootdir"]).arg(&package);
     tests.arg(package.join("tests")).current_dir(&wheels).env("GREYBOX", command);

@@ -7,7 +7,7 @@ use std::process::Command;
 use serde_json::Value as Json;
 use toml::{Table, Value};
 
-use crate::root;
+use greybox_dev::root;
 
 /// The manifests of our workspaces.
 const WORKSPACES: [&str; 3] = ["Cargo.toml", "python/Cargo.toml", "fuzz/Cargo.toml"];
