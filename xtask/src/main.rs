@@ -4,6 +4,8 @@
 #![allow(clippy::disallowed_methods, clippy::print_stdout, clippy::print_stderr)]
 
 #[cfg(test)]
+mod circles;
+#[cfg(test)]
 mod corpus;
 mod crates;
 mod demo;
@@ -49,13 +51,15 @@ enum Task {
     PythonPackage,
     /// Package every crate as it would be published, in the order of their dependencies, and build it from its package
     Crates(crates::Arguments),
-    /// Check what `greybox demo --out OUT` answered and left: the README shows it
+    /// Check what `greybox demo MACHINE --out OUT` answered and left: the README shows it
     Demo {
+        /// The machine
+        machine: demo::Machine,
         /// What the command printed
         answer: PathBuf,
         /// The folder that it wrote
         out: PathBuf,
-        /// Draw the README's figure of its simulations (docs/src/demo.svg)
+        /// Draw the figure of its simulations (docs/src/demo-*.svg)
         #[arg(long)]
         write_docs: bool,
     },
@@ -77,7 +81,9 @@ fn main() -> ExitCode {
         Task::Python => python(&root()),
         Task::Crates(arguments) => crates::run(&root(), &arguments),
         Task::PythonPackage => package::run(&root()),
-        Task::Demo { answer, out, write_docs } => demo::check(&root(), &answer, &out, write_docs),
+        Task::Demo { machine, answer, out, write_docs } => {
+            demo::check(&root(), machine, &answer, &out, write_docs)
+        }
         Task::Ci => ci(&root()),
         Task::ReadmeCommand { marker } => print_command(&root(), &marker),
     };

@@ -303,7 +303,7 @@ fn no_file_names_a_path_of_one_machine() {
 }
 
 /// Words that stood where the field has a term, and the term.
-const REPLACED: [(&str, &str); 15] = [
+const REPLACED: [(&str, &str); 18] = [
     ("anneal", "restart_short_segments"),
     ("declare_unseen", "mark_unidentifiable"),
     ("hats", "smoothed_states"),
@@ -317,6 +317,9 @@ const REPLACED: [(&str, &str); 15] = [
     ("mended", "fixed, or corrected"),
     ("mends", "fixes"),
     ("Polished", "WholeRecordFit"),
+    ("Rival", "AlternativeTerm"),
+    ("rival", "alternative"),
+    ("rivals", "alternatives"),
     ("think_again", "refine_structure"),
     ("Untold", "WorkOnlyListener"),
 ];

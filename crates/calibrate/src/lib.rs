@@ -6,6 +6,7 @@
 struct Readme;
 
 pub mod data;
+mod fit_point;
 pub mod free;
 pub mod free_run;
 mod holdout;
@@ -19,6 +20,7 @@ pub mod stochastic;
 mod student;
 
 pub use data::{Data, DataError, PieceData, SmoothedStates, spread};
+pub use fit_point::FitPoint;
 pub use free::free_parameters;
 pub use free_run::{Criterion, FreeRun, Score, window_length, window_of};
 pub use holdout::{HELD_OUT_SHARE, HoldoutSource};

@@ -12,6 +12,7 @@ mod failure;
 mod log;
 mod output;
 mod progress;
+mod study;
 
 use std::ffi::OsString;
 use std::process::ExitCode;

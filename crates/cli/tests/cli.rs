@@ -300,8 +300,10 @@ fn outputs_that_cannot_be_written() {
     );
     bench.write("improved.toml", MODEL);
     bench.refuses(&["diagnose", "improved.toml", "run1.csv", "--out", "."], &["improved.toml", "overwrite"]);
+    bench.write("cart.toml", MODEL);
+    bench.refuses(&["demo", "--out", "."], &["cart.toml", "not of this demo", "help:"]);
     bench.write("rotary_link.toml", MODEL);
-    bench.refuses(&["demo", "--out", "."], &["rotary_link.toml", "not of this demo", "help:"]);
+    bench.refuses(&["demo", "link", "--out", "."], &["rotary_link.toml", "not of this demo", "help:"]);
     assert_eq!(bench.read("model.toml"), MODEL);
     assert_eq!(bench.read("file"), "mine");
     assert_eq!(bench.read("run1.csv"), recording(1200, 0.0));

@@ -10,7 +10,7 @@ use greybox_report::notes::grouped;
 use greybox_report::summary::{Spread, Summary};
 use greybox_report::{expression, format, sentence};
 
-/// The story of a diagnosis: the conclusion, the mechanisms with their rivals, the fit, and what to know.
+/// The story of a diagnosis: the conclusion, the mechanisms with their alternatives, the fit, and what to know.
 pub fn diagnosis(report: &Report) -> String {
     let mut text = String::new();
     let written = sentence::summary(report);

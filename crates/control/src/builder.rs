@@ -16,7 +16,18 @@ fn positive(what: &str, value: f64) -> Result<(), ControlError> {
     Err(ControlError::Option { what: what.to_owned(), value, wanted: "a positive finite number" })
 }
 
-pub(crate) struct Builder<'a> {
+impl Plant {
+    /// The plant of a model with one of its inputs as the command.
+    ///
+    /// # Errors
+    /// [`ControlError`]: an unknown name, a delay, an explicit time, an equation that is not affine in the highest
+    /// derivatives or in the input, a singular mass matrix, an input that moves nothing, options that make no sense.
+    pub fn of(model: &Model, input: &str, options: &PlantOptions) -> Result<Plant, ControlError> {
+        Builder::new(model, input, options)?.plant()
+    }
+}
+
+struct Builder<'a> {
     model: &'a Model,
     input: &'a str,
     options: &'a PlantOptions,
@@ -28,11 +39,7 @@ pub(crate) struct Builder<'a> {
 }
 
 impl<'a> Builder<'a> {
-    pub(crate) fn new(
-        model: &'a Model,
-        input: &'a str,
-        options: &'a PlantOptions,
-    ) -> Result<Builder<'a>, ControlError> {
+    fn new(model: &'a Model, input: &'a str, options: &'a PlantOptions) -> Result<Builder<'a>, ControlError> {
         let inputs = || listed(model.inputs.iter().map(|i| &i.name));
         let unknown = |name: &str| ControlError::UnknownInput { name: name.to_owned(), known: inputs() };
         model.input(input).ok_or_else(|| unknown(input))?;
@@ -85,7 +92,7 @@ impl<'a> Builder<'a> {
         Ok(Builder { model, input, options, symbols, all, sizes, held })
     }
 
-    pub(crate) fn plant(&self) -> Result<Plant, ControlError> {
+    fn plant(&self) -> Result<Plant, ControlError> {
         let mut range = Range::default();
         let mut dropped = Vec::new();
         let mut closed_gaps = Vec::new();

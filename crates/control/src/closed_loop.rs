@@ -5,63 +5,11 @@ use greybox_simulate::{Carry, Environment, Method as Integration, Seeds, Signal,
 
 use crate::controller::Controller;
 use crate::error::{ControlError, listed};
-use crate::metrics::{Metrics, metrics};
-
-/// Most samples of one run.
-pub const MOST_SAMPLES: usize = 10_000_000;
+use crate::run::metrics;
+pub use crate::run::{MOST_SAMPLES, Reference, Run};
 
 /// A state this many times its size, start or set point has run away.
 const FAR: f64 = 1e9;
-
-/// Set points over the time.
-#[derive(Debug, Clone, PartialEq)]
-pub struct Reference {
-    /// From which time on (s, rising, the first at zero) which set point (SI).
-    pub set_points: Vec<(f64, f64)>,
-    /// Length of the run, s.
-    pub duration: f64,
-}
-
-impl Reference {
-    /// One set point from the start on.
-    #[must_use]
-    pub fn step(value: f64, duration: f64) -> Reference {
-        Reference { set_points: vec![(0.0, value)], duration }
-    }
-
-    /// `value` and −`value` in turn, each for `half_period` s, `count` set points in all.
-    #[must_use]
-    pub fn square(value: f64, half_period: f64, count: usize) -> Reference {
-        let at = |k: usize| (k as f64 * half_period, if k.is_multiple_of(2) { value } else { -value });
-        Reference { set_points: (0..count).map(at).collect(), duration: count as f64 * half_period }
-    }
-
-    /// The set point at a time.
-    #[must_use]
-    pub fn at(&self, t: f64) -> f64 {
-        let later = self.set_points.partition_point(|(start, _)| *start <= t + 1e-9 * self.duration);
-        self.set_points.get(later.saturating_sub(1)).map_or(0.0, |(_, r)| *r)
-    }
-
-    fn check(&self, dt: f64) -> Result<usize, ControlError> {
-        let samples = (self.duration / dt).round();
-        if !(samples >= 1.0 && samples <= MOST_SAMPLES as f64) {
-            let what = "the length of the run, in samples".to_owned();
-            return Err(ControlError::Option { what, value: samples, wanted: "one to ten millions" });
-        }
-        let starts = self.set_points.first().is_some_and(|(t, _)| *t == 0.0);
-        let rising = self.set_points.windows(2).all(|w| w[0].0 < w[1].0);
-        let finite = self.set_points.iter().all(|(t, r)| t.is_finite() && r.is_finite());
-        if !(starts && rising && finite) {
-            return Err(ControlError::Option {
-                what: "the list of set points".into(),
-                value: self.set_points.len() as f64,
-                wanted: "finite, with rising times from zero on",
-            });
-        }
-        Ok(samples as usize)
-    }
-}
 
 /// What the law is given of the state.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
@@ -89,27 +37,6 @@ impl Default for LoopOptions {
         let integration = Integration::Adaptive { rtol: 1e-7, atol: 1e-10 };
         Self { start: None, feedback: Feedback::FullState, integration }
     }
-}
-
-/// A simulated run, sampled where the command changes.
-#[derive(Debug, Clone, PartialEq)]
-pub struct Run {
-    /// Time, s.
-    pub t: Vec<f64>,
-    /// Set point.
-    pub r: Vec<f64>,
-    /// Command, held until the next sample.
-    pub u: Vec<f64>,
-    /// States of the model (all, also those that the law does not know), one series each.
-    pub x: Vec<Vec<f64>>,
-    /// Their names.
-    pub states: Vec<String>,
-    /// The tracked state's index.
-    pub tracked: usize,
-    /// The sample at which the run ended because the state or the command left every bound.
-    pub diverged: Option<usize>,
-    /// What was reached, for each set point.
-    pub metrics: Vec<Metrics>,
 }
 
 /// A model, compiled, under a controller: friction sticks truly ([`greybox_simulate`]), the command is held over the

@@ -5,9 +5,9 @@ use greybox_model::Expr;
 
 use crate::check::Check;
 use crate::compiled::Compiled;
-use crate::design::{Method, Weights};
 use crate::feedforward::FeedForward;
 use crate::plant::Plant;
+use crate::specification::{Method, Weights};
 
 /// A law that was checked.
 #[derive(Debug, Clone)]

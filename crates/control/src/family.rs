@@ -5,9 +5,10 @@ use rand_distr::{Distribution, StandardNormal};
 use rand_pcg::Pcg64Mcg;
 use rayon::prelude::*;
 
-use crate::closed_loop::{ClosedLoop, Reference, Run};
+use crate::closed_loop::ClosedLoop;
 use crate::error::ControlError;
-use crate::metrics::Metrics;
+use crate::metrics::{Metrics, Verdict};
+use crate::run::{Reference, Run};
 
 /// Most members of a family.
 pub const MOST_MEMBERS: usize = 1_000_000;
@@ -176,6 +177,22 @@ impl ClosedLoop<'_> {
             tracked,
             command,
         })
+    }
+}
+
+impl Run {
+    /// What this run did, and the same law on perturbed plants, where they were tried.
+    #[must_use]
+    pub fn verdict(&self, family: Option<&Family>) -> Verdict {
+        if self.diverged.is_some() {
+            Verdict::Diverges
+        } else if self.metrics.is_empty() || self.metrics.iter().any(|m| m.settling.is_none()) {
+            Verdict::Unsettled
+        } else if family.is_some_and(|f| f.settled < f.members) {
+            Verdict::Fragile
+        } else {
+            Verdict::Settles
+        }
     }
 }
 

@@ -5,11 +5,11 @@ use greybox_model::{Expr, Func};
 use greybox_smc::{BoundaryLayer, Rate, SmcError, Surface, Tangent};
 use nalgebra::{DMatrix, dmatrix};
 
-use crate::design::Weights;
 use crate::equilibrium::Equilibrium;
 use crate::error::ControlError;
 use crate::feedforward::FeedForward;
 use crate::plant::Plant;
+use crate::specification::Weights;
 
 /// Relative size of the even part of a drift below which it counts as odd.
 const ODD: f64 = 1e-9;

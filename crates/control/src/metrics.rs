@@ -1,8 +1,5 @@
 //! What a closed loop reached.
 
-use crate::closed_loop::{Reference, Run};
-use crate::family::Family;
-
 /// Half width of the band of settling, relative to the step.
 pub const BAND: f64 = 0.02;
 /// The share of a set point's time, at its end, over which the final error is averaged.
@@ -97,40 +94,4 @@ impl Verdict {
             Verdict::Diverges => "diverges",
         }
     }
-}
-
-impl Run {
-    /// What this run did, and the same law on perturbed plants, where they were tried.
-    #[must_use]
-    pub fn verdict(&self, family: Option<&Family>) -> Verdict {
-        if self.diverged.is_some() {
-            Verdict::Diverges
-        } else if self.metrics.is_empty() || self.metrics.iter().any(|m| m.settling.is_none()) {
-            Verdict::Unsettled
-        } else if family.is_some_and(|f| f.settled < f.members) {
-            Verdict::Fragile
-        } else {
-            Verdict::Settles
-        }
-    }
-}
-
-/// For each set point that was begun.
-pub(crate) fn metrics(run: &Run, reference: &Reference, dt: f64, limits: (f64, f64)) -> Vec<Metrics> {
-    let y = &run.x[run.tracked];
-    let starts: Vec<usize> =
-        reference.set_points.iter().map(|(t, _)| (t / dt - 1e-6).ceil().max(0.0) as usize).collect();
-    let mut found = Vec::with_capacity(starts.len());
-    for (i, &(_, r)) in reference.set_points.iter().enumerate() {
-        let first = starts[i];
-        // The sample at which the next set point is given still belongs to this one's motion.
-        let last = starts.get(i + 1).copied().unwrap_or(y.len()).min(y.len().saturating_sub(1));
-        if first >= last {
-            continue;
-        }
-        let cut = run.diverged.is_some() && last + 1 == run.t.len();
-        let reached = Metrics::of(&y[first..=last], &run.u[first..last], r, dt, limits);
-        found.extend(reached.map(|m| if cut { Metrics { settling: None, ..m } } else { m }));
-    }
-    found
 }

@@ -1,10 +1,9 @@
 //! A model as a plant ẋ = f(x) + g(x) u in symbols.
 
 use greybox_hjb::Linear;
-use greybox_model::{Expr, Model};
+use greybox_model::Expr;
 use nalgebra::DMatrix;
 
-use crate::builder::Builder;
 use crate::compiled::Compiled;
 use crate::error::{ControlError, listed};
 
@@ -120,15 +119,6 @@ pub(crate) fn with_primes(name: &str, primes: u8) -> String {
 }
 
 impl Plant {
-    /// The plant of a model with one of its inputs as the command.
-    ///
-    /// # Errors
-    /// [`ControlError`]: an unknown name, a delay, an explicit time, an equation that is not affine in the highest
-    /// derivatives or in the input, a singular mass matrix, an input that moves nothing, options that make no sense.
-    pub fn of(model: &Model, input: &str, options: &PlantOptions) -> Result<Plant, ControlError> {
-        Builder::new(model, input, options)?.plant()
-    }
-
     /// Names of the states with their primes.
     #[must_use]
     pub fn state_names(&self) -> Vec<String> {

@@ -238,7 +238,7 @@ pub enum Warning {
     },
     /// Another delay fits as well within noise (likelihood ratio below the 99 % point of χ² with one degree of
     /// freedom, counted on effective rows).
-    Rival {
+    Ambiguous {
         /// That delay, s.
         delay: f64,
     },
@@ -484,11 +484,11 @@ impl<'a> Problem<'a> {
             warnings.push(Warning::Uninformative { std: delay_std });
         }
         let step = span / (options.grid - 1) as f64;
-        if let Some((rival, rss)) = second
-            && (rival - delay).abs() > step
+        if let Some((other, rss)) = second
+            && (other - delay).abs() > step
             && effective_rows * (rss / at.rss).ln() < CHI_SQUARED_99
         {
-            warnings.push(Warning::Rival { delay: rival });
+            warnings.push(Warning::Ambiguous { delay: other });
         }
         let separability = Separability {
             gain_correlation,

@@ -4,7 +4,7 @@
 use std::sync::Arc;
 
 use criterion::{Criterion, criterion_group, criterion_main};
-use greybox_calibrate::{Data, Limits, Point, Setup, free_parameters};
+use greybox_calibrate::{Data, FitPoint, Limits, Point, Setup, free_parameters};
 use greybox_diagnose::candidate::candidates;
 use greybox_diagnose::place::places;
 use greybox_diagnose::screen::screen;
@@ -59,7 +59,13 @@ fn all(c: &mut Criterion) {
     let mut group = c.benchmark_group("oscillator, 1000 samples");
     group.sample_size(10);
     group.bench_function("score test of all candidates", |b| {
-        b.iter(|| screen(&setup, &library, &all, &level, &scale, &fit.point));
+        b.iter(|| {
+            screen(
+                FitPoint { setup: &setup, level: &level, scale: &scale, point: &fit.point },
+                &library,
+                &all,
+            )
+        });
     });
     group.bench_function("whole diagnosis", |b| {
         let train = std::slice::from_ref(&recording);

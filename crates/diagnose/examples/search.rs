@@ -4,7 +4,7 @@
 use std::sync::Arc;
 
 use greybox_calibrate::{Data, Setup, free_parameters};
-use greybox_diagnose::{ProgressListener, Stage, Weighed, evidence::Evidence, library, search};
+use greybox_diagnose::{ProgressListener, Stage, Weighed, evidence::Evidence, fitted, library, search};
 
 struct Talk(std::time::Instant, Arc<greybox_calibrate::Work>);
 impl ProgressListener for Talk {
@@ -69,7 +69,7 @@ fn main() -> Result<(), Box<dyn std::error::Error>> {
         for (p, v) in f.setup.model.parameters.iter().zip(&f.fit.point.parameters) {
             println!("  {} = {v:.6}", p.name);
         }
-        println!("  level rms {:?}", search::rms(&f.fit, &found.scale));
+        println!("  level rms {:?}", fitted::rms(&f.fit, &found.scale));
         let run = f.setup.free_run(&f.fit.point.parameters, &found.scale);
         println!("  train {:?}", f.setup.scores(&run, &f.fit.point.parameters, 1.0, None));
         if !test.is_empty() {
@@ -82,7 +82,7 @@ fn main() -> Result<(), Box<dyn std::error::Error>> {
     }
     for a in &found.accepted {
         println!("{} {:?} {:?}", library[a.candidate.mechanism].kind, a.candidate.place, a.evidence);
-        for r in &a.rivals {
+        for r in &a.alternatives {
             println!(
                 "    {} score {:.1} equivalent {}",
                 library[r.candidate.mechanism].kind, r.evidence.score, r.equivalent
@@ -90,7 +90,7 @@ fn main() -> Result<(), Box<dyn std::error::Error>> {
         }
     }
     for f in [&found.calibrated, &found.improved] {
-        let s = greybox_diagnose::discrepancy::test(&f.setup, &f.level, &found.scale, &f.fit.point);
+        let s = greybox_diagnose::discrepancy::test(f.at(&found.scale));
         println!("free shapes {:?}", s.map(|s| (s.gain, s.t)));
     }
     println!("{:7.2} done", talk.0.elapsed().as_secs_f64());

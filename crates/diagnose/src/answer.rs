@@ -9,10 +9,11 @@ use crate::baseline::{
 };
 use crate::candidate::Candidate;
 use crate::diagnosis::{Options, Verdict};
+use crate::fitted::{FittedModel, Found, MechanismTerm};
 use crate::gates::defend;
 use crate::library::Mechanism;
 use crate::proposal::{Gate, Rejected};
-use crate::search::{FittedModel, Found, MISFIT, MechanismTerm, Search};
+use crate::search::{MISFIT, Search};
 use crate::takeover::{Closed, Explored, explored};
 use crate::verdict::Judged;
 

@@ -11,7 +11,8 @@ use greybox_calibrate::{
 use rayon::prelude::*;
 
 use crate::ProgressListener;
-use crate::search::{FittedModel, Found, MISFIT, Search, rms};
+use crate::fitted::{FittedModel, Found, rms};
+use crate::search::{MISFIT, Search};
 
 /// Limits of the fit at each horizon.
 const HORIZON: Limits = Limits { iterations: 30, tolerance: 1e-6 };

@@ -8,7 +8,8 @@ use greybox_recording::Recording;
 
 use crate::ProgressListener;
 use crate::baseline::{Baseline, Judge, WholeRecordFit, alone, residual_scale};
-use crate::diagnosis::{DiagnoseError, Estimate, Layout, ParameterChange, follows, layout};
+use crate::diagnosis::{DiagnoseError, Estimate, ParameterChange};
+use crate::layout::{Layout, follows, layout};
 use crate::search::MOST_WORK;
 use crate::uncertainty::Uncertainty;
 

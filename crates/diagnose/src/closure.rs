@@ -22,13 +22,11 @@ use rayon::prelude::*;
 
 use crate::candidate::Candidate;
 use crate::evidence::{Evidence, least_effective_sample_ratio, price};
+use crate::fitted::{FittedModel, Found, Law, MechanismTerm, SelectedTerm, WHITE, is_same, laws, next_scale};
 use crate::library::Shape;
 use crate::place::own_coordinates;
 use crate::screen::{Held, Scored, Together, reselect, screen, screen_set, screen_shapes, shift_without};
-use crate::search::{
-    FittedModel, Found, Law, MISFIT, MOST_SAMPLES, MechanismTerm, SAME_HOLD, Search, SelectedTerm, UNDECIDED,
-    WHITE, is_same, laws, limits, next_scale, odds, same_level, whole,
-};
+use crate::search::{MISFIT, MOST_SAMPLES, SAME_HOLD, Search, UNDECIDED, limits, odds, same_level, whole};
 use crate::turns::Turns;
 use crate::uncertainty::Uncertainty;
 
@@ -197,10 +195,10 @@ impl Search<'_> {
             let score =
                 self.less(closure, &[index], scale).map_or(0.0, |less| self.robust(&less, closure, scale));
             let known = found.accepted.iter().find(|a| a.candidate == candidate);
-            let mut rivals = known.map_or(Vec::new(), |known| known.rivals.clone());
-            rivals.retain(|r| r.equivalent && closure.parts.iter().all(|p| p.candidate != r.candidate));
-            rivals.iter_mut().for_each(|r| r.evidence.score = score);
-            SelectedTerm { candidate, evidence: Evidence { score, ..Evidence::NONE }, rivals }
+            let mut alternatives = known.map_or(Vec::new(), |known| known.alternatives.clone());
+            alternatives.retain(|r| r.equivalent && closure.parts.iter().all(|p| p.candidate != r.candidate));
+            alternatives.iter_mut().for_each(|r| r.evidence.score = score);
+            SelectedTerm { candidate, evidence: Evidence { score, ..Evidence::NONE }, alternatives }
         };
         (0..closure.parts.len()).into_par_iter().map(of).collect()
     }
@@ -232,7 +230,7 @@ impl Search<'_> {
         if open.is_empty() {
             return None;
         }
-        let scored = screen(&base.setup, self.library, &open, &base.level, scale, &base.fit.point);
+        let scored = screen(base.at(scale), self.library, &open);
         let promising: Vec<Scored> =
             scored.into_iter().take_while(|one| one.gain > more).take(TRIALS).collect();
         let tried = promising.into_par_iter().filter_map(|one| {
@@ -257,8 +255,7 @@ impl Search<'_> {
         scale: &[f64],
     ) -> Option<FittedModel> {
         let open = open(base, terms);
-        let (setup, point) = (&base.setup, &base.fit.point);
-        let together = screen_set(setup, self.library, &open, &base.level, scale, point, most)?;
+        let together = screen_set(base.at(scale), self.library, &open, most)?;
         self.extend_by(base, &open, &together, &STARTS, scale, STEPS)
     }
 
@@ -266,9 +263,9 @@ impl Search<'_> {
     /// first order, the one that is worth most.
     fn shaped(&self, base: &FittedModel, shapes: &[Candidate], scale: &[f64]) -> Option<FittedModel> {
         let open = open(base, shapes);
-        let (setup, level, point) = (&base.setup, &base.level, &base.fit.point);
-        let weight = least_effective_sample_ratio(setup, level, scale, point);
-        let mut likeliest = screen_shapes(setup, self.library, &open, level, scale, point, weight);
+        let at = base.at(scale);
+        let weight = least_effective_sample_ratio(at);
+        let mut likeliest = screen_shapes(at, self.library, &open, weight);
         likeliest.truncate(SHAPES);
         let tried = likeliest.par_iter().filter_map(|shape| {
             let shaped = self.extend_by(base, &open, shape, &STARTS, scale, STEPS_OF_A_TRIAL)?;
@@ -350,7 +347,7 @@ impl Search<'_> {
             let ranked = UNDECIDED * f64::from(law.rank);
             inflation * (price(parameters, information) + 2.0 * law.surcharge + ranked)
         };
-        let together = reselect(setup, self.library, terms, &model.level, scale, point, &held, &price)?;
+        let together = reselect(model.at(scale), self.library, terms, &held, &price)?;
         let other = self.exchanged(model, terms, &positions, &together, scale)?;
         // (First order may have promised too much.)
         let cost =
@@ -421,7 +418,7 @@ impl Search<'_> {
             .filter_map(|i| Some((i, of(setup.free[i].index)?)))
             .map(|(i, &(index, vanishes))| (i, if vanishes { point.parameters[index] } else { 0.0 }))
             .collect();
-        let shift = shift_without(setup, &model.level, scale, point, &gone);
+        let shift = shift_without(model.at(scale), &gone);
         let mut shifted = point.parameters.clone();
         let kept = setup.free.iter().filter(|f| of(f.index).is_none());
         for (f, d) in kept.zip(shift) {
@@ -463,13 +460,14 @@ impl Search<'_> {
         let complexity = |c: &Candidate| self.library[c.mechanism].complexity();
         let most: f64 = own.iter().map(|c| complexity(c)).sum();
         let equations: Vec<String> = own.iter().flat_map(|c| c.place.equations(nominal)).collect();
-        let is_rival = |c: &Candidate| {
+        let is_alternative = |c: &Candidate| {
             !self.library[c.mechanism].named
                 && complexity(c) <= most
                 && c.place.equations(nominal).iter().any(|e| equations.contains(e))
         };
-        let rivals = self.closing().into_iter().filter(is_rival);
-        let (plain, rich): (Vec<_>, Vec<_>) = rivals.partition(|c| self.library[c.mechanism].is_plain());
+        let alternatives = self.closing().into_iter().filter(is_alternative);
+        let (plain, rich): (Vec<_>, Vec<_>) =
+            alternatives.partition(|c| self.library[c.mechanism].is_plain());
         let mut last_first = parts.to_vec();
         last_first.sort_unstable_by(|a, b| b.cmp(a));
         let mut less = model.clone();
@@ -515,8 +513,7 @@ fn open(model: &FittedModel, terms: &[Candidate]) -> Vec<Candidate> {
 
 /// Whether more than white noise is left.
 fn leaves_something(fitted: &FittedModel, scale: &[f64]) -> bool {
-    fitted.misfit(scale) > LEFT
-        || least_effective_sample_ratio(&fitted.setup, &fitted.level, scale, &fitted.fit.point) < WHITE
+    fitted.misfit(scale) > LEFT || least_effective_sample_ratio(fitted.at(scale)) < WHITE
 }
 
 #[cfg(test)]
@@ -618,7 +615,7 @@ second = "n*y'' + c*y' + l*(y - x) = 0"
     /// Kind, equation and coefficient of each term, sorted.
     fn terms(found: &Found, library: &[Mechanism], model: &Model) -> Vec<(String, String, f64)> {
         let fitted = &found.improved;
-        let of = |part: &crate::search::MechanismTerm| {
+        let of = |part: &crate::fitted::MechanismTerm| {
             let index = fitted.setup.model.parameter(&part.instance.names[0]).unwrap();
             let kind = library[part.candidate.mechanism].kind.clone();
             let equations = part.candidate.place.equations(model).join(" ");
@@ -673,7 +670,7 @@ second = "n*y'' + c*y' + l*(y - x) = 0"
             let fitted = closed.improved;
             let value =
                 |name: &String| fitted.fit.point.parameters[fitted.setup.model.parameter(name).unwrap()];
-            let law = |part: &crate::search::MechanismTerm| {
+            let law = |part: &crate::fitted::MechanismTerm| {
                 let values: Vec<f64> = part.instance.names.iter().map(value).collect();
                 let place = part.candidate.place.equations(&search.nominal().model).join(" ");
                 (library[part.candidate.mechanism].kind.clone(), place, values)

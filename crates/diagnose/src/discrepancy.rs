@@ -1,11 +1,11 @@
-//! The non-parametric rival: [free shapes](crate::shapes), to see whether anything systematic is left.
+//! The non-parametric alternative: [free shapes](crate::shapes), to see whether anything systematic is left.
 //!
 //! They are injected like any candidate. What they explain on folds they were not fitted to is force that acts on the machine
 //! and has a shape; noise gains nothing.
 
 use std::sync::Arc;
 
-use greybox_calibrate::{Point, Segmentation, Setup, qr};
+use greybox_calibrate::{FitPoint, Point, Segmentation, Setup, qr};
 use greybox_simulate::SignalLanes;
 use rayon::prelude::*;
 
@@ -62,19 +62,21 @@ fn thinned(setup: &Setup, level: &Segmentation, point: &Point) -> (Segmentation,
 
 /// Tests a fitted model against free shapes: `scale` is one per channel, SI, `point` an optimum at `level`. `None`
 /// where no motion has a shape, or where there is too little independent data.
-pub fn test(setup: &Setup, level: &Segmentation, scale: &[f64], point: &Point) -> Option<Discrepancy> {
+pub fn test(at: FitPoint<'_>) -> Option<Discrepancy> {
+    let FitPoint { setup, level, point, .. } = at;
     let (level, point) = &thinned(setup, level, point);
-    let along = TrajectoryEval::undisturbed(setup, level, scale, point);
+    let at = FitPoint { level, point, ..at };
+    let along = TrajectoryEval::undisturbed(at);
     let Shapes { groups, forces } = Shapes::along(setup, &along, RARE)?;
     let (lanes, signals) = (forces.len(), signals(setup, &forces));
     let total: usize = level.segments.iter().map(|s| s.range.len()).sum();
     // Blocks no shorter than the residual's correlation: neighbours must not predict each other.
-    let effective_sample_ratio = least_effective_sample_ratio(setup, level, scale, point);
+    let effective_sample_ratio = least_effective_sample_ratio(at);
     if (total as f64) * effective_sample_ratio < LEAST_INDEPENDENT {
         return None; // too little independent data to call anything systematic
     }
     let block = (total / 40).max((1.0 / effective_sample_ratio).ceil() as usize).max(1);
-    let data = Folded::new(setup, level, scale, point, &signals, block)?;
+    let data = Folded::new(at, &signals, block)?;
     let np = setup.free.len();
     let parameters: Vec<usize> = (0..np).collect();
     let base = data.errors(&parameters);
@@ -115,17 +117,12 @@ pub fn test(setup: &Setup, level: &Segmentation, scale: &[f64], point: &Point) -
 
 /// Held-out errors by fold of a model without free shapes, on the folds of a [`Discrepancy`] of the same level with
 /// blocks of `block` samples.
-pub fn held_out(
-    setup: &Setup,
-    level: &Segmentation,
-    scale: &[f64],
-    point: &Point,
-    block: usize,
-) -> Option<Vec<f64>> {
+pub fn held_out(at: FitPoint<'_>, block: usize) -> Option<Vec<f64>> {
+    let FitPoint { setup, level, point, .. } = at;
     let (level, point) = &thinned(setup, level, point);
     let none: Vec<Arc<SignalLanes>> =
         setup.data.pieces.iter().map(|_| Arc::new(SignalLanes::default())).collect();
-    let data = Folded::new(setup, level, scale, point, &none, block)?;
+    let data = Folded::new(FitPoint { level, point, ..at }, &none, block)?;
     Some(data.errors(&(0..setup.free.len()).collect::<Vec<_>>()))
 }
 
@@ -140,14 +137,8 @@ struct Folded {
 
 impl Folded {
     /// Every tenth block of `block` samples is a fold; `None` where there are less than four blocks.
-    fn new(
-        setup: &Setup,
-        level: &Segmentation,
-        scale: &[f64],
-        point: &Point,
-        signals: &[Arc<SignalLanes>],
-        block: usize,
-    ) -> Option<Folded> {
+    fn new(at: FitPoint<'_>, signals: &[Arc<SignalLanes>], block: usize) -> Option<Folded> {
+        let FitPoint { setup, level, scale, point } = at;
         let (nx, ny, np) = (setup.system.nx, setup.system.ny, setup.free.len());
         let lanes = signals.first().map_or(0, |s| s.lanes);
         let width = np + lanes + 1;

@@ -27,7 +27,7 @@
 //! |s|²/c − ln |V| besides ([`Smoothness`]). A law that is right only here and there, or whose gain
 //! a slow misfit makes, has a large c, however large the gain.
 
-use greybox_calibrate::{Point, Segmentation, Setup, qr};
+use greybox_calibrate::{FitPoint, qr};
 
 use crate::screen::project;
 
@@ -83,7 +83,8 @@ impl Evidence {
 }
 
 /// κ per channel: information per sample of an autocorrelated residual.
-pub fn effective_sample_ratio(setup: &Setup, level: &Segmentation, scale: &[f64], point: &Point) -> Vec<f64> {
+pub fn effective_sample_ratio(at: FitPoint<'_>) -> Vec<f64> {
+    let FitPoint { setup, level, scale, point } = at;
     let rows = setup.with_problem(level, scale, |p| p.rows(point, false, None));
     (0..setup.system.ny)
         .map(|c| {
@@ -116,17 +117,13 @@ pub fn effective_sample_ratio(setup: &Setup, level: &Segmentation, scale: &[f64]
 }
 
 /// The smallest κ over the channels.
-pub fn least_effective_sample_ratio(
-    setup: &Setup,
-    level: &Segmentation,
-    scale: &[f64],
-    point: &Point,
-) -> f64 {
-    effective_sample_ratio(setup, level, scale, point).into_iter().fold(1.0, f64::min)
+pub fn least_effective_sample_ratio(at: FitPoint<'_>) -> f64 {
+    effective_sample_ratio(at).into_iter().fold(1.0, f64::min)
 }
 
 /// Held-out errors by fold at the optimum of a fit.
-pub fn folds(setup: &Setup, level: &Segmentation, scale: &[f64], point: &Point) -> Folds {
+pub fn folds(at: FitPoint<'_>) -> Folds {
+    let FitPoint { setup, level, scale, point } = at;
     let (nx, ny, np) = (setup.system.nx, setup.system.ny, setup.free.len());
     let rows = setup.with_problem(level, scale, |p| p.rows(point, true, None));
     let total: usize = level.segments.iter().map(|s| s.range.len()).sum();

@@ -24,16 +24,17 @@ use std::ops::Range;
 use std::sync::Arc;
 
 use greybox_calibrate::stochastic::{Filter, Fitted as Filtered, Pass, RANGE, Stochastic};
-use greybox_calibrate::{Point, Prior, Segmentation, Setup, Work, qr};
+use greybox_calibrate::{FitPoint, Point, Prior, Segmentation, Setup, Work, qr};
 use greybox_simulate::SignalLanes;
 use rayon::prelude::*;
 
 use self::beside::Beside;
 use crate::candidate::Candidate;
+use crate::fitted::{FittedModel, Law, MechanismTerm, laws};
 use crate::library::First;
+use crate::marginal::log_sum;
 use crate::screen::{CandidateResponses, Gram, Scored, first_states, lanes, scored};
-use crate::search::{FittedModel, Law, MechanismTerm, Search, carried, laws};
-use crate::shapes::log_sum;
+use crate::search::{Search, carried};
 use crate::spectra::Spectra;
 use crate::trajectory::TrajectoryEval;
 use crate::{ProgressListener, Stage};
@@ -313,8 +314,10 @@ impl<'a, 'b> Explorer<'a, 'b> {
         let setup = &at.setup;
         let (level, point) = self.level(h);
         let scale = at.errors.noise();
-        let (along, forces) = TrajectoryEval::observed(setup, &level, &scale, &point);
-        let spectra = Spectra::new(setup, &level, &scale, &point, &along, &forces);
+        let (along, forces) =
+            TrajectoryEval::observed(FitPoint { setup, level: &level, scale: &scale, point: &point });
+        let spectra =
+            Spectra::new(FitPoint { setup, level: &level, scale: &scale, point: &point }, &along, &forces);
         let lanes = lanes(setup, library, open, &along, &spectra);
         let blocks: Vec<_> = lanes.variants.iter().map(|v| v.columns.clone()).collect();
         let gram = innovations(&self.filter, at, &lanes.signals, &[], &lanes.columns, &blocks);
@@ -330,8 +333,9 @@ impl<'a, 'b> Explorer<'a, 'b> {
         let setup = &machine.at().setup;
         let (level, point) = self.level(machine);
         let scale = &setup.data.spread;
-        let (along, forces) = TrajectoryEval::observed(setup, &level, scale, &point);
-        let spectra = Spectra::new(setup, &level, scale, &point, &along, &forces);
+        let (along, forces) =
+            TrajectoryEval::observed(FitPoint { setup, level: &level, scale, point: &point });
+        let spectra = Spectra::new(FitPoint { setup, level: &level, scale, point: &point }, &along, &forces);
         let lanes = lanes(setup, self.search.library, candidates, &along, &spectra);
         let total = totals(setup, &along);
         (0..candidates.len()).map(|c| self.prior_of(c, &lanes, &total)).collect()
@@ -438,7 +442,9 @@ impl<'a, 'b> Explorer<'a, 'b> {
             Vec::new()
         } else {
             let (level, point) = self.level(h);
-            let along = TrajectoryEval::smoothed(&at.setup, &level, &at.errors.noise(), &point);
+            let noise = at.errors.noise();
+            let fitted = FitPoint { setup: &at.setup, level: &level, scale: &noise, point: &point };
+            let along = TrajectoryEval::smoothed(fitted);
             first_states(&at.setup, mechanism, candidate, &along)?
         };
         let mut laws = h.laws();
@@ -538,7 +544,10 @@ impl<'a, 'b> Explorer<'a, 'b> {
         let at = h.at();
         let (level, point) = self.level(h);
         let scale = vec![1.0; at.errors.sensor.len()];
-        self.search.is_admissible(&h.parts, &at.setup, &level, &point, &scale)
+        self.search.is_admissible(
+            &h.parts,
+            FitPoint { setup: &at.setup, level: &level, scale: &scale, point: &point },
+        )
     }
 
     /// The hypothesis without one of its laws, fitted.
@@ -961,7 +970,7 @@ mass = "m*x'' + k*x = f"
         }
     }
 
-    /// The work may run out before a law has had its rivals.
+    /// The work may run out before a law has had its alternatives.
     #[test]
     fn a_law_is_named_only_where_its_place_was_offered_to_all() {
         let setup = mass(1.9, 1.0, 41);
@@ -1023,7 +1032,12 @@ mass = "m*x'' + k*x = f"
             }
         };
         let (level, point) = explorer.level(&machine);
-        let along = TrajectoryEval::smoothed(&machine.at().setup, &level, &setup.data.spread, &point);
+        let along = TrajectoryEval::smoothed(FitPoint {
+            setup: &machine.at().setup,
+            level: &level,
+            scale: &setup.data.spread,
+            point: &point,
+        });
         let force = along.total_forces()[0];
         assert!((width("constant_offset") / force - 1.0).abs() < 0.05);
         assert!((width("coulomb_friction") / force - 1.0).abs() < 0.05);

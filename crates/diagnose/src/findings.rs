@@ -1,14 +1,14 @@
 //! The mechanisms of a diagnosis: values with intervals, confidence, alternatives, place and curve.
 
-use greybox_calibrate::Setup;
-use greybox_model::Model;
+use greybox_calibrate::{FitPoint, Setup};
+use greybox_model::{Expr, Model};
 
 use crate::diagnosis::{Alternative, Curve, Estimate, IdentifiedMechanism, Role, Site};
 use crate::evidence::Evidence;
+use crate::fitted::{AlternativeTerm, FittedModel, Found, MechanismTerm};
 use crate::library::Mechanism;
-use crate::locate::{force, locate};
+use crate::locate::{Location, force, locate};
 use crate::place::Place;
-use crate::search::{FittedModel, Found, Rival};
 use crate::trajectory::TrajectoryEval;
 use crate::twins::{Twin, twins};
 use crate::uncertainty::Uncertainty;
@@ -41,8 +41,8 @@ fn figure(
     improved: &FittedModel,
     uncertainty: &Uncertainty,
     mechanism: &Mechanism,
-    part: &crate::search::MechanismTerm,
-    e: &greybox_model::Expr,
+    part: &MechanismTerm,
+    e: &Expr,
 ) -> Option<Estimate> {
     let model = &improved.setup.model;
     let own: Vec<(&str, usize)> = mechanism
@@ -68,157 +68,155 @@ fn figure(
     Some(Estimate { value: v, ci95: Some((v - w, v + w)) })
 }
 
+/// The mechanisms of an improved model: `shares` of the residual that each explains, free runs of the training recordings.
 pub(crate) fn findings(
-    improved: &FittedModel,
+    (improved, scale): (&FittedModel, &[f64]),
     found: &Found,
     nominal: &Model,
     library: &[Mechanism],
-    scale: &[f64],
     shares: &[f64],
     train: &Role,
     uncertainty: &Uncertainty,
 ) -> Vec<IdentifiedMechanism> {
     let widths = uncertainty.widths();
+    let parameters = &improved.fit.point.parameters;
     let mut setup = improved.setup.clone();
-    for (p, v) in setup.model.parameters.iter_mut().zip(&improved.fit.point.parameters) {
-        p.value = *v;
-    }
-    let along = TrajectoryEval::simulated(&setup, &train.improved.run.x, &improved.fit.point.parameters);
-    let smoothed_states = TrajectoryEval::smoothed(&setup, &improved.level, scale, &improved.fit.point);
-    improved
-        .parts
-        .iter()
-        .enumerate()
-        .map(|(i, part)| {
-            let mechanism = &library[part.candidate.mechanism];
-            let accepted = found.accepted.iter().find(|a| a.candidate == part.candidate);
-            let evidence = accepted.map_or(Evidence::NONE, |a| a.evidence);
-            // Posterior weights of the explanations tried; equivalent ones share their weight.
-            let rivals = accepted.map_or(&[][..], |a| &a.rivals[..]);
-            let weight = |score: f64| (0.5 * (score - evidence.score)).clamp(-60.0, 0.0).exp();
-            // A wider law at the same place does not speak against a special case of it.
-            let wider = |r: &&Rival| {
-                let kind = &library[r.candidate.mechanism].kind;
-                r.candidate.place == part.candidate.place && mechanism.wider().any(|k| k == kind)
-            };
-            let against = rivals.iter().filter(|r| !r.equivalent && !wider(r));
-            let others: f64 = against.map(|r| weight(r.evidence.score)).sum();
-            let nothing = weight(0.0);
-            let confidence = (1.0 / (1.0 + others + nothing)).clamp(0.01, 0.99);
-            let mut alternatives: Vec<Alternative> = rivals
-                .iter()
-                .map(|r| {
-                    let m = &library[r.candidate.mechanism];
-                    let probability = if r.equivalent {
-                        confidence
-                    } else {
-                        (weight(r.evidence.score) / (1.0 + others + nothing)).clamp(0.0, 0.99)
-                    };
-                    let place = &r.candidate.place;
-                    Alternative {
-                        kind: m.kind.clone(),
-                        confidence: probability,
-                        equivalent: r.equivalent,
-                        expression: r.instance.expression.to_string(),
-                        separate: m.separate(place.moves(nominal)).to_string(),
-                        excitation: m.excitation.clone(),
-                        site: Site::of(std::slice::from_ref(place), nominal),
-                    }
-                })
-                .filter(|a| a.equivalent || a.confidence > 0.001)
-                .collect();
-            let site = Site::of(std::slice::from_ref(&part.candidate.place), nominal);
-            let moves = part.candidate.place.moves(nominal);
-            declare_twins(
-                &mut alternatives,
-                twins(&setup.model, nominal, library, &part.candidate),
-                |twin| {
-                    let m = &library[twin.mechanism];
-                    let moves = twin.places.iter().any(|place| place.moves(nominal));
-                    Alternative {
-                        kind: m.kind.clone(),
-                        confidence,
-                        equivalent: true,
-                        expression: String::new(),
-                        separate: m.separate(moves).to_string(),
-                        excitation: m.excitation.clone(),
-                        site: Site::of(&twin.places, nominal),
-                    }
+    setup.model.parameters.iter_mut().zip(parameters).for_each(|(p, v)| p.value = *v);
+    let along = TrajectoryEval::simulated(&setup, &train.improved.run.x, parameters);
+    let smoothed_states = TrajectoryEval::smoothed(FitPoint { setup: &setup, ..improved.at(scale) });
+    let finding = |(part, share): (&MechanismTerm, &f64)| {
+        let MechanismTerm { candidate, instance, .. } = part;
+        let mechanism = &library[candidate.mechanism];
+        let accepted = found.accepted.iter().find(|a| a.candidate == *candidate);
+        let evidence = accepted.map_or(Evidence::NONE, |a| a.evidence);
+        let tried = accepted.map_or(&[][..], |a| &a.alternatives[..]);
+        let Beside { confidence, alternatives, equations } =
+            Beside::of(part, evidence, tried, (&setup.model, nominal), library);
+        let estimate = |name: &String| {
+            let index = setup.model.parameter(name)?;
+            let value = parameters[index];
+            let width = setup.free.iter().position(|f| f.index == index).map(|i| widths[i]);
+            Some((name.clone(), index, Estimate { value, ci95: width.map(|w| (value - w, value + w)) }))
+        };
+        let figure_of = |name: &String, e: &Expr| {
+            Some((name.clone(), figure(improved, uncertainty, mechanism, part, e)?))
+        };
+        let state = |name: &String| {
+            let equation = setup.model.equations.iter().find(|e| e.name == *name)?;
+            Some((name.clone(), format!("{} = {}", equation.lhs, equation.rhs)))
+        };
+        let site = Site::of(std::slice::from_ref(&candidate.place), nominal);
+        IdentifiedMechanism {
+            kind: mechanism.kind.clone(),
+            family: mechanism.family.clone(),
+            signature: mechanism.about.signature.clone(),
+            excitation: mechanism.excitation.clone(),
+            equations,
+            channel: site.channels.first().cloned(),
+            input: site.input,
+            drifting: site.drifting,
+            expression: instance.expression.to_string(),
+            states: instance.states.iter().filter_map(state).collect(),
+            parameters: instance.names.iter().filter_map(estimate).collect(),
+            figures: mechanism.report.iter().filter_map(|(name, e)| figure_of(name, e)).collect(),
+            share_explained: *share,
+            confidence,
+            alternatives,
+            location: Location { equations: site.equations, ..locate(&setup, &along, mechanism, instance) },
+            evidence,
+            curve: curve(&setup, &smoothed_states, mechanism, instance, &candidate.place),
+        }
+    };
+    improved.parts.iter().zip(shares).map(finding).collect()
+}
+
+/// A mechanism beside the others that explain the same.
+struct Beside {
+    /// Its probability.
+    confidence: f64,
+    alternatives: Vec<Alternative>,
+    /// The equations that it enters; where the data cannot tell at which of several places it acts, all of them.
+    equations: Vec<String>,
+}
+
+impl Beside {
+    /// Of a part of a model, with what was `tried` in its place, and their evidence.
+    fn of(
+        part: &MechanismTerm,
+        evidence: Evidence,
+        tried: &[AlternativeTerm],
+        (model, nominal): (&Model, &Model),
+        library: &[Mechanism],
+    ) -> Beside {
+        let MechanismTerm { candidate, instance, .. } = part;
+        let mechanism = &library[candidate.mechanism];
+        // Posterior weights of the explanations tried; equivalent ones share their weight.
+        let weight = |score: f64| (0.5 * (score - evidence.score)).clamp(-60.0, 0.0).exp();
+        // A wider law at the same place does not speak against a special case of it.
+        let wider = |r: &&AlternativeTerm| {
+            let kind = &library[r.candidate.mechanism].kind;
+            r.candidate.place == candidate.place && mechanism.wider().any(|k| k == kind)
+        };
+        let against = tried.iter().filter(|r| !r.equivalent && !wider(r));
+        let others: f64 = against.map(|r| weight(r.evidence.score)).sum();
+        let all = 1.0 + others + weight(0.0);
+        let confidence = (1.0 / all).clamp(0.01, 0.99);
+        let alternative = |r: &AlternativeTerm| {
+            let m = &library[r.candidate.mechanism];
+            let place = &r.candidate.place;
+            Alternative {
+                kind: m.kind.clone(),
+                confidence: match r.equivalent {
+                    true => confidence,
+                    false => (weight(r.evidence.score) / all).clamp(0.0, 0.99),
                 },
-            );
-            for kind in mechanism.wider() {
-                alternatives.retain(|a| a.kind != kind);
-                let wider = library.iter().find(|m| m.kind == kind);
-                alternatives.push(Alternative {
-                    kind: kind.to_string(),
-                    confidence,
-                    equivalent: true,
-                    expression: part.instance.expression.to_string(),
-                    separate: wider.map_or(String::new(), |m| m.separate(moves).to_string()),
-                    excitation: wider.and_then(|m| m.excitation.clone()),
-                    site: site.clone(),
-                });
+                equivalent: r.equivalent,
+                expression: r.instance.expression.to_string(),
+                separate: m.separate(place.moves(nominal)).to_string(),
+                excitation: m.excitation.clone(),
+                site: Site::of(std::slice::from_ref(place), nominal),
             }
-            let alternatives = distinct(alternatives, &mechanism.kind, &site);
-            let parameters = part
-                .instance
-                .names
-                .iter()
-                .filter_map(|name| {
-                    let index = setup.model.parameter(name)?;
-                    let value = improved.fit.point.parameters[index];
-                    let width = setup.free.iter().position(|f| f.index == index).map(|i| widths[i]);
-                    let estimate = Estimate { value, ci95: width.map(|w| (value - w, value + w)) };
-                    Some((name.clone(), index, estimate))
-                })
-                .collect();
-            let figures = mechanism
-                .report
-                .iter()
-                .filter_map(|(name, e)| {
-                    Some((name.clone(), figure(improved, uncertainty, mechanism, part, e)?))
-                })
-                .collect();
-            let state = |name: &String| {
-                let equation = setup.model.equations.iter().find(|e| e.name == *name)?;
-                Some((name.clone(), format!("{} = {}", equation.lhs, equation.rhs)))
-            };
-            // Where the data cannot tell at which of several places it acts, all are named.
-            let mut places = site.equations.clone();
-            for rival in rivals.iter().filter(|r| r.equivalent) {
-                if library[rival.candidate.mechanism].kind == mechanism.kind {
-                    for name in rival.candidate.place.equations(nominal) {
-                        if !places.contains(&name) {
-                            places.push(name);
-                        }
-                    }
-                }
-            }
-            IdentifiedMechanism {
-                kind: mechanism.kind.clone(),
-                family: mechanism.family.clone(),
-                signature: mechanism.about.signature.clone(),
-                excitation: mechanism.excitation.clone(),
-                equations: places,
-                channel: site.channels.first().cloned(),
-                input: site.input.clone(),
-                drifting: site.drifting.clone(),
-                figures,
-                expression: part.instance.expression.to_string(),
-                states: part.instance.states.iter().filter_map(state).collect(),
-                parameters,
-                share_explained: shares[i],
+        };
+        let mut alternatives: Vec<Alternative> =
+            tried.iter().map(alternative).filter(|a| a.equivalent || a.confidence > 0.001).collect();
+        declare_twins(&mut alternatives, twins(model, nominal, library, candidate), |twin| {
+            let m = &library[twin.mechanism];
+            let moves = twin.places.iter().any(|place| place.moves(nominal));
+            Alternative {
+                kind: m.kind.clone(),
                 confidence,
-                alternatives,
-                location: crate::locate::Location {
-                    equations: site.equations,
-                    ..locate(&setup, &along, mechanism, &part.instance)
-                },
-                evidence,
-                curve: curve(&setup, &smoothed_states, mechanism, &part.instance, &part.candidate.place),
+                equivalent: true,
+                expression: String::new(),
+                separate: m.separate(moves).to_string(),
+                excitation: m.excitation.clone(),
+                site: Site::of(&twin.places, nominal),
             }
-        })
-        .collect()
+        });
+        let site = Site::of(std::slice::from_ref(&candidate.place), nominal);
+        let moves = candidate.place.moves(nominal);
+        for kind in mechanism.wider() {
+            alternatives.retain(|a| a.kind != kind);
+            let wider = library.iter().find(|m| m.kind == kind);
+            alternatives.push(Alternative {
+                kind: kind.to_string(),
+                confidence,
+                equivalent: true,
+                expression: instance.expression.to_string(),
+                separate: wider.map_or(String::new(), |m| m.separate(moves).to_string()),
+                excitation: wider.and_then(|m| m.excitation.clone()),
+                site: site.clone(),
+            });
+        }
+        let mut equations = site.equations.clone();
+        let same =
+            tried.iter().filter(|r| r.equivalent && library[r.candidate.mechanism].kind == mechanism.kind);
+        for name in same.flat_map(|r| r.candidate.place.equations(nominal)) {
+            if !equations.contains(&name) {
+                equations.push(name);
+            }
+        }
+        Beside { confidence, alternatives: distinct(alternatives, &mechanism.kind, &site), equations }
+    }
 }
 
 /// Algebraic twins that no recording of this kind can tell apart are declared even where they were not tried.

@@ -3,9 +3,10 @@
 use rayon::prelude::*;
 
 use crate::baseline::{Baseline, Judge, WholeRecordFit, leaves_noise, polish, residual_scale};
+use crate::fitted::{FittedModel, Found};
 use crate::plausibility::Deviation;
 use crate::proposal::Gate;
-use crate::search::{FittedModel, Found, Search};
+use crate::search::Search;
 use crate::uncertainty::Uncertainty;
 use crate::validate::Gain;
 
@@ -132,7 +133,7 @@ impl<'a> Gates<'a> {
         if self.judge.criterion.misfit(&scores).total_cmp(&self.baseline.misfit).is_gt() {
             return Failure::at(Gate::Training, Vec::new());
         }
-        if search.has_negative_inertia(&fitted.setup, &fitted.level, &fitted.fit.point, scale) {
+        if search.has_negative_inertia(fitted.at(scale)) {
             return Failure::at(Gate::Inertia, Vec::new());
         }
         if self.stated.is_some_and(|stated| search.deviation(fitted).is_implausible_beside(stated)) {

@@ -3,7 +3,8 @@
 use rayon::prelude::*;
 
 use crate::diagnosis::Subset;
-use crate::search::{FittedModel, Search};
+use crate::fitted::FittedModel;
+use crate::search::Search;
 
 /// Residual sum of squares with each part alone, refitted; `without` is that without each part, `base` that without all.
 pub(crate) fn rss_alone(

@@ -24,7 +24,7 @@
 //! high = "2*vs"
 //! [report]                       # further figures that users expect
 //! breakaway = "fc/s0"
-//! [experiment]                   # optional: how to drive the machine, to tell the law from its rivals
+//! [experiment]                   # optional: how to drive the machine, to tell the law from its alternatives
 //! drive = "beyond"               # slow, wide, loud, silent, again; around, ramp and beyond have `at`
 //! at = "2*fc"                    # a frequency in Hz (around), or a magnitude of the input
 //! [about]
@@ -338,7 +338,7 @@ pub struct Region {
     pub high: Option<Expr>,
 }
 
-/// How to drive the machine so that a recording tells a mechanism from its rivals (`[experiment]` in its file): with formulas of
+/// How to drive the machine so that a recording tells a mechanism from its alternatives (`[experiment]` in its file): with formulas of
 /// its parameters and of the figures of its report, or with numbers.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub enum Excitation<T = Expr> {
@@ -466,7 +466,7 @@ pub struct Mechanism {
     /// Kinds of other physics whose law is this one at some values of their parameters, in the same form: they are
     /// equivalent alternatives wherever this one is found.
     pub special_case: Vec<(String, String, Expr)>,
-    /// The excitation that tells it from its rivals, if one is stated.
+    /// The excitation that tells it from its alternatives, if one is stated.
     pub excitation: Option<Excitation>,
     /// Prose.
     pub about: About,

@@ -9,9 +9,10 @@
 use greybox_calibrate::Data;
 use greybox_model::Expr;
 
+use crate::fitted::{FittedModel, MechanismTerm};
 use crate::library::Mechanism;
 use crate::locate::{extent, time_of};
-use crate::search::{FittedModel, MechanismTerm, Search};
+use crate::search::Search;
 use crate::trajectory::TrajectoryEval;
 use crate::uncertainty::Uncertainty;
 use crate::validate;

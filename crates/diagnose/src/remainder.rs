@@ -3,10 +3,10 @@
 use crate::candidate::Candidate;
 use crate::diagnosis::Remainder;
 use crate::discrepancy::Discrepancy;
+use crate::fitted::{FittedModel, MechanismTerm};
 use crate::library::Mechanism;
 use crate::locate::Location;
 use crate::place::{Motion, Place};
-use crate::search::{FittedModel, MechanismTerm};
 use crate::shapes::Variable;
 
 /// What the forces of a model's parts depend on, where that is one motion.

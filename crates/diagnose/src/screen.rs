@@ -24,12 +24,12 @@ pub use response::{
 
 use std::ops::Range;
 
-use greybox_calibrate::{Point, Segmentation, Setup, qr};
+use greybox_calibrate::{FitPoint, qr};
 use rayon::prelude::*;
 
 use crate::candidate::Candidate;
 use crate::library::Mechanism;
-use crate::shapes::evidence;
+use crate::marginal::log_marginal;
 use crate::spectra::Spectra;
 use crate::trajectory::TrajectoryEval;
 
@@ -75,46 +75,34 @@ pub struct Together {
 const PAIR_GAIN: f64 = 0.05;
 
 /// The columns of all candidates around a fit.
-fn lanes_at(
-    setup: &Setup,
-    library: &[Mechanism],
-    candidates: &[Candidate],
-    level: &Segmentation,
-    scale: &[f64],
-    point: &Point,
-) -> CandidateResponses {
-    let (along, forces) = TrajectoryEval::observed(setup, level, scale, point);
-    let spectra = Spectra::new(setup, level, scale, point, &along, &forces);
+fn lanes_at(at: FitPoint<'_>, library: &[Mechanism], candidates: &[Candidate]) -> CandidateResponses {
+    let FitPoint { setup, .. } = at;
+    let (along, forces) = TrajectoryEval::observed(at);
+    let spectra = Spectra::new(at, &along, &forces);
     lanes(setup, library, candidates, &along, &spectra)
 }
 
 /// The same with the products of each variant's own responses.
 fn variants_at(
-    setup: &Setup,
+    at: FitPoint<'_>,
     library: &[Mechanism],
     candidates: &[Candidate],
-    level: &Segmentation,
-    scale: &[f64],
-    point: &Point,
 ) -> (CandidateResponses, Gram) {
-    let lanes = lanes_at(setup, library, candidates, level, scale, point);
+    let lanes = lanes_at(at, library, candidates);
     let blocks: Vec<Range<usize>> = lanes.variants.iter().map(|v| v.columns.clone()).collect();
-    let gram = gram(setup, level, scale, point, &lanes.signals, &lanes.columns, blocks);
+    let gram = gram(at, &lanes.signals, &lanes.columns, blocks);
     (lanes, gram)
 }
 
 /// The same with the products of all responses with each other.
 fn responses(
-    setup: &Setup,
+    at: FitPoint<'_>,
     library: &[Mechanism],
     candidates: &[Candidate],
-    level: &Segmentation,
-    scale: &[f64],
-    point: &Point,
 ) -> (CandidateResponses, Gram) {
-    let lanes = lanes_at(setup, library, candidates, level, scale, point);
+    let lanes = lanes_at(at, library, candidates);
     let whole = 0..lanes.columns.len();
-    let gram = gram(setup, level, scale, point, &lanes.signals, &lanes.columns, vec![whole]);
+    let gram = gram(at, &lanes.signals, &lanes.columns, vec![whole]);
     (lanes, gram)
 }
 
@@ -138,15 +126,8 @@ struct Regressions<'a> {
 }
 
 impl<'a> Regressions<'a> {
-    fn new(
-        setup: &Setup,
-        library: &'a [Mechanism],
-        candidates: &'a [Candidate],
-        level: &Segmentation,
-        scale: &[f64],
-        point: &Point,
-    ) -> Regressions<'a> {
-        let (lanes, gram) = responses(setup, library, candidates, level, scale, point);
+    fn new(at: FitPoint<'_>, library: &'a [Mechanism], candidates: &'a [Candidate]) -> Regressions<'a> {
+        let (lanes, gram) = responses(at, library, candidates);
         Regressions::of(library, candidates, lanes, &gram)
     }
 
@@ -238,15 +219,12 @@ impl<'a> Regressions<'a> {
 /// With the parameters projected out, every pair is a regression on two to four columns of one common
 /// Gram matrix: all of them cost less than the fit of a single one.
 pub fn screen_pairs(
-    setup: &Setup,
+    at: FitPoint<'_>,
     library: &[Mechanism],
     candidates: &[Candidate],
-    level: &Segmentation,
-    scale: &[f64],
-    point: &Point,
     most: usize,
 ) -> Vec<Together> {
-    let all = Regressions::new(setup, library, candidates, level, scale, point);
+    let all = Regressions::new(at, library, candidates);
     let variants = &all.lanes.variants;
     let usable: Vec<(usize, Vec<usize>, Vec<bool>, f64)> = variants
         .iter()
@@ -294,15 +272,12 @@ pub fn screen_pairs(
 /// together: orthogonal matching pursuit (Pati, Rezaiifar and Krishnaprasad, Asilomar 1993) on the Gram matrix of all
 /// responses, the parameters refitted to first order. `None` where nothing explains anything.
 pub fn screen_set(
-    setup: &Setup,
+    at: FitPoint<'_>,
     library: &[Mechanism],
     candidates: &[Candidate],
-    level: &Segmentation,
-    scale: &[f64],
-    point: &Point,
     most: usize,
 ) -> Option<Together> {
-    let all = Regressions::new(setup, library, candidates, level, scale, point);
+    let all = Regressions::new(at, library, candidates);
     let variants = &all.lanes.variants;
     let columns = |chosen: &[usize]| -> (Vec<usize>, Vec<bool>) {
         let of = || chosen.iter().map(|&v| &variants[v]);
@@ -334,15 +309,12 @@ const WIDTHS: i32 = 30;
 /// The laws of free shape that make the residual likelier, the likeliest first: each with the size of the largest marginal
 /// likelihood ([`evidence`], every square worth `weight`), and the likeliest function of that size.
 pub(crate) fn screen_shapes(
-    setup: &Setup,
+    at: FitPoint<'_>,
     library: &[Mechanism],
     candidates: &[Candidate],
-    level: &Segmentation,
-    scale: &[f64],
-    point: &Point,
     weight: f64,
 ) -> Vec<Together> {
-    let (lanes, gram) = variants_at(setup, library, candidates, level, scale, point);
+    let (lanes, gram) = variants_at(at, library, candidates);
     let sized = |index: usize| {
         let Projection { gg, gr, columns, base } = gram.projection(index);
         let n = gr.len();
@@ -354,7 +326,7 @@ pub(crate) fn screen_shapes(
         // From where the best known of them is just known.
         let least = 1.0 / (weight * strongest).sqrt();
         let tried = (0..WIDTHS).map(|i| least * 2f64.powi(i));
-        let tried = tried.map(|width| (evidence(&root, &gg, &gr, weight, width), width));
+        let tried = tried.map(|width| (log_marginal(&root, &gg, &gr, weight, width), width));
         let (evidence, width) = tried.filter(|t| t.0.is_finite()).max_by(|a, b| a.0.total_cmp(&b.0))?;
         let mut precision: Vec<f64> = gg.iter().map(|v| weight * v).collect();
         (0..n).for_each(|i| precision[i * n + i] += 1.0 / (width * width));
@@ -413,12 +385,9 @@ pub(crate) struct Held {
 /// Regression*, 2002, §3.6). First order is good here because the forces of either choice add up to about the same.
 /// `None` where what is held costs least, or one of its terms has no column of its own.
 pub(crate) fn reselect(
-    setup: &Setup,
+    at: FitPoint<'_>,
     library: &[Mechanism],
     candidates: &[Candidate],
-    level: &Segmentation,
-    scale: &[f64],
-    point: &Point,
     held: &[Held],
     price: &(dyn Fn(&Candidate) -> f64 + Sync),
 ) -> Option<Together> {
@@ -427,7 +396,7 @@ pub(crate) fn reselect(
         coefficients: Vec<f64>,
         gain: f64,
     }
-    let (lanes, gram) = responses(setup, library, candidates, level, scale, point);
+    let (lanes, gram) = responses(at, library, candidates);
     let single = |candidate: usize| {
         lanes
             .variants
@@ -475,27 +444,14 @@ pub(crate) fn reselect(
 }
 
 /// First-order shift of the other free parameters when those at these positions go to zero from `values`.
-pub fn shift_without(
-    setup: &Setup,
-    level: &Segmentation,
-    scale: &[f64],
-    point: &Point,
-    gone: &[(usize, f64)],
-) -> Vec<f64> {
-    let gram = gram(setup, level, scale, point, &[], &[], Vec::new()).without(gone);
+pub fn shift_without(at: FitPoint<'_>, gone: &[(usize, f64)]) -> Vec<f64> {
+    let gram = gram(at, &[], &[], Vec::new()).without(gone);
     gram.solve(&gram.jr)
 }
 
 /// Scores every candidate at the point of a fit, best first.
-pub fn screen(
-    setup: &Setup,
-    library: &[Mechanism],
-    candidates: &[Candidate],
-    level: &Segmentation,
-    scale: &[f64],
-    point: &Point,
-) -> Vec<Scored> {
-    let (lanes, gram) = variants_at(setup, library, candidates, level, scale, point);
+pub fn screen(at: FitPoint<'_>, library: &[Mechanism], candidates: &[Candidate]) -> Vec<Scored> {
+    let (lanes, gram) = variants_at(at, library, candidates);
     scored(library, candidates, &lanes, &gram)
 }
 

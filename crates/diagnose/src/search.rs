@@ -13,13 +13,12 @@ use fit::is_drift;
 use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, Ordering};
 
-use greybox_calibrate::{Fit, Limits, Point, Segmentation, Setup};
-use greybox_model::{Hold, Model};
+use greybox_calibrate::{Limits, Point, Segmentation, Setup};
 use rayon::prelude::*;
 
-use crate::candidate::{Candidate, Instance, candidates};
-use crate::evidence::{Evidence, least_effective_sample_ratio};
-use crate::explore::{Belief, Explorer, Hypothesis, Posterior};
+use crate::candidate::{Candidate, candidates};
+use crate::evidence::least_effective_sample_ratio;
+use crate::fitted::{FittedModel, Found, STUCK, SelectedTerm, next_scale};
 use crate::library::Mechanism;
 use crate::place::{Place, places};
 use crate::plausibility::Deviation;
@@ -54,12 +53,8 @@ const MORE: usize = 5;
 const PAIRS: usize = 4;
 /// Fewest samples by which a pair is believed: there are many pairs.
 const PAIR_SAMPLES: usize = 500;
-/// Residual over noise from which a fit may be stuck.
-const STUCK: f64 = 1.2;
 /// Fall of the cost from which another hold of an input is considered once more is known of the machine.
 pub(crate) const SAME_HOLD: f64 = 0.002;
-/// Information per sample from which a residual counts as white.
-pub(crate) const WHITE: f64 = 0.8;
 /// Residual over noise from which a model is far from the noise.
 const FAR: f64 = 2.0;
 /// Ratio of sums of squares at which a whitened estimate simulates no longer what it is fitted to.
@@ -87,120 +82,6 @@ const BEYOND_WINDOWS: f64 = 2.0;
 const PARSIMONY: f64 = 4.0;
 /// Least share of the calibrated model's misfit that a second or later mechanism must explain.
 const LEAST_SHARE: f64 = 7e-4;
-
-/// A mechanism in a model, with the sizes its inner parameters are searched at.
-#[derive(Debug, Clone, PartialEq)]
-pub struct MechanismTerm {
-    /// What and where.
-    pub candidate: Candidate,
-    /// As it stands in the model.
-    pub instance: Instance,
-    /// Sizes of the inner parameters.
-    pub scales: Vec<f64>,
-}
-
-/// A law at a place, the values of its parameters, and the sizes of the inner ones.
-pub(crate) type Law = (Candidate, Vec<f64>, Vec<f64>);
-
-/// Whether two models have the same parts, in whatever order.
-pub(crate) fn is_same(a: &[Candidate], b: &[Candidate]) -> bool {
-    a.len() == b.len() && a.iter().all(|c| b.contains(c))
-}
-
-/// The laws of a model with the values that its parameters give them.
-pub(crate) fn laws(parts: &[MechanismTerm], model: &Model, parameters: &[f64]) -> Vec<Law> {
-    let value = |name: &String| model.parameter(name).map(|i| parameters[i]);
-    let law = |part: &MechanismTerm| {
-        let values = part.instance.names.iter().filter_map(value).collect();
-        (part.candidate.clone(), values, part.scales.clone())
-    };
-    parts.iter().map(law).collect()
-}
-
-/// A model fitted at a level.
-#[derive(Debug, Clone)]
-pub struct FittedModel {
-    /// Model, data, free parameters.
-    pub setup: Setup,
-    /// Mechanisms beyond the nominal equations.
-    pub parts: Vec<MechanismTerm>,
-    /// The segments.
-    pub level: Segmentation,
-    /// The fit; its `rss` is in units of the scale it was fitted with.
-    pub fit: Fit,
-}
-
-impl FittedModel {
-    /// Residual sum of squares over all channels, in units of the fit's scale.
-    pub(crate) fn rss(&self) -> f64 {
-        self.fit.rss.iter().sum()
-    }
-
-    /// Largest residual RMS over the noise.
-    pub fn misfit(&self, scale: &[f64]) -> f64 {
-        rms(&self.fit, scale).iter().zip(&self.setup.data.sigma).map(|(r, s)| r / s).fold(0.0, f64::max)
-    }
-
-    /// Whether a residual with this ratio of independent samples is white, and no larger than the noise.
-    fn is_white(&self, effective_sample_ratio: f64, scale: &[f64]) -> bool {
-        effective_sample_ratio > WHITE && self.misfit(scale) < STUCK
-    }
-
-    /// Whether nothing is left over but white noise, for which no noise model had to stand in.
-    pub fn leaves_white_noise(&self, scale: &[f64]) -> bool {
-        self.setup.noise.is_none()
-            && self.is_white(
-                least_effective_sample_ratio(&self.setup, &self.level, scale, &self.fit.point),
-                scale,
-            )
-    }
-}
-
-/// What was tried beside an accepted mechanism.
-#[derive(Debug, Clone)]
-pub struct Rival {
-    /// What and where.
-    pub candidate: Candidate,
-    /// As it would stand in the model.
-    pub instance: Instance,
-    /// Its evidence.
-    pub evidence: Evidence,
-    /// The data cannot separate it from the accepted one.
-    pub equivalent: bool,
-}
-
-/// An accepted mechanism with the evidence for it.
-#[derive(Debug, Clone)]
-pub struct SelectedTerm {
-    /// What and where.
-    pub candidate: Candidate,
-    /// Evidence when it was accepted.
-    pub evidence: Evidence,
-    /// The others of that round.
-    pub rivals: Vec<Rival>,
-}
-
-/// Result of the search.
-pub struct Found {
-    /// The nominal equations with fitted parameters, at the last level.
-    pub calibrated: FittedModel,
-    /// With the mechanisms.
-    pub improved: FittedModel,
-    /// Evidence for each part of `improved`, in the same order.
-    pub accepted: Vec<SelectedTerm>,
-    /// Holds that explain the recording better than the stated ones: (input, stated, better).
-    pub better_holds: Vec<(usize, Hold, Hold)>,
-    /// Residual scale of the improved model per channel, SI.
-    pub scale: Vec<f64>,
-    /// The work ran out before the search had come to its end.
-    pub limited: bool,
-    /// With the best single candidate, and the best pair, of the last round that found nothing to be believed.
-    pub rejected: Vec<FittedModel>,
-    /// The mechanisms are believed beside an error of the model, by their posterior probability.
-    pub errs: bool,
-    /// The improved model is a closure: a sum of terms that is proposed as a whole.
-    pub closed: bool,
-}
 
 /// The search with everything it needs.
 pub struct Search<'a> {
@@ -264,20 +145,6 @@ pub(crate) fn limits(iterations: usize) -> Limits {
 pub(crate) fn same_level(setup: &Setup, level: &Segmentation) -> Segmentation {
     let priors = level.segments.iter().map(|s| setup.start_prior(s.piece, s.range.start)).collect();
     Segmentation { segments: level.segments.clone(), priors }
-}
-
-/// Residual RMS per channel in SI.
-pub fn rms(fit: &Fit, scale: &[f64]) -> Vec<f64> {
-    rms_of(&fit.rss, &fit.count, scale)
-}
-
-fn rms_of(rss: &[f64], count: &[usize], scale: &[f64]) -> Vec<f64> {
-    rss.iter().zip(count).zip(scale).map(|((r, n), s)| s * (r / (*n).max(1) as f64).sqrt()).collect()
-}
-
-/// The scale for the next comparison: the model's own residual, never below 0.7 of the noise.
-pub fn next_scale(fit: &Fit, scale: &[f64], sigma: &[f64]) -> Vec<f64> {
-    rms(fit, scale).iter().zip(sigma).map(|(r, s)| r.max(0.7 * s)).collect()
 }
 
 impl<'a> Search<'a> {
@@ -442,59 +309,6 @@ impl<'a> Search<'a> {
             errs: false,
             closed: false,
         }
-    }
-
-    /// Explores what the machine lacks where every model of it errs, from what this search found.
-    pub(crate) fn explore(&self, found: &Found) -> Option<Posterior> {
-        let calibrated = &found.calibrated;
-        Explorer::new(self, &calibrated.setup).explore(&calibrated.fit.point.parameters, &[&found.improved])
-    }
-
-    /// A hypothesis fitted to the segments of what this search found, in its place.
-    pub(crate) fn adopt(&self, found: &Found, h: &Hypothesis, beliefs: &[Belief]) -> Option<Found> {
-        let at = &h.fitted.at;
-        let n0 = self.nominal.model.parameters.len();
-        let laws = laws(&h.parts, &at.setup.model, &at.parameters);
-        let (setup, parts) = self.assemble(&at.setup.holds, &at.parameters[..n0], &laws, &at.setup).ok()?;
-        let setup = Setup { noise: None, work: self.nominal.work.clone(), ..setup };
-        let level = same_level(&setup, &found.calibrated.level);
-        let starts = setup.starts(&level, &at.parameters);
-        let point = Point { parameters: at.parameters.clone(), starts };
-        let fit = setup.fit(&level, &found.scale, &[point], limits(15));
-        if !fit.cost.is_finite() {
-            return None;
-        }
-        let mut improved = FittedModel { setup, parts, level, fit };
-        let scale = next_scale(&improved.fit, &found.scale, &self.nominal.data.sigma);
-        self.method(&mut improved, &scale);
-        improved = self.refit(&improved, &scale, 10);
-        let score = |gain: f64| Evidence { score: 2.0 * gain, ..Evidence::NONE };
-        let accepted = improved.parts.iter().zip(beliefs).map(|(part, belief)| SelectedTerm {
-            candidate: part.candidate.clone(),
-            evidence: score(belief.gain),
-            rivals: belief
-                .others
-                .iter()
-                .map(|other| Rival {
-                    candidate: other.part.candidate.clone(),
-                    instance: other.part.instance.clone(),
-                    evidence: score(belief.gain + (other.probability / belief.probability).ln()),
-                    equivalent: other.equivalent,
-                })
-                .collect(),
-        });
-        let accepted = accepted.collect();
-        Some(Found {
-            calibrated: found.calibrated.clone(),
-            improved,
-            accepted,
-            better_holds: found.better_holds.clone(),
-            scale,
-            limited: found.limited,
-            rejected: Vec::new(),
-            errs: true,
-            closed: false,
-        })
     }
 
     /// Goes on with whole pieces where something is left over that is not noise: what acts slowly is hardly seen on a
@@ -682,7 +496,7 @@ impl<'a> Search<'a> {
 
     fn is_coloured(&self, state: &SearchState, below: f64) -> bool {
         let f = &state.current;
-        least_effective_sample_ratio(&f.setup, &f.level, &state.scale, &f.fit.point) < below
+        least_effective_sample_ratio(f.at(&state.scale)) < below
     }
 
     /// The second pass: the noise has a model of its own (an autoregression per channel), residuals,
@@ -794,6 +608,7 @@ impl SearchState {
 mod tests {
     use super::*;
     use greybox_calibrate::{Data, FreeParameter, free_parameters};
+    use greybox_model::Model;
     use greybox_recording::{Channel, Recording};
 
     /// Two carts of 1 and 2 kg, each on its spring, that swing freely: x = cos 2t and cos 3t.
@@ -852,8 +667,7 @@ second = "m2*x2'' + k2*x2 = 0"
             let inertia =
                 |m: &Mechanism| m.kind == "coupling" && m.linear == ["mc"] && m.reaction.is_some() == both;
             let fitted = with(&search, inertia, mc);
-            let negative =
-                search.has_negative_inertia(&fitted.setup, &fitted.level, &fitted.fit.point, &scale);
+            let negative = search.has_negative_inertia(fitted.at(&scale));
             assert_eq!(search.admissible(&fitted, &scale), !negative);
             negative
         };

@@ -8,7 +8,7 @@
 
 use std::sync::Mutex;
 
-use greybox_calibrate::{Point, Segmentation, Setup, qr};
+use greybox_calibrate::{FitPoint, Point, Segmentation, Setup, qr};
 use greybox_model::Expr;
 
 use crate::candidate::Candidate;
@@ -61,14 +61,8 @@ struct Wanted {
 
 impl<'a> Spectra<'a> {
     /// For the model of `setup` at `point`.
-    pub fn new(
-        setup: &'a Setup,
-        level: &'a Segmentation,
-        scale: &'a [f64],
-        point: &'a Point,
-        along: &'a TrajectoryEval<'a>,
-        forces: &'a [Vec<Vec<f64>>],
-    ) -> Self {
+    pub fn new(at: FitPoint<'a>, along: &'a TrajectoryEval<'a>, forces: &'a [Vec<Vec<f64>>]) -> Self {
+        let FitPoint { setup, level, scale, point } = at;
         Spectra { setup, level, scale, point, along, forces, known: Mutex::new(Vec::new()) }
     }
 

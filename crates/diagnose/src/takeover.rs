@@ -1,12 +1,17 @@
 //! Replacements for what a search found: a closure that passes the gates and simulates better, or the laws that are likeliest beside
 //! an error of the model.
 
+use greybox_calibrate::{Point, Setup};
+
 use crate::baseline::{Baseline, Judge, WholeRecordFit, leaves_noise, polish, residual_scale};
 use crate::candidate::Candidate;
 use crate::closure::Visited;
+use crate::evidence::Evidence;
+use crate::explore::{Belief, Explorer, Hypothesis};
+use crate::fitted::{AlternativeTerm, FittedModel, Found, MechanismTerm, SelectedTerm, laws, next_scale};
 use crate::gates::{Gates, defend};
 use crate::proposal::{Gate, Rejected};
-use crate::search::{Found, MechanismTerm, Search};
+use crate::search::{Search, limits, same_level};
 use crate::validate::Gain;
 
 /// A closure that can be handed back, in the place of what stands.
@@ -135,7 +140,9 @@ pub(crate) fn explored(
     baseline: &Baseline,
     judge: &Judge,
 ) -> Option<Explored> {
-    let posterior = search.explore(found)?;
+    let calibrated = &found.calibrated;
+    let explorer = Explorer::new(search, &calibrated.setup);
+    let posterior = explorer.explore(&calibrated.fit.point.parameters, &[&found.improved])?;
     let beliefs = posterior.chosen.parts.iter().zip(&posterior.beliefs);
     let mut named: Vec<Candidate> =
         beliefs.filter(|(_, b)| b.named).map(|(part, _)| part.candidate.clone()).collect();
@@ -143,7 +150,7 @@ pub(crate) fn explored(
     if likeliest.parts.is_empty() {
         return None;
     }
-    let mut adopted = search.adopt(found, likeliest, &posterior.beliefs)?;
+    let mut adopted = adopt(search, found, likeliest, &posterior.beliefs)?;
     let own = polish(&adopted.improved, &adopted.scale, judge);
     let own = defend(search, &mut adopted, own, baseline, judge, false);
     let (parts, standing) = (&own.fitted.parts, &polished.fitted.parts);
@@ -170,6 +177,53 @@ pub(crate) struct Explored {
     pub(crate) polished: WholeRecordFit,
     /// The candidates whose names the data hold.
     pub(crate) named: Vec<Candidate>,
+}
+
+/// A hypothesis fitted to the segments of what this search found, in its place.
+fn adopt(search: &Search<'_>, found: &Found, h: &Hypothesis, beliefs: &[Belief]) -> Option<Found> {
+    let at = &h.fitted.at;
+    let n0 = search.nominal().model.parameters.len();
+    let laws = laws(&h.parts, &at.setup.model, &at.parameters);
+    let (setup, parts) = search.assemble(&at.setup.holds, &at.parameters[..n0], &laws, &at.setup).ok()?;
+    let setup = Setup { noise: None, work: search.nominal().work.clone(), ..setup };
+    let level = same_level(&setup, &found.calibrated.level);
+    let starts = setup.starts(&level, &at.parameters);
+    let point = Point { parameters: at.parameters.clone(), starts };
+    let fit = setup.fit(&level, &found.scale, &[point], limits(15));
+    if !fit.cost.is_finite() {
+        return None;
+    }
+    let mut improved = FittedModel { setup, parts, level, fit };
+    let scale = next_scale(&improved.fit, &found.scale, &search.nominal().data.sigma);
+    search.method(&mut improved, &scale);
+    improved = search.refit(&improved, &scale, 10);
+    let score = |gain: f64| Evidence { score: 2.0 * gain, ..Evidence::NONE };
+    let accepted = improved.parts.iter().zip(beliefs).map(|(part, belief)| SelectedTerm {
+        candidate: part.candidate.clone(),
+        evidence: score(belief.gain),
+        alternatives: belief
+            .others
+            .iter()
+            .map(|other| AlternativeTerm {
+                candidate: other.part.candidate.clone(),
+                instance: other.part.instance.clone(),
+                evidence: score(belief.gain + (other.probability / belief.probability).ln()),
+                equivalent: other.equivalent,
+            })
+            .collect(),
+    });
+    let accepted = accepted.collect();
+    Some(Found {
+        calibrated: found.calibrated.clone(),
+        improved,
+        accepted,
+        better_holds: found.better_holds.clone(),
+        scale,
+        limited: found.limited,
+        rejected: Vec::new(),
+        errs: true,
+        closed: false,
+    })
 }
 
 #[cfg(test)]

@@ -1,6 +1,6 @@
 //! Expressions of the model evaluated along given states, sample by sample.
 
-use greybox_calibrate::{Point, Segmentation, Setup};
+use greybox_calibrate::{FitPoint, Setup};
 use greybox_model::tape::{Column, LeafKind, Tape};
 use greybox_model::{Expr, Func};
 
@@ -14,14 +14,8 @@ pub struct TrajectoryEval<'a> {
 }
 
 /// Writes the segments' own trajectories over the entries of `states[piece][entry][sample]` that `entry` picks.
-fn follow(
-    states: &mut [Vec<Vec<f64>>],
-    setup: &Setup,
-    level: &Segmentation,
-    scale: &[f64],
-    point: &Point,
-    entry: impl Fn(usize) -> bool,
-) {
+fn follow(states: &mut [Vec<Vec<f64>>], at: FitPoint<'_>, entry: impl Fn(usize) -> bool) {
+    let FitPoint { setup, level, scale, point } = at;
     let rows = setup.with_problem(level, scale, |p| p.rows(point, false, None));
     for (segment, rows) in level.segments.iter().zip(&rows) {
         let t = &rows.trajectory;
@@ -35,13 +29,9 @@ impl<'a> TrajectoryEval<'a> {
     /// Smoothed by model and measurements together ([`crate::smoother`]): states, and the force that each
     /// equation lacks. Beside coloured noise the states are those of the fit itself: what the model still lacks
     /// moves them less than the noise does, and noise in a candidate's variables would pass for its effect.
-    pub fn observed(
-        setup: &'a Setup,
-        level: &Segmentation,
-        scale: &[f64],
-        point: &Point,
-    ) -> (TrajectoryEval<'a>, Vec<Vec<Vec<f64>>>) {
-        let first = TrajectoryEval::smoothed(setup, level, scale, point);
+    pub fn observed(at: FitPoint<'a>) -> (TrajectoryEval<'a>, Vec<Vec<Vec<f64>>>) {
+        let FitPoint { setup, point, .. } = at;
+        let first = TrajectoryEval::smoothed(at);
         let force: Vec<f64> = first
             .own_forces()
             .into_iter()
@@ -64,7 +54,7 @@ impl<'a> TrajectoryEval<'a> {
         };
         let smoothed = crate::smoother::smooth(setup, &given);
         let along = if setup.noise.is_some() {
-            TrajectoryEval::undisturbed(setup, level, scale, point)
+            TrajectoryEval::undisturbed(at)
         } else {
             TrajectoryEval { states: smoothed.states, ..first }
         };
@@ -119,34 +109,20 @@ impl<'a> TrajectoryEval<'a> {
     }
 
     /// Smoothed measurements; unmeasured entries from the segments' trajectories.
-    pub fn smoothed(
-        setup: &'a Setup,
-        level: &Segmentation,
-        scale: &[f64],
-        point: &Point,
-    ) -> TrajectoryEval<'a> {
-        TrajectoryEval::measured(setup, level, scale, point, false)
+    pub fn smoothed(at: FitPoint<'a>) -> TrajectoryEval<'a> {
+        TrajectoryEval::measured(at, false)
     }
 
     /// Smoothed measurements, or beside coloured noise, which they hold, the segments' trajectories.
-    pub fn undisturbed(
-        setup: &'a Setup,
-        level: &Segmentation,
-        scale: &[f64],
-        point: &Point,
-    ) -> TrajectoryEval<'a> {
-        TrajectoryEval::measured(setup, level, scale, point, setup.noise.is_some())
+    pub fn undisturbed(at: FitPoint<'a>) -> TrajectoryEval<'a> {
+        let FitPoint { setup, .. } = at;
+        TrajectoryEval::measured(at, setup.noise.is_some())
     }
 
     /// Smoothed measurements; on the segments of `level` all entries (`simulated`) or the unmeasured ones from
     /// their own trajectories.
-    fn measured(
-        setup: &'a Setup,
-        level: &Segmentation,
-        scale: &[f64],
-        point: &Point,
-        simulated: bool,
-    ) -> TrajectoryEval<'a> {
+    fn measured(at: FitPoint<'a>, simulated: bool) -> TrajectoryEval<'a> {
+        let FitPoint { setup, point, .. } = at;
         let own = |i: usize| simulated || setup.smoothed_states.tolerance[i].is_infinite();
         let mut states: Vec<Vec<Vec<f64>>> = setup
             .data
@@ -158,7 +134,7 @@ impl<'a> TrajectoryEval<'a> {
             })
             .collect();
         if (0..setup.system.nx).any(own) {
-            follow(&mut states, setup, level, scale, point, own);
+            follow(&mut states, at, own);
         }
         TrajectoryEval { setup, states, parameters: point.parameters.clone(), simulated }
     }

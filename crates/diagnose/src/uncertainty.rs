@@ -21,8 +21,8 @@ use greybox_calibrate::{Autoregression, qr, student_quantile};
 use statrs::distribution::{ChiSquared, ContinuousCDF};
 
 use crate::evidence::Inflation;
+use crate::fitted::FittedModel;
 use crate::screen::{Projected, project};
-use crate::search::FittedModel;
 
 /// Blocks of samples over all recordings.
 const BLOCKS: usize = 40;

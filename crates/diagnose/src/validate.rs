@@ -13,7 +13,7 @@ use greybox_calibrate::{Criterion, Data, Limits, Point, Segment, Segmentation, S
 use rayon::prelude::*;
 use statrs::distribution::{ContinuousCDF, StudentsT};
 
-use crate::search::FittedModel;
+use crate::fitted::FittedModel;
 
 /// Most folds of several recordings; a single one has one less.
 const FOLDS: usize = 5;

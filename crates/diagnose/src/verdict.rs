@@ -9,19 +9,18 @@ use rayon::prelude::*;
 use crate::diagnosis::Verdict;
 use crate::discrepancy::{Discrepancy, held_out};
 use crate::evidence::{cross_validation_improvement, effective_sample_ratio};
+use crate::fitted::{FittedModel, Found, MechanismTerm};
 use crate::importance::{divided, rss_alone};
 use crate::library::Mechanism;
 use crate::place::{Motion, Place};
-use crate::search::{
-    FittedModel, Found, MISFIT, MechanismTerm, Search, UNDECIDED, log_likelihood_gain, raw_rms, raw_rss,
-};
+use crate::search::{MISFIT, Search, UNDECIDED, log_likelihood_gain, raw_rms, raw_rss};
 
 /// Mean over standard error of the folds' gains from which free shapes are taken seriously.
 const STEADY_SHAPE: f64 = 2.0;
 /// Gain of free shapes over that of the mechanisms from which these are imitations: laws of the state, and
 /// mechanisms with a memory or a delay (which no shape of the state should come near).
-const RIVALS_LAW: f64 = 1.1;
-const RIVALS_MEMORY: f64 = 0.97;
+const IMITATES_LAW: f64 = 1.1;
+const IMITATES_MEMORY: f64 = 0.97;
 /// Share of the calibrated model's misfit up to which a mechanism counts as a small correction.
 const CORRECTION: f64 = 0.02;
 /// Forces on one motion that make a patchwork (and mechanisms in one equation that cast doubt on each other).
@@ -56,6 +55,11 @@ pub(crate) fn outdone(search: &Search<'_>, found: &Found, verdict: Verdict) -> V
     parts.par_iter().map(|part| outdoes(&[*part]).or_else(|| all.clone())).collect()
 }
 
+/// A residual sum of squares over that without any mechanism.
+fn share_of(rss: f64, base: f64) -> f64 {
+    (rss / base.max(1e-300)).clamp(0.0, 1.0)
+}
+
 /// What an improved model explains, and what it leaves.
 pub(crate) struct Judged {
     pub(crate) verdict: Verdict,
@@ -75,6 +79,11 @@ pub(crate) struct Judged {
 }
 
 impl Judged {
+    /// A residual sum of squares over that of the calibrated model.
+    pub(crate) fn share(&self, rss: f64) -> f64 {
+        share_of(rss, self.base)
+    }
+
     /// Of a model with a residual like `scale` beside a calibrated one; whether its parts are named.
     pub(crate) fn of(
         search: &Search<'_>,
@@ -99,7 +108,7 @@ impl Judged {
             .into_par_iter()
             .map(|i| search.rss_without(improved, &[i], calibrated, &found.scale).unwrap_or(base))
             .collect();
-        let share = |rss: f64| (rss / base.max(1e-300)).clamp(0.0, 1.0);
+        let share = |rss: f64| share_of(rss, base);
         let alone = rss_alone(search, (calibrated, improved), &found.scale, &without, base);
         let lost: Vec<f64> = without.iter().map(|rss| share(rss - full)).collect();
         let gained: Vec<f64> = alone.iter().map(|rss| share(base - rss)).collect();
@@ -262,8 +271,7 @@ fn beaten_by_discrepancy(
 ) -> bool {
     let Some(free) = discrepancy_of(base, scale).filter(|s| s.t > STEADY_SHAPE) else { return false };
     // On the same folds as the free shapes: how much blocks tell of each other depends on where they are cut.
-    let point = &improved.fit.point;
-    let Some(errors) = held_out(&improved.setup, &improved.level, scale, point, free.block) else {
+    let Some(errors) = held_out(improved.at(scale), free.block) else {
         return false;
     };
     let named = 1.0 - errors.iter().sum::<f64>() / free.without.max(1e-300);
@@ -276,9 +284,9 @@ fn beaten_by_discrepancy(
     // Where nothing but white noise is left, what a memory explains is explained.
     let doubtful = remembers && !improved.leaves_white_noise(scale);
     if doubtful {
-        free.gain > RIVALS_MEMORY * named
+        free.gain > IMITATES_MEMORY * named
     } else {
-        free.gain > RIVALS_LAW * named && t > STEADY_SHAPE
+        free.gain > IMITATES_LAW * named && t > STEADY_SHAPE
     }
 }
 
@@ -313,7 +321,7 @@ impl ResidualDiagnostics {
         let rms = raw_rms(improved, scale);
         let coloured = crate::search::coloured_channels(improved, scale);
         let misfit = rms.iter().zip(sigma).map(|(r, s)| r / s).fold(0.0, f64::max);
-        let ratios = effective_sample_ratio(&improved.setup, &improved.level, scale, &improved.fit.point);
+        let ratios = effective_sample_ratio(improved.at(scale));
         let slow = (0..rms.len()).any(|c| {
             let over = rms[c] / sigma[c];
             !coloured[c] && (over > MISFIT || (over > SLOW_MISFIT && ratios[c] < SLOW))
@@ -368,5 +376,5 @@ impl ResidualDiagnostics {
 
 /// What free shapes explain of a residual.
 pub(crate) fn discrepancy_of(fitted: &FittedModel, scale: &[f64]) -> Option<Discrepancy> {
-    crate::discrepancy::test(&fitted.setup, &fitted.level, scale, &fitted.fit.point)
+    crate::discrepancy::test(fitted.at(scale))
 }

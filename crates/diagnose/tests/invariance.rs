@@ -8,19 +8,7 @@ use proptest::test_runner::RngSeed;
 use rand::SeedableRng;
 use rand_distr::{Distribution, Normal, Uniform};
 
-const MODEL: &str = r#"
-name = "oscillator"
-[inputs]
-f = { unit = "N" }
-[states]
-x = { unit = "m" }
-[parameters]
-m = { value = 1.1, unit = "kg", std = 0.2 }
-c = { value = 0.5, unit = "N s/m", std = 0.5 }
-k = { value = 38.0, unit = "N/m", std = 8.0 }
-[equations]
-mass = "m*x'' + c*x' + k*x = f"
-"#;
+use crate::common::OSCILLATOR;
 
 /// x'' = f − 0.6 x' − 42 x − friction, by small steps; dry friction removes at most the momentum there is.
 fn record(seed: u64, rows: usize, friction: f64) -> Recording {
@@ -82,7 +70,7 @@ fn same(recordings: &[Recording]) -> Vec<(&'static str, Vec<Recording>, bool)> {
 }
 
 fn calibrated(recordings: &[Recording], held: &[Recording]) -> Calibration {
-    let model = Model::from_toml(MODEL, "oscillator.toml").unwrap();
+    let model = Model::from_toml(OSCILLATOR, "oscillator.toml").unwrap();
     calibrate(&model, recordings, held, &Quiet).unwrap()
 }
 
@@ -93,7 +81,7 @@ fn numbers(calibration: &Calibration) -> Vec<f64> {
 }
 
 fn diagnosed(recordings: &[Recording], held: &[Recording]) -> Diagnosis {
-    let model = Model::from_toml(MODEL, "oscillator.toml").unwrap();
+    let model = Model::from_toml(OSCILLATOR, "oscillator.toml").unwrap();
     // Few mechanisms: it is about what is the same, not about what is found.
     let mut library = built_in().unwrap();
     library.retain(|m| {
@@ -332,7 +320,7 @@ fn a_diagnosis_does_not_depend_on_the_zero_of_temperature() {
 fn a_calibration_does_not_depend_on_count_against_1() {
     let recordings = [record(7, 400, 0.1)];
     let of = |unit: &str| {
-        let text = MODEL
+        let text = OSCILLATOR
             .replace("x = { unit = \"m\" }", &format!("x = {{ unit = \"{unit}\" }}"))
             .replace("\"kg\"", &format!("\"N s^2/{unit}\""))
             .replace("\"N s/m\"", &format!("\"N s/{unit}\""))

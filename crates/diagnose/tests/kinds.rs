@@ -7,18 +7,7 @@ use greybox_recording::{Channel, Recording};
 use rand::SeedableRng;
 use rand_distr::{Distribution, Normal, Uniform};
 
-const MODEL: &str = r#"
-[inputs]
-f = { unit = "N" }
-[states]
-x = { unit = "m" }
-[parameters]
-m = { value = 1.1, unit = "kg", std = 0.2 }
-c = { value = 0.5, unit = "N s/m", std = 0.5 }
-k = { value = 38.0, unit = "N/m", std = 8.0 }
-[equations]
-mass = "m*x'' + c*x' + k*x = f"
-"#;
+use crate::common::OSCILLATOR;
 
 /// State of the machine: position, velocity, and one of the effect's own.
 type State = [f64; 3];
@@ -93,7 +82,7 @@ fn hysteresis_is_named_and_sized() {
     // z' = v − β|v|z − γ v|z|, force 30 z.
     let effect =
         |_: f64, s: &State, _: f64| (30.0 * s[2], s[1] - 12.0 * s[1].abs() * s[2] - 9.0 * s[1] * s[2].abs());
-    let d = answer(MODEL, 1, &LINES, &effect, 0.0);
+    let d = answer(OSCILLATOR, 1, &LINES, &effect, 0.0);
     assert_eq!(kinds(&d), ["bouc_wen_hysteresis"]);
     for (name, truth) in [("kh", 30.0), ("be", 12.0), ("ga", 9.0)] {
         let v = value(&d, name);
@@ -108,7 +97,7 @@ fn hysteresis_is_named_and_sized() {
 fn hysteresis_that_is_friction_by_its_equation_is_called_both() {
     // γ = 0: the equation of a contact that lets go over 1/β.
     let effect = |_: f64, s: &State, _: f64| (30.0 * s[2], s[1] - 12.0 * s[1].abs() * s[2]);
-    let d = answer(MODEL, 1, &LINES, &effect, 0.0);
+    let d = answer(OSCILLATOR, 1, &LINES, &effect, 0.0);
     assert_eq!(kinds(&d), ["presliding_friction"]);
     let found = &d.mechanisms[0];
     let other: Vec<_> = found.alternatives.iter().filter(|a| a.kind == "bouc_wen_hysteresis").collect();
@@ -121,7 +110,7 @@ fn hysteresis_that_is_friction_by_its_equation_is_called_both() {
 fn a_lag_of_the_actuator_is_named_and_sized() {
     // The actuator's force a follows with 60 ms: 0.06 a' + a = f. (f − a is what the model lacks.)
     let effect = |_: f64, s: &State, f: f64| (f - s[2], (f - s[2]) / 0.06);
-    let d = answer(MODEL, 2, &LINES, &effect, 0.0);
+    let d = answer(OSCILLATOR, 2, &LINES, &effect, 0.0);
     assert_eq!(kinds(&d), ["actuator_lag"]);
     assert!((value(&d, "ta") / 0.06 - 1.0).abs() < 0.05, "{}", value(&d, "ta"));
 }
@@ -129,7 +118,7 @@ fn a_lag_of_the_actuator_is_named_and_sized() {
 #[test]
 fn a_drift_names_its_parameter() {
     let effect = |t: f64, s: &State, _: f64| (42.0 * 0.02 * t * s[0], 0.0);
-    let d = answer(MODEL, 3, &LINES, &effect, 0.0);
+    let d = answer(OSCILLATOR, 3, &LINES, &effect, 0.0);
     assert_eq!(kinds(&d), ["parameter_drift"]);
     assert_eq!(d.mechanisms[0].drifting.as_deref(), Some("k"));
     assert!((value(&d, "rate") / 0.02 - 1.0).abs() < 0.05, "{}", value(&d, "rate"));
@@ -138,7 +127,7 @@ fn a_drift_names_its_parameter() {
 #[test]
 fn a_disturbance_in_time_has_its_frequency() {
     let effect = |t: f64, _: &State, _: f64| (0.7 * (2.0 * std::f64::consts::PI * 1.37 * t + 0.4).sin(), 0.0);
-    let d = answer(MODEL, 4, &LINES, &effect, 0.0);
+    let d = answer(OSCILLATOR, 4, &LINES, &effect, 0.0);
     assert_eq!(kinds(&d), ["periodic_disturbance"]);
     assert!((value(&d, "fd") / 1.37 - 1.0).abs() < 0.002, "{}", value(&d, "fd"));
     assert!((value(&d, "ad") / 0.7 - 1.0).abs() < 0.05, "{}", value(&d, "ad"));
@@ -146,7 +135,7 @@ fn a_disturbance_in_time_has_its_frequency() {
 
 #[test]
 fn a_delay_of_the_only_sensor_is_declared_the_same_as_one_of_the_only_input() {
-    let d = answer(MODEL, 5, &LINES, &|_, _, _| (0.0, 0.0), 0.034);
+    let d = answer(OSCILLATOR, 5, &LINES, &|_, _, _| (0.0, 0.0), 0.034);
     let first = &d.mechanisms[0];
     assert!(first.kind == "sensor_delay" || first.kind == "input_delay", "{:?}", kinds(&d));
     let other = if first.kind == "sensor_delay" { "input_delay" } else { "sensor_delay" };
@@ -159,7 +148,7 @@ fn a_delay_of_the_only_sensor_is_declared_the_same_as_one_of_the_only_input() {
 /// the excitation's frequency: either alone makes things worse, both together explain the harmonics.
 #[test]
 fn a_pair_that_only_pays_together_is_found() {
-    let model = MODEL
+    let model = OSCILLATOR
         .replace(", std = 0.2 }", ", fixed = true }")
         .replace(", std = 8.0 }", ", fixed = true }")
         .replace("1.1", "1.0")
@@ -178,7 +167,7 @@ fn a_pair_that_only_pays_together_is_found() {
 #[test]
 fn what_the_library_does_not_know_is_not_named_with_confidence() {
     let effect = |_: f64, s: &State, _: f64| (260.0 * s[0] * s[0] * s[1], 0.0);
-    let d = answer(MODEL, 7, &LINES, &effect, 0.0);
+    let d = answer(OSCILLATOR, 7, &LINES, &effect, 0.0);
     assert_ne!(d.verdict, Verdict::Consistent);
     let sure = d.mechanisms.iter().any(|m| m.confidence >= 0.9);
     assert!(d.verdict == Verdict::Unexplained || !sure, "{:?}", kinds(&d));

@@ -12,19 +12,7 @@ use greybox_recording::{Channel, Recording};
 use rand::SeedableRng;
 use rand_distr::{Distribution, Normal, Uniform};
 
-const MODEL: &str = r#"
-name = "oscillator"
-[inputs]
-f = { unit = "N" }
-[states]
-x = { unit = "m" }
-[parameters]
-m = { value = 1.1, unit = "kg", std = 0.2 }
-c = { value = 0.5, unit = "N s/m", std = 0.5 }
-k = { value = 38.0, unit = "N/m", std = 8.0 }
-[equations]
-mass = "m*x'' + c*x' + k*x = f"
-"#;
+use crate::common::OSCILLATOR;
 
 #[derive(Clone, Copy, Default)]
 struct Left {
@@ -105,7 +93,7 @@ fn answer(seed: u64, left: Left) -> Diagnosis {
 }
 
 fn answer_in_noise(seed: u64, left: Left, noise: f64) -> Diagnosis {
-    let model = Model::from_toml(MODEL, "oscillator.toml").unwrap();
+    let model = Model::from_toml(OSCILLATOR, "oscillator.toml").unwrap();
     let train = [record(seed, left, noise)];
     let held = [record(seed + 1000, left, noise)];
     diagnose(&model, &train, &held, &Options::default(), &Quiet).unwrap()
@@ -165,8 +153,9 @@ fn a_refinement_that_would_not_be_seen_is_an_equal() {
 #[test]
 fn the_baseline_of_a_diagnosis_is_as_good_as_a_calibration() {
     // An axis: nothing draws it back, and what is left out adds up.
-    let axis =
-        MODEL.replace(" + k*x = f", " = f").replace("k = { value = 38.0, unit = \"N/m\", std = 8.0 }\n", "");
+    let axis = OSCILLATOR
+        .replace(" + k*x = f", " = f")
+        .replace("k = { value = 38.0, unit = \"N/m\", std = 8.0 }\n", "");
     let model = Model::from_toml(&axis, "axis.toml").unwrap();
     for (seed, coulomb) in [(0, 0.5), (1, 1.5), (2, 2.5)] {
         let left = Left { coulomb, soft: 42.0, ..Left::default() };
@@ -280,7 +269,7 @@ fn a_law_that_can_be_pieced_together_is_not() {
 /// A search without work left says so, and what it has found stands.
 #[test]
 fn a_search_that_runs_out_of_work_says_so() {
-    let model = Model::from_toml(MODEL, "oscillator.toml").unwrap();
+    let model = Model::from_toml(OSCILLATOR, "oscillator.toml").unwrap();
     let left = Left { coulomb: 0.8, cubic: 300.0, ..Left::default() };
     let (train, held) = ([record(1, left, 1e-3)], [record(1001, left, 1e-3)]);
     let with = |work| {
@@ -316,7 +305,7 @@ impl ProgressListener for Listener {
 /// A search ends by its work: what is asked of it must not count.
 #[test]
 fn listening_costs_the_search_nothing() {
-    let model = Model::from_toml(MODEL, "oscillator.toml").unwrap();
+    let model = Model::from_toml(OSCILLATOR, "oscillator.toml").unwrap();
     let left = Left { coulomb: 0.8, ..Left::default() };
     let (train, held) = ([record(1, left, 1e-3)], [record(1001, left, 1e-3)]);
     let [(none, silent), (heard, asked)] = [false, true].map(|asks| {
@@ -333,7 +322,7 @@ fn listening_costs_the_search_nothing() {
 #[test]
 fn the_answer_does_not_depend_on_the_unit_of_the_file() {
     let left = Left { coulomb: 0.8, ..Left::default() };
-    let model = Model::from_toml(MODEL, "oscillator.toml").unwrap();
+    let model = Model::from_toml(OSCILLATOR, "oscillator.toml").unwrap();
     let (train, held) = (record(3, left, 1e-3), record(1003, left, 1e-3));
     let in_mm = |r: &Recording| {
         let mut channels = r.channels.clone();

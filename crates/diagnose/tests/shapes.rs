@@ -2,7 +2,7 @@
 
 use std::sync::Arc;
 
-use greybox_calibrate::{Data, Fit, Limits, Point, Segmentation, Setup, free_parameters};
+use greybox_calibrate::{Data, Fit, FitPoint, Limits, Point, Segmentation, Setup, free_parameters};
 use greybox_diagnose::discrepancy::{held_out, test};
 use greybox_diagnose::evidence::cross_validation_improvement;
 use greybox_model::{Hold, Model, System};
@@ -98,7 +98,8 @@ fn coloured_noise_is_no_force() {
         let recording = record(seed, 0.95);
         for (force, count) in [("k*x + k3*x^3", &mut alarms), ("k*x", &mut found)] {
             let (setup, level, scale, fit) = fitted(force, &recording, true);
-            let s = test(&setup, &level, &scale, &fit.point).unwrap();
+            let s =
+                test(FitPoint { setup: &setup, level: &level, scale: &scale, point: &fit.point }).unwrap();
             let gain = s.samples as f64 * s.gain;
             *count += u64::from(s.t > 2.5 && gain > 20.0);
             if force.contains("k3") {
@@ -117,8 +118,10 @@ fn coloured_noise_is_no_force() {
 fn models_and_free_shapes_share_their_folds() {
     let recording = record(1, 0.0);
     let (setup, level, scale, fit) = fitted("k*x", &recording, false);
-    let free = test(&setup, &level, &scale, &fit.point).unwrap();
-    let own = held_out(&setup, &level, &scale, &fit.point, free.block).unwrap();
+    let free = test(FitPoint { setup: &setup, level: &level, scale: &scale, point: &fit.point }).unwrap();
+    let own =
+        held_out(FitPoint { setup: &setup, level: &level, scale: &scale, point: &fit.point }, free.block)
+            .unwrap();
     let (ahead, t) = cross_validation_improvement(&own, &free.errors);
     assert!((ahead / own.iter().sum::<f64>() - free.gain).abs() < 1e-12, "{ahead} {}", free.gain);
     assert!((t - free.t).abs() < 1e-9, "{t} {}", free.t);
@@ -126,7 +129,9 @@ fn models_and_free_shapes_share_their_folds() {
 
     // The law itself is ahead of every free shape.
     let (setup, level, _, fit) = fitted("k*x + k3*x^3", &recording, false);
-    let law = held_out(&setup, &level, &scale, &fit.point, free.block).unwrap();
+    let law =
+        held_out(FitPoint { setup: &setup, level: &level, scale: &scale, point: &fit.point }, free.block)
+            .unwrap();
     let (ahead, t) = cross_validation_improvement(&free.errors, &law);
     assert!(ahead > 0.0 && t > 2.0, "{ahead} {t}");
 }

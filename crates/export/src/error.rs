@@ -1,3 +1,5 @@
+//! What is wrong with a function or a model that is to be written.
+
 use greybox_model::system::CompileError;
 
 /// Why a function cannot be written as code.

@@ -1,9 +1,10 @@
+//! A function of named arrays, in expressions.
+
 use greybox_model::Expr;
 use greybox_model::expr::Func;
 
 use crate::error::ExportError;
-use crate::graph::Graph;
-use crate::language::{Language, is_identifier, write};
+use crate::keywords::is_identifier;
 
 /// One argument's element: a symbol of the expressions.
 #[derive(Debug, Clone, PartialEq, Eq)]
@@ -87,15 +88,6 @@ pub struct Vector {
 }
 
 impl Function {
-    /// The code of the function, a file of its own.
-    ///
-    /// # Errors
-    /// [`ExportError`]: names that are none, symbols that are not given, functions of time.
-    pub fn code(&self, language: Language) -> Result<String, ExportError> {
-        self.check()?;
-        Ok(write(self, &Graph::of(self), language))
-    }
-
     /// What the expressions give for arguments: all elements, one after the other, one list per vector.
     ///
     /// # Errors
@@ -131,7 +123,8 @@ impl Function {
             .find_map(|g| g.members.iter().position(|m| m.name == name && m.primes == primes).map(|k| (g, k)))
     }
 
-    fn check(&self) -> Result<(), ExportError> {
+    /// That it can be written.
+    pub(crate) fn check(&self) -> Result<(), ExportError> {
         for name in self.arguments.iter().map(|g| &g.name).chain([&self.name]) {
             if !is_identifier(name) {
                 return Err(ExportError::Name { name: name.clone() });

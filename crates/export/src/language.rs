@@ -4,8 +4,10 @@ use std::fmt::Write as _;
 
 use greybox_model::expr::Func;
 
+use crate::error::ExportError;
 use crate::function::{Function, symbol};
 use crate::graph::{Graph, Node, Operator};
+use crate::keywords::is_identifier;
 use crate::names::ascii;
 
 /// A language that functions are written in.
@@ -15,129 +17,6 @@ pub enum Language {
     C99,
     /// Rust without the standard library, with the crate `libm`.
     Rust,
-}
-
-/// Words that are no names in one language or the other, and names that the code itself uses.
-const TAKEN: &[&str] = &[
-    "abstract",
-    "alignas",
-    "alignof",
-    "as",
-    "async",
-    "auto",
-    "await",
-    "become",
-    "bool",
-    "box",
-    "break",
-    "case",
-    "char",
-    "const",
-    "constexpr",
-    "continue",
-    "crate",
-    "default",
-    "do",
-    "double",
-    "dyn",
-    "else",
-    "enum",
-    "extern",
-    "f32",
-    "f64",
-    "false",
-    "final",
-    "float",
-    "fn",
-    "for",
-    "gen",
-    "goto",
-    "if",
-    "impl",
-    "in",
-    "inline",
-    "int",
-    "let",
-    "libm",
-    "long",
-    "loop",
-    "macro",
-    "main",
-    "match",
-    "mod",
-    "move",
-    "mut",
-    "nullptr",
-    "out",
-    "override",
-    "priv",
-    "pub",
-    "ref",
-    "register",
-    "restrict",
-    "return",
-    "self",
-    "Self",
-    "short",
-    "signed",
-    "sizeof",
-    "static",
-    "struct",
-    "super",
-    "switch",
-    "trait",
-    "true",
-    "try",
-    "type",
-    "typedef",
-    "typeof",
-    "union",
-    "unsafe",
-    "unsigned",
-    "unsized",
-    "use",
-    "virtual",
-    "void",
-    "volatile",
-    "where",
-    "while",
-    "yield",
-    "sin",
-    "cos",
-    "tan",
-    "exp",
-    "log",
-    "sqrt",
-    "tanh",
-    "atan",
-    "fabs",
-    "pow",
-    "sign",
-    "deadzone",
-    "saturate",
-    "table",
-    "smaller",
-    "larger",
-    "j0",
-    "j1",
-    "jn",
-    "y0",
-    "y1",
-    "yn",
-    "gamma",
-];
-
-/// Whether a name can be used as it is in both languages.
-pub(crate) fn is_identifier(name: &str) -> bool {
-    name.starts_with(|c: char| c.is_ascii_alphabetic())
-        && name.chars().all(|c| c.is_ascii_alphanumeric() || c == '_')
-        && !TAKEN.contains(&name)
-        && !is_temporary(name)
-}
-
-/// t0, t1, …: names of parts that occur more than once.
-fn is_temporary(name: &str) -> bool {
-    name.strip_prefix('t').is_some_and(|n| !n.is_empty() && n.chars().all(|c| c.is_ascii_digit()))
 }
 
 /// A name for a constant of the model, whatever it is called there.
@@ -151,6 +30,17 @@ fn constant_name(function: &Function, name: &str) -> String {
     candidate
 }
 
+impl Function {
+    /// The code of the function, a file of its own.
+    ///
+    /// # Errors
+    /// [`ExportError`]: names that are none, symbols that are not given, functions of time.
+    pub fn code(&self, language: Language) -> Result<String, ExportError> {
+        self.check()?;
+        Ok(write(self, &Graph::of(self), language))
+    }
+}
+
 struct Writer<'a> {
     function: &'a Function,
     graph: &'a Graph,
@@ -160,7 +50,7 @@ struct Writer<'a> {
 }
 
 /// The file of a function.
-pub(crate) fn write(function: &Function, graph: &Graph, language: Language) -> String {
+fn write(function: &Function, graph: &Graph, language: Language) -> String {
     let mut writer = Writer { function, graph, language, names: vec![None; graph.nodes.len()] };
     let mut out = String::new();
     writer.head(&mut out);

@@ -4,6 +4,7 @@ mod error;
 mod function;
 mod graph;
 mod infix;
+mod keywords;
 mod language;
 mod latex;
 mod modelica;

@@ -5,6 +5,7 @@ mod correlation;
 mod error;
 mod identify;
 mod library;
+mod options;
 mod output_error;
 mod precision;
 mod stream;
@@ -14,8 +15,9 @@ mod weak;
 pub use error::IdentifyError;
 pub use greybox_calibrate::HoldoutSource;
 pub use identify::{
-    Blocks, DelayedState, DoubtfulTerm, FoundDelay, FoundEquation, FoundTerm, Identification, MOST_WORK,
-    Options, OrderChoice, ProgressListener, Quiet, Role, identify,
+    Blocks, DoubtfulTerm, FoundDelay, FoundEquation, FoundTerm, Identification, OrderChoice,
+    ProgressListener, Quiet, Role, identify,
 };
 pub use library::{Library, Monomials};
+pub use options::{DelayedState, MOST_WORK, Options};
 pub use stream::{Linearisation, Statistics, Streamed, identify_blocks};

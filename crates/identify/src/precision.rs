@@ -6,7 +6,7 @@ use rand_pcg::Pcg64Mcg;
 use rayon::prelude::*;
 
 use crate::correlation::{FEW, Lagged};
-use crate::identify::Options;
+use crate::options::Options;
 use crate::output_error::{self, Linearised, Refined};
 use crate::structure::Structure;
 

@@ -18,7 +18,8 @@ use serde::{Deserialize, Serialize};
 use crate::choose::Reduced;
 use crate::correlation::{LONGEST, Lagged};
 use crate::error::IdentifyError;
-use crate::identify::{self, Blocks, Identification, Options, ProgressListener, Search, conclude, search};
+use crate::identify::{self, Blocks, Identification, ProgressListener, Search, conclude, search};
+use crate::options::Options;
 use crate::output_error::{self, Linearised, Refined, either, floor, stack, triangle_of, widen};
 use crate::precision::{self, BLOCKS, Precision, Spread};
 

@@ -149,14 +149,6 @@ impl Func {
             Table => None,
         }
     }
-
-    /// Whether these may be its arguments: as many as it takes, and knots that are increasing numbers.
-    pub fn takes(self, args: &[Expr]) -> bool {
-        match self.arity() {
-            Some(arity) => args.len() == arity,
-            None => crate::Table::of(args).is_some(),
-        }
-    }
 }
 
 impl Expr {

@@ -58,6 +58,16 @@ impl<'a> Table<'a> {
     }
 }
 
+impl Func {
+    /// Whether these may be its arguments: as many as it takes, and knots that are increasing numbers.
+    pub fn takes(self, args: &[Expr]) -> bool {
+        match self.arity() {
+            Some(arity) => args.len() == arity,
+            None => Table::of(args).is_some(),
+        }
+    }
+}
+
 /// The value at `x` of a table with these knots and as many values; not a number where `x` is none.
 pub(crate) fn interpolate(knots: &[f64], values: &[f64], x: f64) -> f64 {
     let last = knots.len() - 1;

@@ -6,7 +6,8 @@
 //! that names the cell.
 
 use crate::error::{Place, RecordingError};
-use crate::read::{check_file, unread};
+use crate::file::{self, check_file, unread};
+use crate::header::{header_cell, seconds};
 use crate::recording::{Channel, Recording};
 use ::csv::{ByteRecord, ReaderBuilder, WriterBuilder};
 use std::fs;
@@ -18,7 +19,7 @@ use std::path::Path;
 /// # Errors
 /// Any [`RecordingError`]; its place names the file as given, the line and the column.
 pub fn read_csv(path: impl AsRef<Path>) -> Result<Recording, RecordingError> {
-    let (bytes, label, name) = crate::read::bytes(path.as_ref())?;
+    let (bytes, label, name) = file::bytes(path.as_ref())?;
     parse(&bytes, &label, &name, 0)
 }
 
@@ -481,36 +482,6 @@ fn header(record: &ByteRecord, place: &Place, text: &[u8]) -> Result<Header, Rec
         }
     }
     Ok(Header { time_scale, columns: parsed.into_iter().skip(1).collect() })
-}
-
-/// Seconds per unit of a time; `None` for a unit that times do not have.
-pub(crate) fn seconds(unit: Option<&str>) -> Option<f64> {
-    match unit {
-        None | Some("s") => Some(1.0),
-        Some("ms") => Some(1e-3),
-        Some("us" | "µs" | "μs") => Some(1e-6),
-        Some(_) => None,
-    }
-}
-
-/// `name` or `name [unit]`.
-pub(crate) fn header_cell(
-    cell: &str,
-    place: impl Fn() -> Place,
-) -> Result<(String, Option<String>), RecordingError> {
-    let refuse = |help| RecordingError::HeaderCell { place: place(), found: cell.to_owned(), help };
-    let (name, unit) = match cell.split_once('[') {
-        Some((name, rest)) if !name.contains(']') => match rest.strip_suffix(']') {
-            Some(unit) if !unit.contains(['[', ']']) => (name.trim(), Some(unit.trim())),
-            _ => return Err(refuse("close the unit's bracket at the end of the cell")),
-        },
-        _ if cell.contains(']') => return Err(refuse("open the unit's bracket with `[`")),
-        _ => (cell, None),
-    };
-    if name.is_empty() {
-        return Err(refuse("give the column a name, or delete it"));
-    }
-    Ok((name.to_owned(), unit.filter(|unit| !unit.is_empty()).map(str::to_owned)))
 }
 
 /// The number in a cell; NaN for an empty cell, `None` for anything that is not a finite number.

@@ -1,4 +1,4 @@
-//! What a check has to say: severity, sentence, fix, number.
+//! What a check has to say: severity, sentence, fix, number; numbers and lists in sentences.
 
 use serde::Serialize;
 use std::fmt;
@@ -117,6 +117,19 @@ pub(crate) fn quantity(x: f64, unit: Option<&str>) -> String {
         Some(unit) => format!("{} {unit}", number(x)),
         None => number(x),
     }
+}
+
+/// Most variables or columns that a sentence names.
+const TOLD: usize = 8;
+
+/// A list for a sentence, cut where it gets long.
+pub fn told(mut all: Vec<String>) -> String {
+    if all.len() > TOLD {
+        let more = all.len() - TOLD;
+        all.truncate(TOLD);
+        all.push(format!("{more} more"));
+    }
+    all.join(", ")
 }
 
 #[cfg(test)]

@@ -1,7 +1,7 @@
 //! From the times of a file to pieces on one uniform grid.
 
 use crate::finding::{Finding, Severity, number};
-use crate::noise::median;
+use crate::median::median;
 use crate::recording::{Channel, MIN_SAMPLES, Piece};
 use std::ops::Range;
 

@@ -3,11 +3,10 @@
 //! Each check is a small function over the samples of the longest piece (the counts over all pieces); [`check`]
 //! runs them all. The limits are set so that a sound recording yields only [`Severity::Info`].
 
-use crate::finding::{Finding, Severity, number, quantity};
+use crate::finding::{self, Finding, Severity, number, quantity};
 use crate::interpolate::fill_missing;
-use crate::noise::{
-    finite_range, median, noise_sigma, quantisation_step, recording_sigma, spectral_floor_sigma,
-};
+use crate::median::median;
+use crate::noise::{finite_range, noise_sigma, quantisation_step, recording_sigma, spectral_floor_sigma};
 use crate::recording::{Channel, Recording};
 use crate::spectrum::{Periodogram, correlation, periodogram, whiten};
 
@@ -105,7 +104,7 @@ fn sampling(recording: &Recording) -> Finding {
 }
 
 fn unknown_channels(recording: &Recording, inputs: &[&str], outputs: &[&str]) -> Vec<Finding> {
-    let known = crate::told(recording.channels.iter().map(|channel| channel.name.clone()).collect());
+    let known = finding::told(recording.channels.iter().map(|channel| channel.name.clone()).collect());
     let absent = inputs.iter().chain(outputs).filter(|name| recording.channel(name).is_none());
     absent
         .map(|name| {

@@ -44,15 +44,19 @@
 #[doc = include_str!("../README.md")]
 struct Readme;
 
+mod columns;
 mod correlation;
 pub mod csv;
 mod error;
+mod file;
 mod finding;
 mod grid;
+mod header;
 pub mod health;
 pub mod interpolate;
 #[cfg(feature = "mat")]
 pub mod mat;
+mod median;
 pub mod noise;
 mod outliers;
 #[cfg(feature = "parquet")]
@@ -66,11 +70,12 @@ mod spectrum;
 pub use crate::correlation::Correlation;
 pub use crate::csv::{CsvBlocks, parse_csv, read_csv, write_csv, write_csv_file};
 pub use crate::error::{Place, RecordingError};
-pub use crate::finding::{Finding, Severity};
+pub use crate::file::is_device;
+pub use crate::finding::{Finding, Severity, told};
 #[cfg(feature = "mat")]
 pub use crate::mat::parse_mat;
 #[cfg(feature = "parquet")]
 pub use crate::parquet::parse_parquet;
-pub use crate::read::{EXTENSIONS, is_device, read, told};
+pub use crate::read::{EXTENSIONS, read};
 pub use crate::recording::{Channel, MIN_SAMPLES, Piece, Recording, SIZES};
 pub use crate::rename::{Rename, RenameError};

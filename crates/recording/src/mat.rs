@@ -22,7 +22,7 @@ mod layout;
 mod level5;
 
 use crate::error::{Place, RecordingError};
-use crate::read::ROOM;
+use crate::file::ROOM;
 use crate::recording::Recording;
 use level5::Fault;
 

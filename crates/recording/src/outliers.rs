@@ -5,7 +5,8 @@
 //! polynomial and one of three things: a spike in its middle, a step beside it, a corner. An outlier is a spike that
 //! explains more than any of the others would.
 
-use crate::noise::{finite_range, median, quantisation_step};
+use crate::median::median;
+use crate::noise::{finite_range, quantisation_step};
 
 /// Samples on either side of a window, and powers of its polynomial: short ones and many powers for fast signals, long
 /// ones and few powers for noise.

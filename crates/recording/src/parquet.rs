@@ -5,10 +5,10 @@
 //! 1); a missing value (null) or NaN is a missing sample. What else there is (texts, lists, decimals) is left out, and
 //! told in the warnings of the recording. Compression: Snappy, Zstandard, LZ4, gzip.
 
-use crate::csv::{header_cell, seconds};
 use crate::error::{Place, RecordingError};
-use crate::finding::{Finding, Severity};
-use crate::read::{ROOM, TIMES, told};
+use crate::file::ROOM;
+use crate::finding::{Finding, Severity, told};
+use crate::header::{TIMES, header_cell, seconds};
 use crate::recording::{Channel, Recording};
 use ::parquet::basic::{LogicalType, TimeUnit, Type};
 use ::parquet::column::reader::{ColumnReader, ColumnReaderImpl};

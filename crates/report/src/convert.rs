@@ -221,7 +221,7 @@ fn remainder_plan(d: &Diagnosis, reach: &Reach) -> Option<Experiment> {
 /// The experiment that separates a mechanism from its alternatives, if it has any.
 fn plan(found: &IdentifiedMechanism, improved: &Model, reach: &Reach) -> Option<Experiment> {
     let told = found.alternatives.iter().find(|a| !a.separate.is_empty());
-    let rival = told.or(found.alternatives.first())?;
+    let alternative = told.or(found.alternatives.first())?;
     let value = |name: &str| {
         // In the model a name may carry the equation's behind it.
         let is =
@@ -245,10 +245,10 @@ fn plan(found: &IdentifiedMechanism, improved: &Model, reach: &Reach) -> Option<
     Some(suggest::experiment(
         &Subject {
             own: drive(&found.excitation),
-            rival: drive(&rival.excitation),
+            alternative: drive(&alternative.excitation),
             input,
             location: &location,
-            separate: &rival.separate,
+            separate: &alternative.separate,
         },
         reach,
     ))
@@ -958,9 +958,9 @@ mod tests {
             told.parameters.iter().map(|(n, e)| (n.as_str(), e.unit.as_str())).collect();
         assert_eq!(units, [("g", "m/s^2"), ("f0", "Hz"), ("zeta", "1")]);
         assert_eq!(told.parameters["f0"].ci95, Some(Interval::new(3.6, 4.4)));
-        let rival = &told.alternatives[0];
-        assert_eq!((&rival.equation, &rival.channel), (&Some("fall".into()), &None));
-        assert_eq!(rival.replaces.as_deref(), Some("u"));
+        let alternative = &told.alternatives[0];
+        assert_eq!((&alternative.equation, &alternative.channel), (&Some("fall".into()), &None));
+        assert_eq!(alternative.replaces.as_deref(), Some("u"));
         let experiment = told.experiment.unwrap();
         assert_eq!(experiment.input.as_deref(), Some("u"), "the input of the equation");
         let band = experiment.band_hz.unwrap();

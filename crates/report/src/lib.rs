@@ -11,7 +11,7 @@
 //!   [`mod@pool`] the statistics
 //! - [`page`]: what the page shows beside it; [`Page::to_html`] writes the file
 //! - [`sentence`]: the conclusion in plain language, to fill [`Report::summary`]
-//! - [`suggest`]: the experiment that separates a mechanism from its rivals
+//! - [`suggest`]: the experiment that separates a mechanism from its alternatives
 //! - [`mod@format`], [`expression`], [`decimate`], [`diff`], [`svg`]: the pure functions underneath
 //!
 //! ```
@@ -38,6 +38,7 @@
 struct Readme;
 
 pub mod compare;
+mod comparison;
 pub mod contract;
 pub mod control;
 pub mod convert;
@@ -56,7 +57,7 @@ pub mod suggest;
 pub mod summary;
 pub mod svg;
 
-pub use compare::Comparison;
+pub use comparison::Comparison;
 pub use contract::Report;
 pub use control::ControlPage;
 pub use identified::IdentifyReport;

@@ -1,4 +1,4 @@
-//! The experiment that separates an explanation from its rivals: which input, how large, at which
+//! The experiment that separates an explanation from its alternatives: which input, how large, at which
 //! frequencies, over which part of the state space.
 //!
 //! Every number is read off the recordings ([`Reach`]) or off the law that was found; a figure that neither
@@ -81,8 +81,8 @@ impl InputRange {
 pub struct Subject<'a> {
     /// What its own law asks for.
     pub own: Drive,
-    /// What the law of the rival asks for that the experiment is about.
-    pub rival: Drive,
+    /// What the law of the alternative asks for that the experiment is about.
+    pub alternative: Drive,
     /// The input that reaches it, where one is known.
     pub input: Option<&'a str>,
     /// Where it acts.
@@ -136,7 +136,7 @@ fn amplitude(drive: Drive, input: &InputRange) -> Amplitude {
 
 /// The experiment for a mechanism.
 pub fn experiment(subject: &Subject<'_>, reach: &Reach) -> Experiment {
-    planned(subject.rival.or(subject.own), subject, reach)
+    planned(subject.alternative.or(subject.own), subject, reach)
 }
 
 /// The experiment for a remainder without a name: the recordings again, louder.
@@ -152,7 +152,7 @@ pub fn for_remainder(location: &Location, input: Option<&str>, reach: &Reach, sh
         }
     };
     let separate = format!("the residual looks like {shape}: {ask}");
-    let subject = Subject { own: drive, rival: drive, input, location, separate: &separate };
+    let subject = Subject { own: drive, alternative: drive, input, location, separate: &separate };
     planned(drive, &subject, reach)
 }
 
@@ -329,7 +329,7 @@ mod tests {
         let location = Location { region, band_hz: Some(Interval::new(0.5, 3.0)), ..Location::default() };
         let subject = Subject {
             own: drive(kind, values),
-            rival: None,
+            alternative: None,
             input: Some("v"),
             location: &location,
             separate: "look.",
@@ -449,11 +449,11 @@ mod tests {
     }
 
     #[test]
-    fn the_rival_says_what_to_do() {
+    fn the_alternative_says_what_to_do() {
         let (location, b) = (Location::default(), reach());
-        let subject = |kind, rival| {
-            let (own, rival) = (drive(kind, &[]), drive(rival, &[]));
-            experiment(&Subject { own, rival, input: None, location: &location, separate: "" }, &b)
+        let subject = |kind, alternative| {
+            let (own, alternative) = (drive(kind, &[]), drive(alternative, &[]));
+            experiment(&Subject { own, alternative, input: None, location: &location, separate: "" }, &b)
         };
         assert_eq!(subject("step_disturbance", "periodic_disturbance").text, "record with v at zero");
         assert_eq!(subject("step_disturbance", "my_own").text, "record the same again, v up to 2 V");
@@ -479,7 +479,7 @@ mod tests {
         let location = Location::default();
         let subject = Subject {
             own: Some(Excitation::Wide),
-            rival: None,
+            alternative: None,
             input: None,
             location: &location,
             separate: "turn it.",

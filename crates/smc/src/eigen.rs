@@ -1,7 +1,7 @@
 //! Eigenvalues and the characteristic polynomial of a small real matrix.
 
-use crate::check::Pole;
 use crate::matrix::{Matrix, hessenberg, identity, power_of_two};
+use crate::pole::Pole;
 
 /// Iterations allowed per eigenvalue. Two or three are usual, but a repeated pole, which the laws here are made for,
 /// can take a hundred.

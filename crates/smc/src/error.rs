@@ -2,7 +2,7 @@
 
 use core::fmt;
 
-use crate::check::Pole;
+use crate::pole::Pole;
 
 /// Why a law could not be designed, or an equilibrium not be found. The text says what to change.
 #[derive(Debug, Clone, Copy, PartialEq)]

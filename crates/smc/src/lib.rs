@@ -13,6 +13,7 @@ mod flat;
 mod friction;
 mod law;
 mod matrix;
+mod pole;
 mod surface;
 mod tangent;
 pub mod thesis;

@@ -4,7 +4,7 @@ use std::sync::Arc;
 
 use anyhow::Result;
 use greybox_algebraic::{Column, Hold, Kernel};
-use greybox_calibrate::{Data, Limits, Point, Setup, free_parameters};
+use greybox_calibrate::{Data, FitPoint, Limits, Point, Setup, free_parameters};
 use greybox_diagnose::built_in;
 use greybox_diagnose::candidate::candidates;
 use greybox_diagnose::place::places;
@@ -56,7 +56,8 @@ fn screening() -> Result<Case> {
     let fit = setup.fit(&level, &scale, &[point], Limits::default());
     let candidates = candidates(&model, &library, &places(&model));
     Ok(Case::alone(candidates.len() as f64, move || {
-        let scored = screen(&setup, &library, &candidates, &level, &scale, &fit.point);
+        let at = FitPoint { setup: &setup, level: &level, scale: &scale, point: &fit.point };
+        let scored = screen(at, &library, &candidates);
         Ok(Answer::from([("gains".to_owned(), scored.iter().map(|s| s.gain).collect())]))
     }))
 }

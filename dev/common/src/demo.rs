@@ -1,4 +1,4 @@
-//! What `greybox demo` diagnoses.
+//! What `greybox demo link` diagnoses.
 
 use anyhow::Result;
 use greybox_diagnose::{Diagnosis, Options, Quiet, diagnose};
@@ -31,7 +31,7 @@ impl Demo {
         })
     }
 
-    /// What `greybox demo` does with them.
+    /// What `greybox demo link` does with them.
     ///
     /// # Errors
     /// Those of [`diagnose`].

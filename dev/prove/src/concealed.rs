@@ -3,10 +3,10 @@
 //! A case is a folder with a nominal model and recordings under a name that says nothing; greybox runs on
 //! it as a process. The truth stands in another folder, and is used only here, after the run.
 
+mod baseline;
 mod case;
 mod gallery;
 mod plan;
-mod rival;
 mod score;
 mod summary;
 #[cfg(test)]
@@ -42,8 +42,8 @@ pub(crate) struct Options<'a> {
     pub(crate) floors: Option<&'a Path>,
     pub(crate) times_advisory: bool,
     pub(crate) limit: Duration,
-    /// Whether the naive rival is judged as well.
-    pub(crate) rival: bool,
+    /// Whether the baseline method is judged as well.
+    pub(crate) baseline: bool,
 }
 
 /// A case that was run.
@@ -55,8 +55,8 @@ pub(crate) struct Finished {
     pub(crate) models: [String; 2],
     /// The held-out recording, channel by channel, for the gallery.
     pub(crate) curves: Vec<gallery::Curves>,
-    /// What the naive rival says; absent where it was not asked or cannot say anything.
-    pub(crate) rival: Option<rival::Verdict>,
+    /// What the baseline method says; absent where it was not asked or cannot say anything.
+    pub(crate) baseline: Option<baseline::Verdict>,
 }
 
 /// Runs the suite.
@@ -84,8 +84,8 @@ pub(crate) fn run(binary: &Path, options: &Options<'_>) -> Result<Ending> {
     }
     let verdicts = summary::Figures::of(&finished);
     print!("{}", summary::render(&finished, &verdicts));
-    if options.rival {
-        print!("{}", summary::render_rival(&finished));
+    if options.baseline {
+        print!("{}", summary::render_baseline(&finished));
     }
     put(&options.folder.join("gallery.html"), &gallery::render(seed, &finished, &verdicts))?;
     println!("gallery: {}\n", options.folder.join("gallery.html").display());
@@ -178,12 +178,12 @@ fn one(binary: &Path, slot: &Slot, options: &Options<'_>) -> Result<Option<Finis
         Ok(report) => curves(binary, &case, report, &folder, &out, options.limit)?,
         Err(_) => Vec::new(),
     };
-    let rival = match &report {
-        Ok(report) if options.rival => {
+    let baseline = match &report {
+        Ok(report) if options.baseline => {
             let named = case.machine.family.parameters().iter().zip(&case.nominal);
             let value = |name: &str| report.parameters.get(name).and_then(|p| p.calibrated);
             let calibrated: Vec<f64> = named.map(|(n, &p)| value(n.name).unwrap_or(p)).collect();
-            rival::judge(&case, &calibrated)
+            baseline::judge(&case, &calibrated)
         }
         _ => None,
     };
@@ -192,7 +192,7 @@ fn one(binary: &Path, slot: &Slot, options: &Options<'_>) -> Result<Option<Finis
         Err(why) => Score::failed(&case.truth, why, run.seconds),
     };
     let finished =
-        Finished { truth: case.truth, score, oracle, models: [nominal, truth_model], curves, rival };
+        Finished { truth: case.truth, score, oracle, models: [nominal, truth_model], curves, baseline };
     println!("{}", summary::line(&finished));
     Ok(Some(finished))
 }

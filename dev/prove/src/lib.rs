@@ -53,7 +53,7 @@ pub struct Arguments {
     jobs: usize,
     /// Beside greybox, judge what sparse regression of the missing acceleration says of the concealed suite
     #[arg(long)]
-    rival: bool,
+    baseline: bool,
     /// Fail only when a figure falls below its floor in this file, which also names the fixed suite of concealed cases;
     /// with --recordings, the floors of the real sets
     #[arg(long, value_name = "FILE")]
@@ -199,7 +199,7 @@ fn conceal(root: &Path, arguments: &Arguments) -> Result<Ending> {
         floors: arguments.floors.as_deref(),
         times_advisory: arguments.times_advisory,
         limit: Duration::from_secs(arguments.timeout),
-        rival: arguments.rival,
+        baseline: arguments.baseline,
     };
     concealed::run(&process::build(root)?, &options)
 }

@@ -41,7 +41,7 @@ pub struct Arguments {
     /// Where to write [default: target/reproduction]
     #[arg(long, value_name = "DIR")]
     out: Option<PathBuf>,
-    /// What `greybox demo --out DIR` left: the story reads its models in place of diagnosing again
+    /// What `greybox demo link --out DIR` left: the story reads its models in place of diagnosing again
     #[arg(long, value_name = "DIR")]
     demo: Option<PathBuf>,
 }

@@ -64,7 +64,7 @@ impl Answer {
         })
     }
 
-    /// From what `greybox demo --out OUT` left.
+    /// From what `greybox demo link --out OUT` left.
     fn read(out: &Path) -> Result<Self> {
         let text = |name: &str| {
             let path = out.join(name);

@@ -4,10 +4,10 @@ use clap::Args;
 use greybox_commands::calibrate::{FILES, Results, has_free_parameter};
 
 use crate::answer::Answer;
-use crate::arguments::{ModelStudy, Recordings};
 use crate::case::Subject;
 use crate::failure::Failure;
 use crate::progress::Progress;
+use crate::study::{ModelStudy, Recordings};
 
 /// Refit the parameters of a model, its equations unchanged, with uncertainties
 #[derive(Debug, Args)]

@@ -6,11 +6,11 @@ use clap::{Args, ValueEnum};
 use greybox_commands::control::{self as commands, FILES, Request};
 
 use crate::answer::Answer;
-use crate::arguments::whole;
 use crate::failure::Failure;
 use crate::loading;
 use crate::output::OutputFolder;
 use crate::progress::Progress;
+use crate::study::whole;
 
 /// Design a controller for a model, simulate its closed loop, and write its law as code
 #[derive(Debug, Args)]

@@ -10,11 +10,11 @@ use greybox_diagnose::Options;
 use greybox_recording::Recording;
 
 use crate::answer::Answer;
-use crate::arguments::{BILLION, ModelStudy, Study, whole};
 use crate::case::Subject;
 use crate::failure::Failure;
 use crate::loading::{self, LoadedModel, Mechanisms};
 use crate::progress::Progress;
+use crate::study::{BILLION, ModelStudy, Study, whole};
 
 /// Find what physics a model leaves out: what, where, how sure, and a model that fits
 #[derive(Debug, Args)]

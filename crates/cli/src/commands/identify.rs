@@ -9,12 +9,12 @@ use greybox_model::Hold;
 use greybox_report::convert::identification::{MODEL_FILE, Sources};
 
 use crate::answer::Answer;
-use crate::arguments::{BILLION, Recordings, Study, whole};
 use crate::case::Subject;
 use crate::commands::diagnose::{self, written};
 use crate::failure::Failure;
 use crate::loading;
 use crate::progress::Progress;
+use crate::study::{BILLION, Recordings, Study, whole};
 
 /// Find the governing equations from recordings alone: which terms, their values, and how sure each is
 #[derive(Debug, Args)]

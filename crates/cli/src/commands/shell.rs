@@ -1,11 +1,10 @@
 //! `greybox completions` and `greybox man`: what a packager installs beside the command.
 
-use clap::{Args, CommandFactory};
+use clap::Args;
 use clap_complete::Shell;
 use serde_json::json;
 
 use crate::answer::Answer;
-use crate::arguments::Cli;
 use crate::failure::Failure;
 
 /// Print the completions for a shell
@@ -26,17 +25,17 @@ pub(crate) struct Completions {
   greybox man > ~/.local/share/man/man1/greybox.1")]
 pub(crate) struct Man {}
 
-pub(crate) fn completions(arguments: &Completions) -> Result<Answer, Failure> {
+/// The script for a shell; `command` is the whole command line.
+pub(crate) fn completions(arguments: &Completions, mut command: clap::Command) -> Result<Answer, Failure> {
     let mut script = Vec::new();
-    clap_complete::generate(arguments.shell, &mut Cli::command(), "greybox", &mut script);
+    clap_complete::generate(arguments.shell, &mut command, "greybox", &mut script);
     let text = text(script)?;
     let json = json!({ "shell": arguments.shell.to_string(), "text": text });
     Ok(Answer::new(text, json))
 }
 
 /// One page for the command and all its subcommands.
-pub(crate) fn man(_: &Man) -> Result<Answer, Failure> {
-    let mut command = Cli::command();
+pub(crate) fn man(mut command: clap::Command) -> Result<Answer, Failure> {
     command.build();
     let mut page = Vec::new();
     let render = |command: clap::Command, page: &mut Vec<u8>| {

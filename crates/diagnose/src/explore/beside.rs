@@ -13,12 +13,13 @@
 //! replaces a law is compared with it there. Each shape is one of N candidates.
 
 use greybox_calibrate::stochastic::Filter;
-use greybox_calibrate::{Point, Segmentation};
+use greybox_calibrate::{FitPoint, Point, Segmentation};
 
 use super::{Hypothesis, Known, innovations};
 use crate::library::Mechanism;
+use crate::marginal::log_sum;
 use crate::screen::{Gram, effect, signals};
-use crate::shapes::{Group, Shapes, log_sum};
+use crate::shapes::{Group, Shapes};
 use crate::trajectory::TrajectoryEval;
 
 /// Forces of free shape beside a hypothesis.
@@ -48,7 +49,8 @@ impl<'h> Beside<'h> {
     ) -> Option<Beside<'h>> {
         let at = h.at();
         let setup = &at.setup;
-        let along = TrajectoryEval::smoothed(setup, level, &at.errors.noise(), point);
+        let noise = at.errors.noise();
+        let along = TrajectoryEval::smoothed(FitPoint { setup, level, scale: &noise, point });
         let Shapes { groups, forces: mut added } = Shapes::along(setup, &along, 0.0)?;
         let (np, shapes) = (setup.free.len(), added.len());
         let mut lanes = Vec::new();

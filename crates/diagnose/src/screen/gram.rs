@@ -3,7 +3,7 @@
 use std::ops::Range;
 use std::sync::Arc;
 
-use greybox_calibrate::{FreeParameter, Point, SegmentRows, Segmentation, Setup, qr};
+use greybox_calibrate::{FitPoint, FreeParameter, SegmentRows, qr};
 use greybox_simulate::SignalLanes;
 use rayon::prelude::*;
 
@@ -145,14 +145,12 @@ impl Gram {
 /// Simulates with the lanes and gathers the inner products; `blocks` are the groups of lanes whose
 /// mutual products are wanted.
 pub fn gram(
-    setup: &Setup,
-    level: &Segmentation,
-    scale: &[f64],
-    point: &Point,
+    at: FitPoint<'_>,
     signals: &[Arc<SignalLanes>],
     columns: &[Range<usize>],
     blocks: Vec<Range<usize>>,
 ) -> Gram {
+    let FitPoint { setup, level, scale, point } = at;
     let nx = setup.system.nx;
     let np = setup.free.len();
     let lanes = columns.len();

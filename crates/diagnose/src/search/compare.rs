@@ -5,12 +5,13 @@ use std::sync::Arc;
 use greybox_calibrate::{Setup, Work, qr};
 
 use super::{
-    CLEAR, FittedModel, Found, INDEPENDENT, LAST_STEPS, LEAST_SHARE, MEMORY_SAMPLES, MOST_MECHANISMS,
-    MOST_SAMPLES, MechanismTerm, SHORTEST, STEPS_WITHOUT, Search, WHITE, limits, odds, rms_of,
+    CLEAR, INDEPENDENT, LAST_STEPS, LEAST_SHARE, MEMORY_SAMPLES, MOST_MECHANISMS, MOST_SAMPLES, SHORTEST,
+    STEPS_WITHOUT, Search, limits, odds,
 };
 use crate::Weighed;
 use crate::candidate::Candidate;
 use crate::evidence::{ComparedModel, Evidence, Smoothness, effective_sample_ratio, folds, robust, weigh};
+use crate::fitted::{FittedModel, Found, MechanismTerm, WHITE, rms_of};
 use crate::library::Mechanism;
 use crate::place::Place;
 use crate::screen::screen;
@@ -27,7 +28,7 @@ const FAINT: f64 = 0.1;
 impl Search<'_> {
     /// The evidence for `new` over `old`, by the independent samples of the residual that `new` leaves.
     pub(super) fn weigh(&self, old: &FittedModel, new: &FittedModel, scale: &[f64]) -> Evidence {
-        let ratios = effective_sample_ratio(&new.setup, &new.level, scale, &new.fit.point);
+        let ratios = effective_sample_ratio(new.at(scale));
         self.weigh_with(old, new, scale, &ratios)
     }
 
@@ -41,7 +42,7 @@ impl Search<'_> {
         effective_sample_ratio: &[f64],
     ) -> Evidence {
         let (before, after) = (self.side(old, new, scale), self.side(new, new, scale));
-        let folds = |f: &FittedModel| folds(&f.setup, &f.level, scale, &f.fit.point);
+        let folds = |f: &FittedModel| folds(f.at(scale));
         let whitened = new.setup.noise.is_some();
         weigh((&before, &folds(old)), (&after, &folds(new)), &new.fit.count, effective_sample_ratio, whitened)
     }
@@ -249,20 +250,13 @@ impl Search<'_> {
         };
         let doubt = self.doubts.iter().find(doubts)?;
         let base = self.without(fitted, index, scale, 12)?;
-        let scored = screen(
-            &base.setup,
-            self.library,
-            std::slice::from_ref(doubt),
-            &base.level,
-            scale,
-            &base.fit.point,
-        );
-        let rival = self.extend(&base, doubt, scored.first()?, scale, LAST_STEPS)?;
+        let scored = screen(base.at(scale), self.library, std::slice::from_ref(doubt));
+        let alternative = self.extend(&base, doubt, scored.first()?, scale, LAST_STEPS)?;
         // One information per sample for both: that of the residual which fits better.
-        let best = if rival.rss() < fitted.rss() { &rival } else { fitted };
-        let ratios = effective_sample_ratio(&best.setup, &best.level, scale, &best.fit.point);
+        let best = if alternative.rss() < fitted.rss() { &alternative } else { fitted };
+        let ratios = effective_sample_ratio(best.at(scale));
         let score = |f: &FittedModel| self.weigh_with(&base, f, scale, &ratios).score;
-        Some(score(&rival) - score(fitted))
+        Some(score(&alternative) - score(fitted))
     }
 }
 

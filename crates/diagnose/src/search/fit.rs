@@ -2,13 +2,14 @@
 
 use std::cell::LazyCell;
 
-use greybox_calibrate::{FreeParameter, Point, Segmentation, Setup, free_parameters};
+use greybox_calibrate::{FitPoint, FreeParameter, Point, Segmentation, Setup, free_parameters};
 use greybox_model::system::CompileError;
 use greybox_model::{Hold, Model};
 
-use super::{FittedModel, Law, MechanismTerm, STEPS_WITHOUT, Search, laws, limits, longest, same_level};
+use super::{STEPS_WITHOUT, Search, limits, longest, same_level};
 use crate::candidate::{Candidate, Instance};
 use crate::evidence::effective_sample_ratio;
+use crate::fitted::{FittedModel, Law, MechanismTerm, laws};
 use crate::library::Mechanism;
 use crate::screen::{Scored, Together, first_states};
 use crate::trajectory::TrajectoryEval;
@@ -130,7 +131,7 @@ impl Search<'_> {
         let old = &base.fit.point;
         let mut parts = self.laws(base);
         let mut fresh: Vec<Vec<f64>> = vec![Vec::new(); base.setup.data.pieces.len()];
-        let along = LazyCell::new(|| TrajectoryEval::smoothed(&base.setup, &base.level, scale, old));
+        let along = LazyCell::new(|| TrajectoryEval::smoothed(base.at(scale)));
         for member in &together.members {
             let candidate = &open[member.candidate];
             let mechanism = &self.library[candidate.mechanism];
@@ -180,20 +181,13 @@ impl Search<'_> {
 
     /// Whether every mechanism's requirements on its parameters hold, and no inertia is negative.
     pub(crate) fn admissible(&self, fitted: &FittedModel, scale: &[f64]) -> bool {
-        self.is_admissible(&fitted.parts, &fitted.setup, &fitted.level, &fitted.fit.point, scale)
+        self.is_admissible(&fitted.parts, fitted.at(scale))
     }
 
     /// The same of parts in a model at a point of a level.
-    pub(crate) fn is_admissible(
-        &self,
-        parts: &[MechanismTerm],
-        setup: &Setup,
-        level: &Segmentation,
-        point: &Point,
-        scale: &[f64],
-    ) -> bool {
-        parts.iter().all(|part| self.allows(part, setup, &point.parameters))
-            && !self.has_negative_inertia(setup, level, point, scale)
+    pub(crate) fn is_admissible(&self, parts: &[MechanismTerm], at: FitPoint<'_>) -> bool {
+        let FitPoint { setup, point, .. } = at;
+        parts.iter().all(|part| self.allows(part, setup, &point.parameters)) && !self.has_negative_inertia(at)
     }
 
     /// Whether a mechanism's requirements on its parameters hold at these values of the model's.
@@ -250,7 +244,7 @@ impl Search<'_> {
         let fresh = if mechanism.states.is_empty() {
             Vec::new()
         } else {
-            let along = TrajectoryEval::smoothed(&base.setup, &base.level, scale, &base.fit.point);
+            let along = TrajectoryEval::smoothed(base.at(scale));
             first_states(&base.setup, mechanism, candidate, &along)?
         };
         let level = same_level(&setup, &base.level);
@@ -356,7 +350,7 @@ impl Search<'_> {
             return best;
         }
         let gain = |from: &FittedModel, to: &FittedModel| -> f64 {
-            let ratios = effective_sample_ratio(&to.setup, &to.level, scale, &to.fit.point);
+            let ratios = effective_sample_ratio(to.at(scale));
             (0..ratios.len())
                 .filter(|&c| to.fit.rss[c] > 0.0 && from.fit.rss[c] > 0.0)
                 .map(|c| to.fit.count[c] as f64 * ratios[c] * (from.fit.rss[c] / to.fit.rss[c]).ln())
@@ -445,14 +439,9 @@ impl Search<'_> {
 
     /// Whether the mechanisms turn the sign of the mass matrix's determinant somewhere along the recordings: a negative
     /// inertia, or a coupling of accelerations stronger than the inertias that it couples.
-    pub fn has_negative_inertia(
-        &self,
-        setup: &Setup,
-        level: &Segmentation,
-        point: &Point,
-        scale: &[f64],
-    ) -> bool {
-        let along = TrajectoryEval::smoothed(setup, level, scale, point);
+    pub fn has_negative_inertia(&self, at: FitPoint<'_>) -> bool {
+        let FitPoint { setup, .. } = at;
+        let along = TrajectoryEval::smoothed(at);
         let n0 = self.nominal.system.nz;
         let model = &setup.model;
         let highest: Vec<(&str, u8)> =

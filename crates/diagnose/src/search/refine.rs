@@ -1,18 +1,16 @@
-//! Reconsideration: the model with a rival in place of each mechanism, without it, and with simpler laws.
+//! Reconsideration: the model with an alternative in place of each mechanism, without it, and with simpler laws.
 
 use rayon::prelude::*;
 
-use super::{
-    FittedModel, LAST_STEPS, MOST_MECHANISMS, MechanismTerm, PAIR_SAMPLES, PAIRS, PARSIMONY, Rival, Search,
-    SearchState, SelectedTerm, WHITE, is_same,
-};
+use super::{LAST_STEPS, MOST_MECHANISMS, PAIR_SAMPLES, PAIRS, PARSIMONY, Search, SearchState};
 use crate::Stage;
 use crate::candidate::{Candidate, Instance};
+use crate::fitted::{AlternativeTerm, FittedModel, MechanismTerm, SelectedTerm, WHITE, is_same};
 use crate::screen::{first_values, inner_scales, screen, screen_pairs};
 use crate::trajectory::TrajectoryEval;
 
 /// Most candidates that a mechanism is held against once more, beside its relatives.
-const RIVALS: usize = 6;
+const ALTERNATIVES: usize = 6;
 /// Share of a law's strength by which a refinement's differs, to matter.
 const SUBSTANTIAL: f64 = 0.5;
 /// Score that a mechanism keeps, or goes.
@@ -56,9 +54,9 @@ impl Search<'_> {
             let taken = |c: &Candidate| base.parts.iter().any(|p| p.candidate == *c);
             let open: Vec<Candidate> = self.all.iter().filter(|c| !taken(c)).cloned().collect();
             self.listener.stage(Stage::Screening { candidates: open.len(), found: base.parts.len() });
-            let scored = screen(&base.setup, self.library, &open, &base.level, &state.scale, &base.fit.point);
+            let scored = screen(base.at(&state.scale), self.library, &open);
             let relatives = &self.library[part.candidate.mechanism].about.confused_with;
-            let mut short = self.short_list(&open, &scored, 0.003, RIVALS, state.near_equals());
+            let mut short = self.short_list(&open, &scored, 0.003, ALTERNATIVES, state.near_equals());
             // Those it is confused with at the same place, even where the score test ranks them low.
             for s in &scored {
                 let c = &open[s.candidate];
@@ -86,7 +84,7 @@ impl Search<'_> {
                 index = 0;
                 continue;
             }
-            let Some((winner, chosen, rivals, evidence)) =
+            let Some((winner, chosen, alternatives, evidence)) =
                 self.decide(calibrated, &base, &open, trials, &state.scale)
             else {
                 continue;
@@ -95,11 +93,11 @@ impl Search<'_> {
             if winner == part.candidate {
                 if let Some(known) = known {
                     // What equals it exactly stays declared so.
-                    let before = std::mem::replace(&mut known.rivals, rivals);
+                    let before = std::mem::replace(&mut known.alternatives, alternatives);
                     for old in before.into_iter().filter(|r| r.equivalent) {
-                        match known.rivals.iter_mut().find(|r| r.candidate == old.candidate) {
+                        match known.alternatives.iter_mut().find(|r| r.candidate == old.candidate) {
                             Some(new) => new.equivalent = true,
-                            None => known.rivals.push(old),
+                            None => known.alternatives.push(old),
                         }
                     }
                     known.evidence = evidence;
@@ -115,7 +113,7 @@ impl Search<'_> {
                 continue;
             }
             state.accepted.retain(|a| a.candidate != part.candidate);
-            self.accept(state, winner, chosen, rivals, evidence);
+            self.accept(state, winner, chosen, alternatives, evidence);
         }
     }
 
@@ -135,8 +133,7 @@ impl Search<'_> {
         else {
             return;
         };
-        let pairs =
-            screen_pairs(&base.setup, self.library, &self.all, &base.level, &scale, &base.fit.point, PAIRS);
+        let pairs = screen_pairs(base.at(&scale), self.library, &self.all, PAIRS);
         self.listener.stage(Stage::Fitting { candidates: pairs.len() });
         let best = pairs
             .par_iter()
@@ -151,7 +148,7 @@ impl Search<'_> {
             state.accepted = best
                 .parts
                 .iter()
-                .map(|p| SelectedTerm { candidate: p.candidate.clone(), evidence, rivals: Vec::new() })
+                .map(|p| SelectedTerm { candidate: p.candidate.clone(), evidence, alternatives: Vec::new() })
                 .collect();
             state.current = best;
             self.settle(state);
@@ -192,7 +189,7 @@ impl Search<'_> {
                 state.accepted.push(SelectedTerm {
                     candidate: open[*c].clone(),
                     evidence,
-                    rivals: Vec::new(),
+                    alternatives: Vec::new(),
                 });
                 state.current = smaller;
                 self.settle(state);
@@ -274,11 +271,12 @@ impl Search<'_> {
             self.listener.dropped(&mechanism.kind);
             let law = simpler.parts[index].candidate.clone();
             if let Some(known) = state.accepted.iter_mut().find(|a| a.candidate == refinement) {
-                known.rivals.retain(|r| r.candidate != law);
+                known.alternatives.retain(|r| r.candidate != law);
                 let before = std::mem::replace(&mut known.evidence, evidence);
                 known.candidate = law;
-                let rival = Rival { candidate: refinement, instance, evidence: before, equivalent: true };
-                known.rivals.insert(0, rival);
+                let alternative =
+                    AlternativeTerm { candidate: refinement, instance, evidence: before, equivalent: true };
+                known.alternatives.insert(0, alternative);
             }
             state.current = simpler;
         }
@@ -291,7 +289,7 @@ impl Search<'_> {
             let law = state.current.parts[index].candidate.clone();
             let Some(known) = state.accepted.iter_mut().find(|a| a.candidate == law) else { continue };
             for refinement in self.all.iter().filter(|c| self.is_refined_by(&law, c)) {
-                if known.rivals.iter().any(|r| r.equivalent && r.candidate == *refinement) {
+                if known.alternatives.iter().any(|r| r.equivalent && r.candidate == *refinement) {
                     continue;
                 }
                 if self.is_spent() {
@@ -300,9 +298,9 @@ impl Search<'_> {
                 let Some(instance) = self.unseen(&state.current, index, refinement, &state.scale) else {
                     continue;
                 };
-                match known.rivals.iter_mut().find(|r| r.candidate == *refinement) {
-                    Some(rival) => rival.equivalent = true,
-                    None => known.rivals.push(Rival {
+                match known.alternatives.iter_mut().find(|r| r.candidate == *refinement) {
+                    Some(alternative) => alternative.equivalent = true,
+                    None => known.alternatives.push(AlternativeTerm {
                         candidate: refinement.clone(),
                         instance,
                         evidence: known.evidence,
@@ -329,7 +327,7 @@ impl Search<'_> {
         if !mechanism.is_at_equal_strengths(law) {
             return None;
         }
-        let along = TrajectoryEval::smoothed(&fitted.setup, &fitted.level, scale, &fitted.fit.point);
+        let along = TrajectoryEval::smoothed(fitted.at(scale));
         let scales = inner_scales(mechanism, refinement, &along, &fitted.setup)?;
         let choices = first_values(mechanism, &scales);
         let at = |inner: &Vec<f64>| -> Option<(bool, Instance)> {

@@ -6,13 +6,13 @@ use rayon::prelude::*;
 use super::compare::{by_likelihood, calibrated_rss};
 use super::fit::transfer;
 use super::{
-    BEST, FAR, FINALISTS, FIRST_STEPS, FittedModel, LAST_STEPS, LEAST_SHARE, MORE_STEPS, MOST_MECHANISMS,
-    PAIR_SAMPLES, PAIRS, PARSIMONY, Rival, SHORT_LIST, STARTS, Search, SearchState, SelectedTerm, UNDECIDED,
-    WHITE, limits,
+    BEST, FAR, FINALISTS, FIRST_STEPS, LAST_STEPS, LEAST_SHARE, MORE_STEPS, MOST_MECHANISMS, PAIR_SAMPLES,
+    PAIRS, PARSIMONY, SHORT_LIST, STARTS, Search, SearchState, UNDECIDED, limits,
 };
 use crate::Stage;
 use crate::candidate::Candidate;
 use crate::evidence::{Evidence, effective_sample_ratio};
+use crate::fitted::{AlternativeTerm, FittedModel, SelectedTerm, WHITE};
 use crate::place::Place;
 use crate::screen::{Scored, screen, screen_pairs};
 use crate::uncertainty::Uncertainty;
@@ -39,15 +39,7 @@ impl Search<'_> {
         let scale = state.scale.clone();
         let open: Vec<Candidate> =
             self.all.iter().filter(|c| !current.parts.iter().any(|p| p.candidate == **c)).cloned().collect();
-        let pairs = screen_pairs(
-            &current.setup,
-            self.library,
-            &open,
-            &current.level,
-            &scale,
-            &current.fit.point,
-            PAIRS,
-        );
+        let pairs = screen_pairs(current.at(&scale), self.library, &open, PAIRS);
         self.listener.stage(Stage::Fitting { candidates: pairs.len() });
         let trials: Vec<FittedModel> =
             pairs.par_iter().filter_map(|p| self.extend_by_pair(&current, &open, p, &scale)).collect();
@@ -78,7 +70,7 @@ impl Search<'_> {
             state.accepted.push(SelectedTerm {
                 candidate: part.candidate.clone(),
                 evidence,
-                rivals: Vec::new(),
+                alternatives: Vec::new(),
             });
         }
         state.current = best;
@@ -124,7 +116,7 @@ impl Search<'_> {
         };
         let open: Vec<Candidate> = self.all.iter().filter(|c| !taken(c)).cloned().collect();
         self.listener.stage(Stage::Screening { candidates: open.len(), found: current.parts.len() });
-        let scored = screen(&current.setup, self.library, &open, &current.level, &scale, &current.fit.point);
+        let scored = screen(current.at(&scale), self.library, &open);
         let ranking: Vec<(&str, f64)> =
             scored.iter().map(|s| (&*self.library[open[s.candidate].mechanism].kind, s.gain)).collect();
         self.listener.screened(&ranking);
@@ -134,7 +126,7 @@ impl Search<'_> {
         if trials.is_empty() {
             return false;
         }
-        let Some((winner, chosen, rivals, evidence)) =
+        let Some((winner, chosen, alternatives, evidence)) =
             self.decide(calibrated, current, &open, trials, &scale)
         else {
             return false;
@@ -162,7 +154,7 @@ impl Search<'_> {
             state.rejected = vec![chosen];
             return false;
         }
-        self.accept(state, winner, chosen, rivals, evidence);
+        self.accept(state, winner, chosen, alternatives, evidence);
         true
     }
 
@@ -215,7 +207,7 @@ impl Search<'_> {
             .anchors(base, state)
             .into_iter()
             .map(|a| {
-                let scored = screen(&a.setup, self.library, open, &a.level, scale, &a.fit.point);
+                let scored = screen(a.at(scale), self.library, open);
                 (a, scored)
             })
             .collect();
@@ -301,7 +293,7 @@ impl Search<'_> {
         state: &mut SearchState,
         winner: Candidate,
         chosen: FittedModel,
-        rivals: Vec<Rival>,
+        alternatives: Vec<AlternativeTerm>,
         evidence: Evidence,
     ) {
         let scale = state.scale.clone();
@@ -310,7 +302,7 @@ impl Search<'_> {
         state.accepted.retain(|a| chosen.parts.iter().any(|p| p.candidate == a.candidate));
         match self.split(&chosen, &scale) {
             Some(split) => {
-                let whole = Rival {
+                let whole = AlternativeTerm {
                     candidate: winner.clone(),
                     instance: chosen.parts[chosen.parts.len() - 1].instance.clone(),
                     evidence,
@@ -320,30 +312,30 @@ impl Search<'_> {
                     // A part that was there before keeps its own evidence.
                     if let Some(known) = before.iter().find(|a| a.candidate == part.candidate) {
                         let mut known = known.clone();
-                        known.rivals.retain(|r| r.candidate != winner);
-                        known.rivals.insert(0, whole.clone());
+                        known.alternatives.retain(|r| r.candidate != winner);
+                        known.alternatives.insert(0, whole.clone());
                         state.accepted.push(known);
                         continue;
                     }
                     // What was tried beside the whole is no equal of its parts alone.
                     let mut others = vec![whole.clone()];
                     others.extend(
-                        rivals
+                        alternatives
                             .iter()
                             .filter(|r| !split.parts.iter().any(|p| p.candidate == r.candidate))
-                            .map(|r| Rival { equivalent: false, ..r.clone() }),
+                            .map(|r| AlternativeTerm { equivalent: false, ..r.clone() }),
                     );
                     state.accepted.push(SelectedTerm {
                         candidate: part.candidate.clone(),
                         evidence,
-                        rivals: others,
+                        alternatives: others,
                     });
                 }
                 state.current = split;
             }
             None => {
                 state.current = chosen;
-                state.accepted.push(SelectedTerm { candidate: winner, evidence, rivals });
+                state.accepted.push(SelectedTerm { candidate: winner, evidence, alternatives });
             }
         }
         self.settle(state);
@@ -378,14 +370,7 @@ impl Search<'_> {
             None => self.extend(current, candidate, scored, scale, FIRST_STEPS),
             Some(index) => {
                 let base = self.without(current, index, scale, 6)?;
-                let again = screen(
-                    &base.setup,
-                    self.library,
-                    std::slice::from_ref(candidate),
-                    &base.level,
-                    scale,
-                    &base.fit.point,
-                );
+                let again = screen(base.at(scale), self.library, std::slice::from_ref(candidate));
                 self.extend(&base, candidate, again.first()?, scale, FIRST_STEPS)
             }
         }
@@ -438,10 +423,10 @@ impl Search<'_> {
         open: &[Candidate],
         trials: Vec<(usize, FittedModel)>,
         scale: &[f64],
-    ) -> Option<(Candidate, FittedModel, Vec<Rival>, Evidence)> {
+    ) -> Option<(Candidate, FittedModel, Vec<AlternativeTerm>, Evidence)> {
         // One information per sample for all: that of the residual which fits best.
         let best = trials.iter().min_by(|a, b| a.1.rss().total_cmp(&b.1.rss()))?;
-        let ratios = effective_sample_ratio(&best.1.setup, &best.1.level, scale, &best.1.fit.point);
+        let ratios = effective_sample_ratio(best.1.at(scale));
         let mut weighed: Vec<(usize, FittedModel, Evidence)> = trials
             .into_par_iter()
             .map(|(c, f)| {
@@ -487,12 +472,13 @@ impl Search<'_> {
             let undetermined = undetermined && refined.contains(&self.library[open[chosen].mechanism].kind);
             let equivalent = as_good || disputed || close || undetermined;
             let instance = f.parts.last()?.instance.clone();
-            Some(Rival { candidate: open[c].clone(), instance, evidence: e, equivalent })
+            Some(AlternativeTerm { candidate: open[c].clone(), instance, evidence: e, equivalent })
         };
-        let rivals =
+        let alternatives =
             undetermined.into_iter().map(|u| (u, true)).chain(weighed.into_iter().map(|w| (w, false)));
-        let rivals = rivals.filter_map(|(trial, undetermined)| tell(trial, undetermined)).collect();
-        Some((open[chosen].clone(), fitted, rivals, evidence))
+        let alternatives =
+            alternatives.filter_map(|(trial, undetermined)| tell(trial, undetermined)).collect();
+        Some((open[chosen].clone(), fitted, alternatives, evidence))
     }
 
     /// Whether the recordings determine none of the strengths of a model's last part.

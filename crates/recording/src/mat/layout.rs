@@ -1,10 +1,9 @@
 //! Which variables are the time, which the signals, and how the signals are called.
 
 use super::level5::{Array, Value, Variable};
-use crate::csv::{header_cell, seconds};
 use crate::error::{Place, RecordingError};
-use crate::finding::{Finding, Severity};
-use crate::read::{TIMES, told};
+use crate::finding::{Finding, Severity, told};
+use crate::header::{TIMES, header_cell, seconds};
 use crate::recording::{Channel, MIN_SAMPLES, Recording};
 
 /// Names of a list of column names, alone or behind the matrix's name and `_`.

@@ -5,7 +5,7 @@
 //!
 //! Nothing is reserved on the word of the file: what is read is there, what is unpacked counts against [`ROOM`].
 
-use crate::read::ROOM;
+use crate::file::ROOM;
 use flate2::bufread::ZlibDecoder;
 use std::io::Read;
 

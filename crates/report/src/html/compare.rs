@@ -3,7 +3,7 @@
 use askama::Template;
 
 use super::{Assets, Common, severity};
-use crate::compare::{Change, Comparison, Errors, MechanismChange, Run, Weight};
+use crate::comparison::{Change, Comparison, Errors, MechanismChange, Run, Weight};
 use crate::contract::{Estimate, Interval};
 use crate::notes::{self, Note};
 use crate::sentence::comparison as words;

@@ -1,6 +1,6 @@
 //! What changed from one run to another, in plain language.
 
-use crate::compare::{Change, Comparison, MechanismChange};
+use crate::comparison::{Change, Comparison, MechanismChange};
 use crate::contract::{Report, Verdict};
 use crate::{expression, format};
 

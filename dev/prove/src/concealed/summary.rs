@@ -9,8 +9,8 @@ use serde::{Deserialize, Serialize};
 use serde_json::json;
 
 use super::Finished;
+use super::baseline::Verdict;
 use super::case::TruthEffect;
-use super::rival::Verdict;
 use super::score::is_worse;
 use greybox_plants::kind::Kind;
 
@@ -468,10 +468,10 @@ fn calibration(finished: &[Finished]) -> String {
     text
 }
 
-/// Greybox beside the naive rival, on the cases of which the rival can say anything.
-pub(crate) fn render_rival(finished: &[Finished]) -> String {
+/// Greybox beside the baseline method, on the cases of which the baseline can say anything.
+pub(crate) fn render_baseline(finished: &[Finished]) -> String {
     let both: Vec<(&Finished, &Verdict)> =
-        finished.iter().filter_map(|f| f.rival.as_ref().map(|r| (f, r))).collect();
+        finished.iter().filter_map(|f| f.baseline.as_ref().map(|r| (f, r))).collect();
     let of = |class: &'static str| both.iter().filter(move |(f, _)| f.truth.class == class);
     let family = |f: &Finished, r: &Verdict| {
         r.kind.and_then(Kind::family_of).is_some_and(|x| f.truth.effects.iter().any(|e| e.family == x))
@@ -480,7 +480,7 @@ pub(crate) fn render_rival(finished: &[Finished]) -> String {
         let named = r.equation.as_ref();
         named.is_some_and(|e| f.truth.effects.iter().any(|t| t.equations.contains(e)))
     };
-    // Of several effects the rival need name only one.
+    // Of several effects the baseline need name only one.
     let kind = |f: &Finished, r: &Verdict| {
         let fits = |e: &TruthEffect, k: &str| e.kind == k || e.twins.contains(&k);
         r.kind.is_some_and(|k| f.truth.effects.iter().any(|e| fits(e, k)))
@@ -489,7 +489,7 @@ pub(crate) fn render_rival(finished: &[Finished]) -> String {
         "{:<38} {:>9} {:>9}   on the {} cases with every state measured\n",
         "",
         "greybox",
-        "rival",
+        "baseline",
         both.len()
     );
     let mut line = |what: &str, ours: Option<f64>, theirs: Option<f64>| {
@@ -526,7 +526,7 @@ pub(crate) fn render_rival(finished: &[Finished]) -> String {
         share(of("outside").filter_map(|(f, _)| f.score.outside)),
         share(of("outside").map(|(_, r)| r.detected && r.kind.is_none())),
     );
-    text.push_str("held-out error of the rival: none, its terms are not a simulation\n\n");
+    text.push_str("held-out error of the baseline: none, its terms are not a simulation\n\n");
     text
 }
 
@@ -534,7 +534,7 @@ pub(crate) fn render_rival(finished: &[Finished]) -> String {
 pub(crate) fn to_json(seed: u64, finished: &[Finished], figures: &Figures) -> serde_json::Value {
     let cases: Vec<_> = finished
         .iter()
-        .map(|f| json!({"truth": f.truth, "score": f.score, "oracle": f.oracle, "rival": f.rival}))
+        .map(|f| json!({"truth": f.truth, "score": f.score, "oracle": f.oracle, "baseline": f.baseline}))
         .collect();
     let goals: Vec<_> = GOALS
         .iter()

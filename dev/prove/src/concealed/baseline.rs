@@ -1,4 +1,4 @@
-//! The naive rival: what one would script with a sparse-regression library in an afternoon.
+//! The baseline method: what one would script with a sparse-regression library in an afternoon.
 //!
 //! The calibrated model (greybox's own calibration, which is generous), accelerations by Savitzky–Golay
 //! derivatives of the measurements, the force that the equations then miss, and STLSQ (Brunton, Proctor &
@@ -24,7 +24,7 @@ const PREDICTED: f64 = 0.1;
 /// Missing force over the force of inertia (RMS) below which nothing is said to be missing.
 const NOTICED: f64 = 0.05;
 
-/// What the rival says.
+/// What the baseline says.
 #[derive(Debug, Clone, Default, PartialEq, Serialize)]
 pub(crate) struct Verdict {
     pub(crate) detected: bool,

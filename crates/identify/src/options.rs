@@ -1,0 +1,65 @@
+//! What to identify: the states, the inputs, the candidate terms and the limits of the search.
+
+use greybox_model::Hold;
+
+use crate::library::{Library, Monomials};
+
+/// What to identify.
+#[derive(Debug, Clone, PartialEq)]
+pub struct Options {
+    /// Channels that are the coordinates; one equation each.
+    pub states: Vec<String>,
+    /// Channels that drive the machine. With one input, every equation has it on the right with factor one; the
+    /// others enter as terms. Without any, the leading coefficients are one.
+    pub inputs: Vec<String>,
+    /// Order of the leading derivative: 2 for mechanics (q̈), 1 for first-order systems.
+    pub derivatives: usize,
+    /// The candidate terms.
+    pub library: Library,
+    /// Orders of the library to search, from 1 to this.
+    pub order: usize,
+    /// What the inputs do between samples; none: found from the recordings.
+    pub hold: Option<Hold>,
+    /// A delayed feedback of a state.
+    pub delay: Option<DelayedState>,
+    /// Replicates of the block bootstrap behind the inclusion probabilities.
+    pub replicates: usize,
+    /// Seed of the bootstrap.
+    pub seed: u64,
+    /// Work of the fits ([`greybox_calibrate::Work`]) after which nothing more is tried.
+    pub work: u64,
+}
+
+/// The usual limit of the work.
+pub const MOST_WORK: u64 = 80_000_000_000;
+
+impl Options {
+    /// The usual request: second order, polynomials up to order 6 for one state, up to 4 for several.
+    pub fn new(states: &[&str], inputs: &[&str]) -> Options {
+        let several = states.len() > 1;
+        let monomials = if several { Monomials::Separate } else { Monomials::Tensor };
+        Options {
+            states: states.iter().map(|s| (*s).to_string()).collect(),
+            inputs: inputs.iter().map(|s| (*s).to_string()).collect(),
+            derivatives: 2,
+            library: Library { monomials, ..Library::default() },
+            order: if several { 4 } else { 6 },
+            hold: None,
+            delay: None,
+            replicates: 100,
+            seed: 0,
+            work: MOST_WORK,
+        }
+    }
+}
+
+/// A feedback k_p q(t − τ) that is added to the first input, on the right side of every equation (thesis Eq 3.3).
+#[derive(Debug, Clone, PartialEq)]
+pub struct DelayedState {
+    /// The state.
+    pub state: String,
+    /// The gain k_p where it is known.
+    pub gain: Option<f64>,
+    /// Longest delay looked for, s.
+    pub longest: f64,
+}

@@ -1,0 +1,52 @@
+//! A file whatever its format: its bytes, what errors call it, and how much its values may need.
+
+use crate::error::{Place, RecordingError};
+use std::fs;
+use std::io::ErrorKind;
+use std::path::Path;
+
+/// Most bytes that the values of a file may need, unpacked. A variable of a MAT-file has at most so many anyway.
+#[cfg(any(feature = "mat", feature = "parquet"))]
+pub(crate) const ROOM: u64 = 2 << 30;
+
+/// The content of the file at `path`, what errors call it, and its name.
+pub(crate) fn bytes(path: &Path) -> Result<(Vec<u8>, String, String), RecordingError> {
+    let (label, name) = check_file(path)?;
+    let bytes = fs::read(path).map_err(|source| unread(&label, source))?;
+    Ok((bytes, label, name))
+}
+
+/// What errors call the file at `path`, and its name; an error where there is no file.
+pub(crate) fn check_file(path: &Path) -> Result<(String, String), RecordingError> {
+    let label = path.display().to_string();
+    let kind = fs::metadata(path).map_err(|source| unread(&label, source))?.file_type();
+    if kind.is_dir() {
+        return Err(RecordingError::IsDirectory { place: Place::file(&label) });
+    }
+    if is_device(kind) {
+        return Err(RecordingError::IsDevice { place: Place::file(&label) });
+    }
+    let name = path.file_name().map_or_else(|| label.clone(), |name| name.to_string_lossy().into_owned());
+    Ok((label, name))
+}
+
+/// Whether it is a device, of which some never end. (A pipe is none: `<(zcat run.csv.gz)` may be read.)
+pub fn is_device(kind: fs::FileType) -> bool {
+    #[cfg(unix)]
+    {
+        use std::os::unix::fs::FileTypeExt;
+        kind.is_char_device() || kind.is_block_device()
+    }
+    #[cfg(not(unix))]
+    {
+        let _ = kind;
+        false
+    }
+}
+
+pub(crate) fn unread(label: &str, source: std::io::Error) -> RecordingError {
+    match source.kind() {
+        ErrorKind::NotFound => RecordingError::NotFound { place: Place::file(label) },
+        _ => RecordingError::Io { place: Place::file(label), action: "read", source },
+    }
+}
