@@ -568,12 +568,19 @@ impl Problem<'_> {
     /// column has had: where the model does not feel it for a while, its step stays bounded. The region grows and
     /// shrinks by how much of the decrease that the linear model promised came true.
     pub fn fit(&self, point: Point, limits: Limits) -> Fit {
+        self.fit_from(point, None, limits)
+    }
+
+    /// [`fit`](Self::fit) from a point whose rows, with their derivatives, are known.
+    pub(crate) fn fit_from(&self, point: Point, rows: Option<Vec<SegmentRows>>, limits: Limits) -> Fit {
         let (nx, np) = (self.system.nx, self.free.len());
         let width = nx + np + 1;
+        let known = point.parameters.clone();
         let mut point = point;
         for f in self.free {
             point.parameters[f.index] = point.parameters[f.index].clamp(f.lower, f.upper);
         }
+        let rows = rows.filter(|_| point.parameters == known);
         let continued = self.continued();
         let pinned = |i: usize, j: usize| {
             self.start_priors[i][j].1 == 0.0 || (continued[i] && self.carried.contains(&j))
@@ -582,11 +589,14 @@ impl Problem<'_> {
         let mut damping = 1.0_f64;
         let mut ending = Ending::Limit;
         let mut iterations = 0;
-        let mut rows = self.rows(&point, true, None);
+        // Those of `point` throughout; with derivatives, where another iteration follows.
+        let mut rows = rows.unwrap_or_else(|| self.rows(&point, limits.iterations > 0, None));
         let mut cost = self.cost_of(&rows, &point);
         let work_of = |rows: &[SegmentRows]| rows.iter().map(|s| s.work).sum::<u64>();
         let mut work = work_of(&rows);
         let mut small = 0;
+        // The first trial of an iteration was taken over.
+        let mut goes_well = true;
         let mut sizes = vec![0.0; np];
         while iterations < limits.iterations && !self.work.ends(work) {
             iterations += 1;
@@ -606,6 +616,8 @@ impl Problem<'_> {
                     Reduced { triangle: qr::triangle(&mut a, s.rows, width) }
                 })
                 .collect();
+            // No more is needed of the derivatives: those of a trial may take their place.
+            rows.iter_mut().for_each(|s| (s.jx, s.jp) = (Vec::new(), Vec::new()));
             let global = self.stack(&reduced, &point.parameters, nx, np);
             for (j, size) in sizes.iter_mut().enumerate() {
                 let square: f64 = (0..=j).map(|i| global[i * (np + 1) + j].powi(2)).sum();
@@ -619,8 +631,9 @@ impl Problem<'_> {
                 radius = FIRST_RADIUS * if size > 0.0 { size } else { cost.sqrt() };
             }
             let mut accepted = false;
+            let mut has_derivatives = false;
             let mut otherwise = Ending::Stalled;
-            for _ in 0..TRIALS {
+            for trials in 0..TRIALS {
                 let Some((step, lambda)) = self.step_within(&global, &sizes, radius, &point.parameters)
                 else {
                     break;
@@ -663,7 +676,9 @@ impl Problem<'_> {
                         }
                     }
                 }
-                let simulated = self.rows(&trial, false, None);
+                // What is likely to be taken over is simulated once, with the derivatives that the next iteration needs.
+                has_derivatives = trials == 0 && goes_well && iterations < limits.iterations;
+                let simulated = self.rows(&trial, has_derivatives, None);
                 let value = self.cost_of(&simulated, &trial);
                 work += work_of(&simulated);
                 // How much of the decrease that the linear model promised came true says how far it reaches.
@@ -683,6 +698,8 @@ impl Problem<'_> {
                     small = if decrease < limits.tolerance { small + 1 } else { 0 };
                     cost = value;
                     damping = (2.0 * damping).min(1.0);
+                    rows = simulated;
+                    goes_well = trials == 0;
                     accepted = true;
                     break;
                 }
@@ -698,12 +715,11 @@ impl Problem<'_> {
                 ending = Ending::Converged;
                 break;
             }
-            if iterations < limits.iterations {
+            if iterations < limits.iterations && !has_derivatives {
                 rows = self.rows(&point, true, None);
                 work += work_of(&rows);
             }
         }
-        let rows = self.rows(&point, false, None);
         self.take_over(&rows, &continued, &mut point);
         let (rss, count) = self.rss(&rows);
         Fit { cost: self.cost_of(&rows, &point), point, rss, count, iterations, ending }

@@ -535,13 +535,15 @@ impl Setup {
     /// Fits from the cheapest of several starting points.
     pub fn fit(&self, level: &Segmentation, scale: &[f64], points: &[Point], limits: Limits) -> Fit {
         self.with_problem(level, scale, |problem| {
-            let simulated = points.iter().map(|p| (problem.rows(p, false, None), p));
+            let is_only = points.len() == 1 && limits.iterations > 0;
+            let simulated = points.iter().map(|p| (problem.rows(p, is_only, None), p));
             let priced = simulated.map(|(rows, p)| (problem.cost_of(&rows, p), rows, p));
-            let best = match priced.min_by(|a, b| a.0.total_cmp(&b.0)) {
-                Some((_, rows, point)) => self.with_fresh_starts(problem, &rows, point.clone()),
-                None => Point { parameters: self.values(), starts: Vec::new() },
+            let Some((_, rows, point)) = priced.min_by(|a, b| a.0.total_cmp(&b.0)) else {
+                return problem.fit(Point { parameters: self.values(), starts: Vec::new() }, limits);
             };
-            problem.fit(best, limits)
+            let best = self.with_fresh_starts(problem, &rows, point.clone());
+            let known = is_only && best == *point;
+            problem.fit_from(best, known.then_some(rows), limits)
         })
     }
 
