@@ -506,7 +506,7 @@ fn find_channel(
             file,
             channel: channel.to_string(),
             role,
-            available: greybox_recording::told(available),
+            available: greybox_recording::listed(available),
             help: help(channel, name.map(|name| (name, "")), recording),
         });
     };

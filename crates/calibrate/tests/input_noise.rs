@@ -12,7 +12,7 @@ const DT: f64 = 0.01;
 const N: usize = 3000;
 
 /// What is told of an oscillator that `truth` drives, where `logged` stands in the column of the force.
-fn told(truth: &[f64], logged: &[f64], noise: f64) -> (Vec<InputNoise>, Vec<Finding>) {
+fn reported(truth: &[f64], logged: &[f64], noise: f64) -> (Vec<InputNoise>, Vec<Finding>) {
     told_by(OSCILLATOR, truth, logged, noise)
 }
 
@@ -43,7 +43,7 @@ fn multisine(lines: &[f64]) -> Vec<f64> {
 fn noise_of_a_measured_input_is_told_with_its_size() {
     let truth = multisine(&[0.3, 0.7, 1.1, 2.3]);
     let noisy: Vec<f64> = truth.iter().zip(normal(5, N)).map(|(u, e)| u + 0.2 * e).collect();
-    let (found, words) = told(&truth, &noisy, 2e-4);
+    let (found, words) = reported(&truth, &noisy, 2e-4);
     assert_eq!(found.len(), 1);
     let found = found[0];
     assert!((found.sigma / 0.2 - 1.0).abs() < 0.1 && !found.rounded, "{found:?}");
@@ -53,14 +53,14 @@ fn noise_of_a_measured_input_is_told_with_its_size() {
     assert_eq!(words[0].channel.as_deref(), Some("f"));
     assert!(words[0].message.starts_with("If this input is a measurement, its noise of 0."), "{}", words[0]);
     // Where the output is noisier than that, nothing is to be said.
-    assert!(told(&truth, &noisy, 2e-2).0.is_empty());
+    assert!(reported(&truth, &noisy, 2e-2).0.is_empty());
 }
 
 #[test]
 fn a_coarse_sensor_of_an_input_is_told() {
     let truth = multisine(&[0.3, 0.7, 1.1, 2.3]);
     let rounded: Vec<f64> = truth.iter().map(|u| (u / 0.5).round() * 0.5).collect();
-    let (found, _) = told(&truth, &rounded, 2e-5);
+    let (found, _) = reported(&truth, &rounded, 2e-5);
     assert!(found.len() == 1 && found[0].rounded, "{found:?}");
     assert!((found[0].sigma / (0.5 / 12f64.sqrt()) - 1.0).abs() < 0.05, "{found:?}");
 }
@@ -88,7 +88,7 @@ fn commands_are_no_noisy_measurements() {
     // A spring that is far off leaves too much to prove anything.
     let off = OSCILLATOR.replace("20.0", "28.0");
     for (what, u) in commands {
-        let (found, _) = told(&u, &u, 1e-5);
+        let (found, _) = reported(&u, &u, 1e-5);
         assert!(found.is_empty(), "{what}: {found:?}");
         let (found, _) = told_by(&off, &u, &u, 2e-4);
         assert!(found.is_empty(), "{what}, wrong model: {found:?}");
@@ -101,5 +101,5 @@ fn an_input_that_is_kept_between_its_samples_is_a_command() {
     let noisy: Vec<f64> = truth.iter().zip(normal(5, N)).map(|(u, e)| u + 0.2 * e).collect();
     let held = OSCILLATOR.replace("unit = \"N\" }", "unit = \"N\", hold = \"zero\" }");
     assert!(held != OSCILLATOR && told_by(&held, &truth, &noisy, 2e-4).0.is_empty());
-    assert_eq!(told(&truth, &noisy, 2e-4).0.len(), 1);
+    assert_eq!(reported(&truth, &noisy, 2e-4).0.len(), 1);
 }

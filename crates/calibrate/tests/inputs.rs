@@ -172,8 +172,8 @@ fn what_has_no_derivative_is_refused() {
 #[test]
 fn the_advice_at_a_primed_input_works() {
     let primed = BASE.replace("du = { unit = \"m/s\", channel = \"u'\" }\n", "").replace("du)", "u')");
-    let told = Model::from_toml(&primed, "m.toml").unwrap_err();
-    let help = told.help().unwrap();
+    let reported = Model::from_toml(&primed, "m.toml").unwrap_err();
+    let help = reported.help().unwrap();
     let line = "du = { unit = \"m/s\", channel = \"u'\" }";
     assert!(help.contains(line) && help.contains("and write `du`"), "{help}");
     let followed = primed.replace("[inputs]\n", &format!("[inputs]\n{line}\n")).replace("u')", "du)");

@@ -29,23 +29,23 @@ fn refusal(header: &str) -> String {
 
 #[test]
 fn a_slip_in_the_name_of_a_state_s_channel_is_corrected_at_the_state() {
-    let told = refusal("t,u,angle,spead");
-    assert!(told.contains("Did you mean `angle`?"), "{told}");
+    let reported = refusal("t,u,angle,spead");
+    assert!(reported.contains("Did you mean `angle`?"), "{reported}");
     assert!(
-        told.contains("`--map angel=angle`, or in the model, `theta = { channel = \"angle\" }`"),
-        "{told}"
+        reported.contains("`--map angel=angle`, or in the model, `theta = { channel = \"angle\" }`"),
+        "{reported}"
     );
 }
 
 #[test]
 fn a_measurement_is_corrected_at_its_key() {
-    let told = refusal("t,u,angel,speed");
-    assert!(told.contains("`speed` in the place of `spead` under `[measurements]`"), "{told}");
+    let reported = refusal("t,u,angel,speed");
+    assert!(reported.contains("`speed` in the place of `spead` under `[measurements]`"), "{reported}");
 }
 
 #[test]
 fn where_no_name_is_near_none_is_guessed() {
-    let told = refusal("t,f,angel,spead");
-    assert!(!told.contains("Did you mean"), "{told}");
-    assert!(told.contains("`--map u=…`, or in the model, `u = { channel = \"…\" }`"), "{told}");
+    let reported = refusal("t,f,angel,spead");
+    assert!(!reported.contains("Did you mean"), "{reported}");
+    assert!(reported.contains("`--map u=…`, or in the model, `u = { channel = \"…\" }`"), "{reported}");
 }

@@ -59,8 +59,8 @@ fn a_mode_too_fast_to_follow_is_refused_with_its_rate() {
         assert!((rate * lag - 1.0).abs() < 0.02, "{rate:e}");
         assert_eq!(dt, 0.01);
     }
-    let told = laid_out(1e-9).unwrap_err().to_string();
-    assert!(told.starts_with("the model is stiff: it has a mode of about 1.0e9 1/s"), "{told}");
+    let reported = laid_out(1e-9).unwrap_err().to_string();
+    assert!(reported.starts_with("the model is stiff: it has a mode of about 1.0e9 1/s"), "{reported}");
 }
 
 /// Presliding friction (Dahl): its memory fades at a rate that grows with the speed.

@@ -105,8 +105,8 @@ impl CaseOptions {
             packed.extend(files.recordings.iter().filter(|(path, _)| path.is_file()).map(copied));
         }
         if outcome.is_ok() {
-            let told = subject.files.iter().filter(|name| self.with_data || !name.ends_with(".html"));
-            packed.extend(told.filter_map(|name| {
+            let reported = subject.files.iter().filter(|name| self.with_data || !name.ends_with(".html"));
+            packed.extend(reported.filter_map(|name| {
                 let text = fs::read_to_string(subject.out.join(name)).ok()?;
                 Some((format!("results/{name}"), Content::Text(values.taken_out_of(&text))))
             }));
@@ -129,14 +129,14 @@ impl CaseOptions {
             .zip(read)
             .enumerate()
             .map(|(k, ((path, name), read))| {
-                let mut told = match read {
+                let mut reported = match read {
                     Ok(recording) => statistics(recording, &findings(recording, model, subject)),
-                    Err(failure) => self.told(failure, true),
+                    Err(failure) => self.reported(failure, true),
                 };
-                told["file"] = json!(name);
-                told["held_out"] = json!(k >= subject.train.len());
-                told["bytes"] = json!(fs::metadata(path).map(|m| m.len()).ok());
-                told
+                reported["file"] = json!(name);
+                reported["held_out"] = json!(k >= subject.train.len());
+                reported["bytes"] = json!(fs::metadata(path).map(|m| m.len()).ok());
+                reported
             })
             .collect();
         let unread = read.iter().any(Result::is_err);
@@ -153,23 +153,23 @@ impl CaseOptions {
             "recordings": recordings,
             "outcome": match (outcome, panic) {
                 (_, Some(words)) => json!({ "panic": words }),
-                (Err(failure), _) => self.told(failure, unread),
+                (Err(failure), _) => self.reported(failure, unread),
                 (Ok(_), _) => json!({ "report": format!("results/{REPORT}") }),
             },
         })
     }
 
     /// An error, without what it quotes of a recording that could not be read.
-    fn told(&self, failure: &Failure, quotes: bool) -> Value {
-        let mut told = failure.to_json();
+    fn reported(&self, failure: &Failure, quotes: bool) -> Value {
+        let mut reported = failure.to_json();
         if quotes && !self.with_data {
             for key in ["message", "help"] {
-                if let Some(text) = told["error"][key].as_str().map(masked) {
-                    told["error"][key] = json!(text);
+                if let Some(text) = reported["error"][key].as_str().map(masked) {
+                    reported["error"][key] = json!(text);
                 }
             }
         }
-        told
+        reported
     }
 
     fn readme(&self, files: &Inputs) -> String {
@@ -341,7 +341,7 @@ mod tests {
 
     #[test]
     fn a_case_names_no_place_of_its_maker() {
-        let told = renamed(&[
+        let reported = renamed(&[
             "diagnose",
             "/elsewhere/me/m.toml",
             "a/run.csv",
@@ -359,7 +359,7 @@ mod tests {
             "x=s [mm]",
         ]);
         assert_eq!(
-            told.iter().map(|word| quoted(word)).collect::<Vec<_>>().join(" "),
+            reported.iter().map(|word| quoted(word)).collect::<Vec<_>>().join(" "),
             "diagnose model/m.toml recordings/1/run.csv --holdout=recordings/2/run.csv --mechanisms mechanisms --seed 3 \
              --map 'x=s [mm]' --out rerun"
         );
@@ -374,8 +374,8 @@ mod tests {
 
     #[test]
     fn a_panic_is_told_in_its_words() {
-        let told = |work: fn()| words(panic::catch_unwind(work).unwrap_err().as_ref());
-        assert_eq!(told(|| panic!("an index {}", 3)), "an index 3");
-        assert_eq!(told(|| panic!("plain")), "plain");
+        let reported = |work: fn()| words(panic::catch_unwind(work).unwrap_err().as_ref());
+        assert_eq!(reported(|| panic!("an index {}", 3)), "an index 3");
+        assert_eq!(reported(|| panic!("plain")), "plain");
     }
 }

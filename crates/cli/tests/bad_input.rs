@@ -146,15 +146,15 @@ fn json_agrees(bench: &Bench, row: &Row, words: &Said) -> bool {
     let Ok(document) = serde_json::from_str::<Value>(&json.stdout) else { return false };
     let error = &document["error"];
     // How a command is to be called is told of the command as it was called: with `--json`.
-    let told = |key: &str| {
+    let reported = |key: &str| {
         let mut lines = error[key].as_str().into_iter().flat_map(str::lines);
         lines.all(|line| line.contains("Usage: ") || words.stderr.contains(line.trim()))
     };
     json.code == row.code
         && error["exit_code"] == row.code
         && error["message"].is_string()
-        && told("message")
-        && told("help")
+        && reported("message")
+        && reported("help")
 }
 
 /// An answer: its heading and what the terminal shows.

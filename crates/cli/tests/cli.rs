@@ -80,20 +80,20 @@ fn what_recordings_have_in_common_is_one_line() {
         bench.write(name, &text);
     }
     let files = ["run1.csv", "run2.csv", "run3.csv"];
-    let told = bench.greybox(&[&["check"], &files[..], &["--model", "model.toml"]].concat()).stdout;
-    assert!(told.starts_with("run1.csv: usable, 1 warning\nrun2.csv: usable, "), "{told}");
-    assert_eq!(told.matches("Use a finer sensor").count(), 1, "{told}");
+    let reported = bench.greybox(&[&["check"], &files[..], &["--model", "model.toml"]].concat()).stdout;
+    assert!(reported.starts_with("run1.csv: usable, 1 warning\nrun2.csv: usable, "), "{reported}");
+    assert_eq!(reported.matches("Use a finer sensor").count(), 1, "{reported}");
     let place = "x in 3 recordings (run1.csv, run2.csv, run3.csv): The values come in steps of";
-    assert!(told.contains(&format!("  warning  {place}")), "{told}");
+    assert!(reported.contains(&format!("  warning  {place}")), "{reported}");
     let json = bench.json(&[&["check"], &files[..], &["--model", "model.toml"]].concat());
     for k in 0..3 {
         let findings = json["recordings"][k]["findings"].as_array().unwrap();
         assert!(findings.iter().any(|f| f["code"] == "quantisation"), "{findings:#?}");
     }
     let fit = ["calibrate", "model.toml", "run1.csv", "run2.csv", "--holdout", "run3.csv", "--out", "out"];
-    let told = bench.greybox(&fit).stdout;
-    assert_eq!(told.matches("Use a finer sensor").count(), 1, "{told}");
-    assert!(told.contains(&format!("Note: {place}")), "{told}");
+    let reported = bench.greybox(&fit).stdout;
+    assert_eq!(reported.matches("Use a finer sensor").count(), 1, "{reported}");
+    assert!(reported.contains(&format!("Note: {place}")), "{reported}");
 }
 
 #[test]

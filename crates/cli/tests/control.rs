@@ -111,14 +111,14 @@ fn a_loop_that_does_not_settle_is_not_praised() {
         (report["verdict"].as_str().unwrap().to_owned(), html)
     };
     // A set point for too short a time.
-    let (told, html) = verdict(&["--hold", "0.05", "--members", "0"]);
-    assert_eq!(told, "unsettled");
+    let (reported, html) = verdict(&["--hold", "0.05", "--members", "0"]);
+    assert_eq!(reported, "unsettled");
     assert!(html.contains("does not come to stay within 2") && html.contains("No perturbed plants"));
     assert!(!html.contains("<section id=\"family\""));
     // A gravity so uncertain that a law without integral action is often off.
     std::fs::write(folder.path().join("arm.toml"), MODEL.replace("std = 0.03", "std = 0.2")).unwrap();
-    let (told, html) = verdict(&["--size", "theta=0.2", "--hold", "4"]);
-    assert_eq!(told, "fragile");
+    let (reported, html) = verdict(&["--size", "theta=0.2", "--hold", "4"]);
+    assert_eq!(reported, "fragile");
     assert!(html.contains("not on every perturbed plant"));
 }
 

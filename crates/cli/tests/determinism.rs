@@ -65,14 +65,14 @@ fn diagnose() {
 #[test]
 fn what_is_told_changes_nothing() {
     let bench = bench();
-    let told = |out: &str, log: &[&str]| {
+    let reported = |out: &str, log: &[&str]| {
         let request = ["diagnose", "model.toml", "run1.csv", "run2.csv", "--out", out];
         let outcome = bench.greybox(&[&request, log].concat());
         assert_eq!(outcome.code, 0, "{}", outcome.stderr);
         outcome.stderr
     };
-    assert_eq!(told("silent", &[]), "");
-    let log = told("told", &["--log"]);
+    assert_eq!(reported("silent", &[]), "");
+    let log = reported("told", &["--log"]);
     let weighed = log.lines().find(|line| line.contains("viscous_friction: score ")).unwrap();
     assert!(weighed.contains(", robust ") && weighed.ends_with(": accepted"), "{log}");
     for file in ["improved.toml", "report.json"] {

@@ -126,9 +126,9 @@ fn the_modelica_model_computes_what_simulate_computes() {
         let units: Value = channels.iter().map(|(c, unit)| ((*c).to_owned(), Value::from(*unit))).collect();
         let (holds, units) = (serde_json::json!({ input: hold }).to_string(), units.to_string());
         let files = ["run.csv", "simulated.csv", "answer.json"];
-        let told =
+        let reported =
             script(&python, "modelica.py", &[&[".", &class, &holds, &units], &files[..]].concat(), &bench);
-        let differences: Value = serde_json::from_slice(&told).unwrap();
+        let differences: Value = serde_json::from_slice(&reported).unwrap();
         for channel in names {
             let difference = differences[channel].as_f64().unwrap();
             assert!(difference < bound, "{name}, {channel}: {difference:e}");

@@ -94,9 +94,9 @@ fn a_nominal_model_is_given_the_terms_that_it_lacks() {
     let request = ["identify", "train.csv", "--model", "nominal.toml", "--holdout", "test.csv", "--out", "o"];
     let outcome = bench.greybox(&request);
     assert_eq!(outcome.code, 0, "{}", outcome.stderr);
-    let told = outcome.stdout;
-    assert!(told.starts_with("Terms are missing from the model: "), "{told}");
-    assert!(told.ends_with("Written: o/report.html, o/report.json, o/model.toml\n"), "{told}");
+    let reported = outcome.stdout;
+    assert!(reported.starts_with("Terms are missing from the model: "), "{reported}");
+    assert!(reported.ends_with("Written: o/report.html, o/report.json, o/model.toml\n"), "{reported}");
     let report: Value = serde_json::from_str(&bench.read("o/report.json")).unwrap();
     assert_eq!((&report["terms_only"], &report["basis"]), (&Value::Bool(true), &"proposed".into()));
     assert_eq!(report["mechanisms"].as_array().unwrap().len(), 0);

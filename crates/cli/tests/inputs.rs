@@ -270,8 +270,8 @@ fn a_noisy_input_is_told_and_a_command_is_not() {
         let document: Value = serde_json::from_str(&outcome.stdout).unwrap();
         codes(&document["recordings"][0]["findings"])
     };
-    let told = |severity: &str| ("input_noise".to_owned(), "f".to_owned(), severity.to_owned());
-    assert!(check("noisy.csv").contains(&told("info")));
+    let reported = |severity: &str| ("input_noise".to_owned(), "f".to_owned(), severity.to_owned());
+    assert!(check("noisy.csv").contains(&reported("info")));
     assert!(!check("run.csv").iter().any(|(code, ..)| code == "input_noise"));
     for command in [&["calibrate"] as &[&str], &["diagnose", "--work", "1"]] {
         let findings = |file: &str| {
@@ -279,7 +279,7 @@ fn a_noisy_input_is_told_and_a_command_is_not() {
             assert_eq!(outcome.code, 0, "{}", outcome.stderr);
             codes(&serde_json::from_str::<Value>(&bench.read("out/report.json")).unwrap()["findings"])
         };
-        assert!(findings("noisy.csv").contains(&told("warning")), "{command:?}");
+        assert!(findings("noisy.csv").contains(&reported("warning")), "{command:?}");
         assert!(!findings("run.csv").iter().any(|(code, ..)| code == "input_noise"), "{command:?}");
     }
 }
@@ -299,11 +299,11 @@ fn a_derivative_and_a_constant_are_inputs_as_any_other() {
     bench.write("loaded.csv", &rewritten("t,f [N],mp [g],x [mm]", |_, t, f, x| format!("{t},{f},50,{x}")));
     let outcome = bench.greybox(&["check", "loaded.csv", "--model", "lead.toml"]);
     assert_eq!(outcome.code, 0, "{}", outcome.stderr);
-    for told in [
+    for reported in [
         "input f (N, linear hold) and input df (its derivative, in N/s)",
         "mp: The input is a known constant here (50 g)",
     ] {
-        assert!(outcome.stdout.contains(told), "{}", outcome.stdout);
+        assert!(outcome.stdout.contains(reported), "{}", outcome.stdout);
     }
     assert!(!outcome.stdout.contains("no channel of this name"), "{}", outcome.stdout);
     // What is written is read again, the line of the derivative as it was.

@@ -166,11 +166,11 @@ fn parameters(model: &Model, changes: &[ParameterChange]) -> Ordered<Parameter> 
         .iter()
         .filter_map(|change| {
             let p = model.parameters.get(change.index)?;
-            let told = |si: f64| p.unit.as_ref().map_or(si, |u| u.from_si(si));
+            let reported = |si: f64| p.unit.as_ref().map_or(si, |u| u.from_si(si));
             let parameter = Parameter {
-                nominal: told(change.nominal),
-                value: told(change.calibrated.value),
-                ci95: change.calibrated.ci95.map(|(low, high)| Interval::new(told(low), told(high))),
+                nominal: reported(change.nominal),
+                value: reported(change.calibrated.value),
+                ci95: change.calibrated.ci95.map(|(low, high)| Interval::new(reported(low), reported(high))),
                 unit: p.unit.as_ref().map(|u| u.text.clone()),
                 fixed: p.fixed,
                 calibrated: None,

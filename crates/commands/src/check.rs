@@ -5,7 +5,7 @@ use std::path::Path;
 
 use greybox_calibrate::Data;
 use greybox_model::{Model, Unit};
-use greybox_recording::{Finding, Recording, Severity, health, told};
+use greybox_recording::{Finding, Recording, Severity, health, listed};
 use greybox_report::convert::health_finding;
 use greybox_report::notes::{Note, grouped};
 use greybox_report::{contract, format};
@@ -117,7 +117,7 @@ fn known(recording: &Recording, inputs: &[String]) -> Result<(), Failure> {
     };
     let names: Vec<String> = recording.channels.iter().map(|c| format!("`{}`", c.name)).collect();
     let message = format!("there is no channel `{unknown}`, which `--inputs` names");
-    Err(Failure::file(Path::new(&recording.name), message).help(format!("name one of {}", told(names))))
+    Err(Failure::file(Path::new(&recording.name), message).help(format!("name one of {}", listed(names))))
 }
 
 /// The health of a recording, its channels in the roles that the model gives them.

@@ -153,14 +153,14 @@ impl Failure {
 
     /// Nothing could be done because of `failures`, each of one file.
     pub fn all(folder: &Path, message: &str, failures: &[Failure]) -> Failure {
-        let told: String = failures
+        let reported: String = failures
             .iter()
             .map(|f| match &f.0.help {
                 Some(help) => format!("\n  {}\n    help: {help}", f.0.message),
                 None => format!("\n  {}", f.0.message),
             })
             .collect();
-        let mut failure = Failure::file(folder, format!("{message}:{told}"));
+        let mut failure = Failure::file(folder, format!("{message}:{reported}"));
         // A fault of greybox in all of them is no bad input.
         if !failures.is_empty() && failures.iter().all(|f| f.0.cause == Cause::Internal) {
             failure.0.cause = Cause::Internal;

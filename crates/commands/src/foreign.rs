@@ -181,12 +181,12 @@ mod tests {
     #[test]
     fn every_kind_says_where_to_look() {
         for kind in KINDS {
-            let told = kind.as_model("a.x".as_ref()).to_string();
+            let reported = kind.as_model("a.x".as_ref()).to_string();
             for part in [kind.what, "TOML", kind.physics, "`greybox new --list`", "`greybox export`"] {
-                assert!(told.contains(part), "{told}");
+                assert!(reported.contains(part), "{reported}");
             }
-            let told = kind.as_recording("a.x".as_ref()).to_string();
-            assert!(told.contains("CSV") && told.contains("Parquet"), "{told}");
+            let reported = kind.as_recording("a.x".as_ref()).to_string();
+            assert!(reported.contains("CSV") && reported.contains("Parquet"), "{reported}");
         }
         assert!(of("nowhere.urdf".as_ref()).is_none() && of(".".as_ref()).is_none());
     }

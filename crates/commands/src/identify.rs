@@ -57,7 +57,7 @@ impl Results {
 }
 
 /// A stage in words.
-pub fn told(stage: &str) -> &str {
+pub fn reported(stage: &str) -> &str {
     match stage {
         "weak form" => "first estimates (weak form)",
         "output error" => "choosing and fitting terms on simulated outputs",

@@ -316,19 +316,19 @@ shaft = "J*theta'' + b*theta' = kt*u"
         Recording::from_columns("run.csv", time, vec![channel("u", input), channel("theta", angle)]).unwrap()
     }
 
-    fn told(text: &str, factor: f64) -> Vec<Finding> {
+    fn reported(text: &str, factor: f64) -> Vec<Finding> {
         findings(&Model::from_toml(text, "m.toml").unwrap(), &logged(factor))
     }
 
     #[test]
     fn a_model_with_roughly_known_parameters_is_left_in_peace() {
-        let found = told(MODEL, 1.0);
+        let found = reported(MODEL, 1.0);
         assert!(found.is_empty(), "{found:?}");
     }
 
     #[test]
     fn degrees_taken_as_radians_are_told() {
-        let found = told(MODEL, 1f64.to_degrees());
+        let found = reported(MODEL, 1f64.to_degrees());
         assert_eq!(found[0].code, "nominal_size");
         assert!(found[0].help.as_deref().unwrap().contains("[deg]"), "{found:?}");
         assert_eq!(found.len(), 1);
@@ -336,7 +336,7 @@ shaft = "J*theta'' + b*theta' = kt*u"
 
     #[test]
     fn a_gear_that_the_model_lacks_is_no_unit() {
-        let found = told(MODEL, 20.0);
+        let found = reported(MODEL, 20.0);
         assert_eq!((found.len(), found[0].code), (1, "nominal_size"));
         assert!(found[0].help.as_deref().unwrap().contains("a gear"), "{found:?}");
     }
@@ -347,7 +347,7 @@ shaft = "J*theta'' + b*theta' = kt*u"
 
     #[test]
     fn a_turned_sign_is_told() {
-        let found = told(MODEL, -1.0);
+        let found = reported(MODEL, -1.0);
         assert_eq!((found.len(), found[0].code), (1, "nominal_sign"));
         assert!(help(&found).contains("the input `u` or of `kt` or of this measurement"), "{found:?}");
     }
@@ -355,12 +355,12 @@ shaft = "J*theta'' + b*theta' = kt*u"
     #[test]
     fn a_turned_damping_is_told_by_its_name() {
         let wrong = MODEL.replace("+ b*theta'", "- b*theta'");
-        let found = told(&wrong, 1.0);
+        let found = reported(&wrong, 1.0);
         assert_eq!((found.len(), found[0].code), (1, "nominal_diverges"));
         assert!(help(&found).starts_with("Reverse the sign of `b`, in its value"), "{found:?}");
         assert!(help(&found).contains("(nrmse"), "{found:?}");
         // As a value too.
-        let found = told(&MODEL.replace("value = 0.1,", "value = -0.1,"), 1.0);
+        let found = reported(&MODEL.replace("value = 0.1,", "value = -0.1,"), 1.0);
         assert!(help(&found).starts_with("Reverse the sign of `b`, in its value"), "{found:?}");
     }
 
@@ -382,7 +382,7 @@ shaft = "J*theta'' + b*theta' = kt*u"
     fn a_wrong_inertia_is_told_without_a_word_on_signs() {
         for inertia in ["2e-6", "200"] {
             let wrong = MODEL.replace("value = 0.02,", &format!("value = {inertia},"));
-            for finding in told(&wrong, 1.0) {
+            for finding in reported(&wrong, 1.0) {
                 let help = finding.help.as_deref().unwrap();
                 assert!(!help.contains("Reverse the sign"), "{inertia}: {finding:?}");
                 assert_ne!(finding.code, "nominal_sign", "{inertia}");
@@ -391,7 +391,7 @@ shaft = "J*theta'' + b*theta' = kt*u"
         // So small that the motion would be hundreds of times as large.
         let free = MODEL.replace(" + b*theta'", "").replace("value = 0.02,", "value = 2e-5,");
         let free = free.replace("b = { value = 0.1, unit = \"N m s/rad\" }\n", "");
-        let found = told(&free, 1.0);
+        let found = reported(&free, 1.0);
         assert_eq!((found.len(), found[0].code), (1, "nominal_diverges"));
         assert!(help(&found).starts_with("Look at units and values"), "{found:?}");
     }

@@ -108,8 +108,8 @@ impl<'a> Builder<'a> {
                 let free = terms::without_limits(&residual, self.input, &value, &mut range);
                 let mut gaps = Vec::new();
                 let bridged = terms::without_gaps(&free, &|e| self.moves(e), &mut gaps);
-                let told = |term| Dropped { equation: equation.name.clone(), term };
-                closed_gaps.extend(gaps.into_iter().map(told));
+                let reported = |term| Dropped { equation: equation.name.clone(), term };
+                closed_gaps.extend(gaps.into_iter().map(reported));
                 Ok(if self.options.close_gaps { bridged } else { free }.simplify())
             })
             .collect::<Result<_, ControlError>>()?;

@@ -121,9 +121,9 @@ impl Search<'_> {
                     // A law with more to fit is tried where it promises more than they keep.
                     let kept = plain.as_ref().map_or(0.0, |plain| 1.0 - plain.rss() / current.rss());
                     let rich = settled(self.with_one(&current, &rich, kept, &scale), &rich);
-                    let told = |model: &FittedModel| self.robust(&current, model, &scale);
+                    let reported = |model: &FittedModel| self.robust(&current, model, &scale);
                     let both = [plain, rich].into_iter().flatten();
-                    both.max_by(|a, b| told(a).total_cmp(&told(b)))
+                    both.max_by(|a, b| reported(a).total_cmp(&reported(b)))
                 };
                 // (Where the terms leave a misfit, others do not do their work for less.)
                 let other = || match !is_done && current.misfit(&scale) <= MISFIT {
@@ -237,12 +237,12 @@ impl Search<'_> {
             let alone = Together { gain: one.gain, shift: one.shift.clone(), members: vec![one] };
             self.extend_by(base, &open, &alone, &STARTS, scale, STEPS_OF_A_TRIAL)
         });
-        let told = |model: FittedModel| (self.robust(base, &model, scale), model);
-        let mut tried: Vec<(f64, FittedModel)> = tried.map(told).collect();
+        let reported = |model: FittedModel| (self.robust(base, &model, scale), model);
+        let mut tried: Vec<(f64, FittedModel)> = tried.map(reported).collect();
         tried.sort_by(|a, b| b.0.total_cmp(&a.0));
         tried.truncate(FINALISTS);
         let fitted = tried.into_par_iter().map(|(_, model)| self.refit(&model, scale, STEPS));
-        let allowed = fitted.filter(|model| self.admissible(model, scale)).map(told).collect::<Vec<_>>();
+        let allowed = fitted.filter(|model| self.admissible(model, scale)).map(reported).collect::<Vec<_>>();
         allowed.into_iter().max_by(|a, b| a.0.total_cmp(&b.0)).map(|best| best.1)
     }
 
@@ -641,9 +641,9 @@ second = "n*y'' + c*y' + l*(y - x) = 0"
             let search = Search::new(bodies(&more, 10 + seed), &library, &crate::Quiet);
             let found = nothing(&search);
             let closed = search.closure(&found, &found.calibrated, &mut Visited::default()).unwrap();
-            let told = terms(&closed, &library, &search.nominal().model);
-            told.len() == truth.len()
-                && told
+            let reported = terms(&closed, &library, &search.nominal().model);
+            reported.len() == truth.len()
+                && reported
                     .iter()
                     .zip(&truth)
                     .all(|(a, b)| (&*a.0, &*a.1) == (b.0, b.1) && (a.2 / b.2 - 1.0).abs() < 0.01)
@@ -654,8 +654,8 @@ second = "n*y'' + c*y' + l*(y - x) = 0"
             let search = Search::new(bodies(&|_| [0.0; 3], 20 + seed), &library, &crate::Quiet);
             let found = nothing(&search);
             let closed = search.closure(&found, &found.calibrated, &mut Visited::default());
-            let told = closed.map(|closed| terms(&closed, &library, &search.nominal().model));
-            assert_eq!(told, None, "seed {seed}");
+            let reported = closed.map(|closed| terms(&closed, &library, &search.nominal().model));
+            assert_eq!(reported, None, "seed {seed}");
         }
     }
 
@@ -663,7 +663,7 @@ second = "n*y'' + c*y' + l*(y - x) = 0"
     #[test]
     fn laws_with_constants_or_a_memory_are_found() {
         let library = crate::built_in().unwrap();
-        let told = |more: &dyn Fn([f64; 5]) -> [f64; 3], seed: u64| {
+        let reported = |more: &dyn Fn([f64; 5]) -> [f64; 3], seed: u64| {
             let search = Search::new(bodies(more, seed), &library, &crate::Quiet);
             let found = nothing(&search);
             let closed = search.closure(&found, &found.calibrated, &mut Visited::default()).unwrap();
@@ -683,9 +683,9 @@ second = "n*y'' + c*y' + l*(y - x) = 0"
             k == kind && p == place && close
         };
         for seed in 40..42 {
-            let brake = told(&|[_, _, v, ..]| [3.0 * v / (1.0 + (v / 0.4).powi(2)), 0.0, 0.0], seed);
+            let brake = reported(&|[_, _, v, ..]| [3.0 * v / (1.0 + (v / 0.4).powi(2)), 0.0, 0.0], seed);
             assert!(near(&brake, "eddy_current_damping", "first", [3.0, 0.4]), "{brake:?}");
-            let spring = told(&|[_, y, _, _, z]| [0.0, 6.0 * (y - z), 2.0 * (y - z)], seed);
+            let spring = reported(&|[_, y, _, _, z]| [0.0, 6.0 * (y - z), 2.0 * (y - z)], seed);
             assert!(near(&spring, "maxwell_element", "second", [6.0, 2.0]), "{spring:?}");
         }
     }
@@ -714,16 +714,16 @@ second = "n*y'' + c*y' + l*(y - x) = 0"
                 let start = calibrated.fit.point.parameters.iter().copied().chain(kinds.iter().map(|_| 0.1));
                 search.reassembled_from(&calibrated, &laws, vec![start.collect()], &scale, STEPS).unwrap()
             };
-            let told = |model: FittedModel| {
+            let reported = |model: FittedModel| {
                 terms(&Found { improved: model, ..nothing(&search) }, &library, &search.nominal().model)
             };
             let other =
                 search.reselected(&with(&["asymmetric_stiffness", "constant_offset"]), &plain, &scale);
-            let other = told(other.expect("there is a plainer one"));
+            let other = reported(other.expect("there is a plainer one"));
             let [(kind, place, value)] = &other[..] else { panic!("{other:?}") };
             assert_eq!((&**kind, &**place), ("quadratic_stiffness", "first"));
             assert!((value / 9.0 - 1.0).abs() < 0.01, "{value}");
-            let right = search.reselected(&with(&["quadratic_stiffness"]), &plain, &scale).map(told);
+            let right = search.reselected(&with(&["quadratic_stiffness"]), &plain, &scale).map(reported);
             assert_eq!(right, None);
         }
     }
@@ -746,8 +746,8 @@ second = "n*y'' + c*y' + l*(y - x) = 0"
         let search = Search::new(bodies(&|[x, ..]| [magnet(x), 0.0, 0.0], 70), &library, &crate::Quiet);
         let found = nothing(&search);
         let closed = search.closure(&found, &found.calibrated, &mut Visited::default()).unwrap();
-        let told = terms(&closed, &library, &search.nominal().model);
-        assert!(told.iter().any(|t| (&*t.0, &*t.1) == ("free_position_force", "first")), "{told:?}");
+        let reported = terms(&closed, &library, &search.nominal().model);
+        assert!(reported.iter().any(|t| (&*t.0, &*t.1) == ("free_position_force", "first")), "{reported:?}");
         assert!(closed.improved.misfit(&closed.scale) < 1.1);
         let (model, _) = search.tabulated(&closed.improved).expect("a shape");
         let first = model.equations[0].residual();
@@ -803,10 +803,10 @@ second = "n*y'' + c*y' + l*(y - x) = 0"
             let search = Search::new(bodies(more, 31), &library, &crate::Quiet);
             let found = nothing(&search);
             let closed = search.closure(&found, &found.calibrated, &mut Visited::default()).expect(kind);
-            let told = terms(&closed, &library, &search.nominal().model);
+            let reported = terms(&closed, &library, &search.nominal().model);
             let index =
                 closed.improved.parts.iter().position(|p| library[p.candidate.mechanism].kind == kind);
-            let Some(index) = index else { panic!("{told:?}") };
+            let Some(index) = index else { panic!("{reported:?}") };
             !search.is_replaceable(&closed, index)
         };
         assert!(held("coulomb_friction", &|[_, _, v, ..]| [0.8 * f64::tanh(1e3 * v), 0.0, 0.0]));

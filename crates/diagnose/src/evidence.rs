@@ -276,14 +276,14 @@ fn gain(
 pub fn robust(old: &ComparedModel, new: &ComparedModel, count: &[usize], inflation: Inflation) -> f64 {
     let (gain, information) = gain(old, new, count, |_| 1.0 / inflation.factor);
     let freedom = inflation.freedom;
-    let told = match freedom.is_finite() && gain > 0.0 {
+    let reported = match freedom.is_finite() && gain > 0.0 {
         true => (freedom + inflation.parameters) * (gain / freedom).ln_1p(),
         false => gain,
     };
     let cost =
         |side: &ComparedModel| price(side.parameters, information) + side.shapes.price(inflation.factor);
     let dearer = cost(new) - cost(old);
-    told - dearer - 2.0 * (new.surcharge - old.surcharge)
+    reported - dearer - 2.0 * (new.surcharge - old.surcharge)
 }
 
 /// Weighs the richer model (`new`) against the simpler (`old`), both fitted with the same scale, by what the samples tell and

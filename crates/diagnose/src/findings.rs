@@ -338,9 +338,9 @@ mod tests {
         ];
         let own = Site { equations: vec!["hub".into()], ..Site::default() };
         let left = distinct(all, "presliding_friction", &own);
-        let told: Vec<(&str, f64)> = left.iter().map(|a| (a.kind.as_str(), a.confidence)).collect();
+        let reported: Vec<(&str, f64)> = left.iter().map(|a| (a.kind.as_str(), a.confidence)).collect();
         assert_eq!(
-            told,
+            reported,
             [
                 ("input_offset", 0.3),
                 ("input_offset", 0.3),
@@ -360,8 +360,8 @@ mod tests {
             let name = if twin.places == [Place::Equation(0)] { "hub" } else { "link" };
             alternative("sensor_offset", &[name], 0.6, true)
         });
-        let told: Vec<(&str, f64, bool)> =
+        let reported: Vec<(&str, f64, bool)> =
             all.iter().map(|a| (a.site.equations[0].as_str(), a.confidence, a.equivalent)).collect();
-        assert_eq!(told, [("hub", 0.6, true), ("link", 0.6, true)]);
+        assert_eq!(reported, [("hub", 0.6, true), ("link", 0.6, true)]);
     }
 }

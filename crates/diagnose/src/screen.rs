@@ -410,14 +410,14 @@ pub(crate) fn reselect(
     let open: Vec<usize> = (0..candidates.len()).filter_map(single).collect();
     let all = Regressions::of(library, candidates, lanes, &gram.without(&gone).with_columns(&did));
     let variants = &all.lanes.variants;
-    let told = |chosen: &[usize]| -> Option<Told> {
+    let reported = |chosen: &[usize]| -> Option<Told> {
         let columns: Vec<usize> = chosen.iter().map(|&v| variants[v].columns.start).collect();
         let positive: Vec<bool> = chosen.iter().flat_map(|&v| all.positive(&variants[v])).collect();
         let (coefficients, gain) = all.regress(&columns, &positive, LEAST_RIDGE)?;
         let paid: f64 = chosen.iter().map(|&v| price(&candidates[variants[v].candidate])).sum();
         Some(Told { cost: paid - gain * all.rr, coefficients, gain })
     };
-    let mut best = (told(&chosen)?, chosen.clone());
+    let mut best = (reported(&chosen)?, chosen.clone());
     loop {
         let (own, current) = &best;
         let with = |set: &[usize]| -> Vec<Vec<usize>> {
@@ -430,7 +430,7 @@ pub(crate) fn reselect(
             moves.extend(with(&less));
             moves.push(less);
         }
-        let tried = moves.into_par_iter().filter_map(|set| Some((told(&set)?, set)));
+        let tried = moves.into_par_iter().filter_map(|set| Some((reported(&set)?, set)));
         let next = tried.min_by(|a, b| a.0.cost.total_cmp(&b.0.cost).then_with(|| a.1.cmp(&b.1)));
         match next {
             // (Less is rounding.)
@@ -438,9 +438,9 @@ pub(crate) fn reselect(
             _ => break,
         }
     }
-    let (told, set) = best;
+    let (reported, set) = best;
     let is_same = set.len() == chosen.len() && set.iter().all(|v| chosen.contains(v));
-    if is_same { None } else { all.together(&set, &told.coefficients, told.gain) }
+    if is_same { None } else { all.together(&set, &reported.coefficients, reported.gain) }
 }
 
 /// First-order shift of the other free parameters when those at these positions go to zero from `values`.

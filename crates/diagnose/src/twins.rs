@@ -259,7 +259,7 @@ mod tests {
     use crate::library::built_in;
 
     /// What equals a constant at a place: kinds with the names of their places.
-    fn told(text: &str, kind: &str, place: Place) -> Vec<String> {
+    fn reported(text: &str, kind: &str, place: Place) -> Vec<String> {
         told_in(&Model::from_toml(text, "m.toml").unwrap(), None, kind, place)
     }
 
@@ -295,23 +295,23 @@ mod tests {
     #[test]
     fn a_force_on_a_cart_with_a_spring_of_its_own_is_an_offset_of_its_sensor_and_of_its_input() {
         let damped = carts(["c*(x1' - x2')", "c*(x2' - x1')"]);
-        let force = |e| told(&damped, "constant_offset", Place::Equation(e));
+        let force = |e| reported(&damped, "constant_offset", Place::Equation(e));
         assert_eq!(force(0), ["input_offset f", "sensor_offset x1"]);
         assert_eq!(force(1), ["sensor_offset x2"]);
-        let sensor = told(&damped, "sensor_offset", Place::Measurement(0));
+        let sensor = reported(&damped, "sensor_offset", Place::Measurement(0));
         assert_eq!(sensor, ["constant_offset first", "input_offset f"]);
     }
 
     #[test]
     fn a_force_between_carts_moves_both_of_them() {
         let sprung = carts(["k2*(x1 - x2)", "k2*(x2 - x1)"]);
-        let force = told(&sprung, "constant_offset", Place::Equation(0));
+        let force = reported(&sprung, "constant_offset", Place::Equation(0));
         assert_eq!(force, ["input_offset f", "sensor_offset x1+x2"]);
-        let sensor = told(&sprung, "sensor_offset", Place::Measurement(0));
+        let sensor = reported(&sprung, "sensor_offset", Place::Measurement(0));
         assert_eq!(sensor, ["constant_offset first+second"]);
         // Where the second cart is not measured, one sensor is enough.
         let blind = sprung.replace("x2 = { unit = \"m\" }", "x2 = { unit = \"m\", measured = false }");
-        let force = told(&blind, "constant_offset", Place::Equation(0));
+        let force = reported(&blind, "constant_offset", Place::Equation(0));
         assert_eq!(force, ["constant_offset second", "input_offset f", "sensor_offset x1"]);
     }
 
@@ -347,22 +347,22 @@ mod tests {
             ("k1*x1", "0*x1"),
         ] {
             let other = damped.replace(from, to);
-            assert_eq!(told(&other, "constant_offset", Place::Equation(0)), ["input_offset f"], "{to}");
+            assert_eq!(reported(&other, "constant_offset", Place::Equation(0)), ["input_offset f"], "{to}");
         }
         // A delay tells nothing of a constant, and dry friction asks for the direction only.
         for to in ["k1*delay(x1, b)", "k1*x1 + a*sign(x1')"] {
             let other = damped.replace("k1*x1", to);
-            let force = told(&other, "constant_offset", Place::Equation(0));
+            let force = reported(&other, "constant_offset", Place::Equation(0));
             assert_eq!(force, ["input_offset f", "sensor_offset x1"], "{to}");
         }
         // An input that enters as its square is no constant, and one in both equations is none in one.
         for to in ["= a*f^2", "= f + a*f*x2"] {
             let other = damped.replace("= f", to);
-            assert_eq!(told(&other, "constant_offset", Place::Equation(0)), ["sensor_offset x1"], "{to}");
+            assert_eq!(reported(&other, "constant_offset", Place::Equation(0)), ["sensor_offset x1"], "{to}");
         }
         let both = damped.replace("= 0\"", "= f\"");
-        assert_eq!(told(&both, "constant_offset", Place::Equation(0)), ["sensor_offset x1"]);
-        assert_eq!(told(&both, "input_offset", Place::Input(0)), ["sensor_offset x1+x2"]);
-        assert_eq!(told(&both, "coulomb_friction", Place::Equation(0)), [""; 0]);
+        assert_eq!(reported(&both, "constant_offset", Place::Equation(0)), ["sensor_offset x1"]);
+        assert_eq!(reported(&both, "input_offset", Place::Input(0)), ["sensor_offset x1+x2"]);
+        assert_eq!(reported(&both, "coulomb_friction", Place::Equation(0)), [""; 0]);
     }
 }

@@ -195,7 +195,10 @@ fn terms_alone_are_never_named() {
         let [one] = found else { panic!("{} terms", found.len()) };
         (one.kind.clone(), one.parameters[0].2.value)
     };
-    let (told, term) = (of(&named.mechanisms), of(&terms.candidates));
-    assert_eq!((&*told.0, &*term.0), ("cubic_stiffness", "cubic_stiffness"));
-    assert!((term.1 / 300.0 - 1.0).abs() < 0.02 && (told.1 / term.1 - 1.0).abs() < 0.01, "{told:?} {term:?}");
+    let (reported, term) = (of(&named.mechanisms), of(&terms.candidates));
+    assert_eq!((&*reported.0, &*term.0), ("cubic_stiffness", "cubic_stiffness"));
+    assert!(
+        (term.1 / 300.0 - 1.0).abs() < 0.02 && (reported.1 / term.1 - 1.0).abs() < 0.01,
+        "{reported:?} {term:?}"
+    );
 }

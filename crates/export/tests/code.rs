@@ -192,8 +192,8 @@ fn what_is_no_number_stays_none() {
     std::fs::write(path("main.c"), main).unwrap();
     let made = Command::new("gcc").arg(path("main.c")).args(["-lm", "-o"]).arg(path("run")).output().unwrap();
     assert!(made.status.success(), "{}", String::from_utf8_lossy(&made.stderr));
-    let told = Command::new(path("run")).output().unwrap().stdout;
-    assert_eq!(String::from_utf8(told).unwrap().trim(), "1 1 1 1 1 1 1");
+    let reported = Command::new(path("run")).output().unwrap().stdout;
+    assert_eq!(String::from_utf8(reported).unwrap().trim(), "1 1 1 1 1 1 1");
 }
 
 #[test]

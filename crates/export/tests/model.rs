@@ -212,14 +212,14 @@ fn units_that_only_the_model_language_has() {
                 tau = { value = 2, unit = \"s\" }\nTo = { value = 25, unit = \"degC\" }\nk = { value = 3 }\n\
                 [equations]\nheat = \"tau*T' + T = To + k*c\"\nloss = \"tau*c' + c = 0\"\n";
     let model = Model::from_toml(text, "heat.toml").unwrap();
-    let told = modelica(&model).unwrap();
-    assert!(told.contains("parameter Real To(unit = \"K\") = 298.15;"), "{told}");
-    assert!(told.contains("Real T(unit = \"K\", start = 293.15, fixed = true)"), "{told}");
-    assert!(told.contains("parameter Real k = 3;") && !told.contains("dose"), "{told}");
-    let told = python(&model).unwrap();
-    assert!(told.contains("CHANNELS = {\"T\": (\"K\", 1), \"c\": (\"dose\", 1)}"), "{told}");
-    let told = latex_document(&model);
-    assert!(told.contains("& $25$ & degC"), "{told}");
+    let reported = modelica(&model).unwrap();
+    assert!(reported.contains("parameter Real To(unit = \"K\") = 298.15;"), "{reported}");
+    assert!(reported.contains("Real T(unit = \"K\", start = 293.15, fixed = true)"), "{reported}");
+    assert!(reported.contains("parameter Real k = 3;") && !reported.contains("dose"), "{reported}");
+    let reported = python(&model).unwrap();
+    assert!(reported.contains("CHANNELS = {\"T\": (\"K\", 1), \"c\": (\"dose\", 1)}"), "{reported}");
+    let reported = latex_document(&model);
+    assert!(reported.contains("& $25$ & degC"), "{reported}");
 }
 
 /// A table is a variable with branches in Modelica, also inside another, and a small matrix in LaTeX.

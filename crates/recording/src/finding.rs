@@ -120,13 +120,13 @@ pub(crate) fn quantity(x: f64, unit: Option<&str>) -> String {
 }
 
 /// Most variables or columns that a sentence names.
-const TOLD: usize = 8;
+const MOST_LISTED: usize = 8;
 
 /// A list for a sentence, cut where it gets long.
-pub fn told(mut all: Vec<String>) -> String {
-    if all.len() > TOLD {
-        let more = all.len() - TOLD;
-        all.truncate(TOLD);
+pub fn listed(mut all: Vec<String>) -> String {
+    if all.len() > MOST_LISTED {
+        let more = all.len() - MOST_LISTED;
+        all.truncate(MOST_LISTED);
         all.push(format!("{more} more"));
     }
     all.join(", ")

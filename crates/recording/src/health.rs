@@ -104,7 +104,7 @@ fn sampling(recording: &Recording) -> Finding {
 }
 
 fn unknown_channels(recording: &Recording, inputs: &[&str], outputs: &[&str]) -> Vec<Finding> {
-    let known = finding::told(recording.channels.iter().map(|channel| channel.name.clone()).collect());
+    let known = finding::listed(recording.channels.iter().map(|channel| channel.name.clone()).collect());
     let absent = inputs.iter().chain(outputs).filter(|name| recording.channel(name).is_none());
     absent
         .map(|name| {
@@ -626,7 +626,7 @@ pub fn clock_offsets(recording: &Recording, inputs: &[&str], outputs: &[&str]) -
         else {
             break;
         };
-        let finding = told(recording, &strongest, piece.dt, roles && is(inputs, strongest.pair[1]));
+        let finding = listed(recording, &strongest, piece.dt, roles && is(inputs, strongest.pair[1]));
         // Without roles it may be an input and its answer.
         let severity = if roles { Severity::Warning } else { Severity::Info };
         findings.push(Finding { severity, ..finding });
@@ -666,7 +666,7 @@ fn odd_one(offsets: &[Offset], channels: usize) -> Option<usize> {
     (0..channels).max_by_key(|&c| times(c)).filter(|&c| times(c).0 > 0)
 }
 
-fn told(recording: &Recording, offset: &Offset, dt: f64, acausal: bool) -> Finding {
+fn listed(recording: &Recording, offset: &Offset, dt: f64, acausal: bool) -> Finding {
     let [early, late] = offset.pair.map(|c| recording.channels[c].name.as_str());
     let Lag { samples, correlation } = offset.lag;
     let [agree, tell] = offset.parts;

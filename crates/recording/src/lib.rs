@@ -71,7 +71,7 @@ pub use crate::correlation::Correlation;
 pub use crate::csv::{CsvBlocks, parse_csv, read_csv, write_csv, write_csv_file};
 pub use crate::error::{Place, RecordingError};
 pub use crate::file::is_device;
-pub use crate::finding::{Finding, Severity, told};
+pub use crate::finding::{Finding, Severity, listed};
 #[cfg(feature = "mat")]
 pub use crate::mat::parse_mat;
 #[cfg(feature = "parquet")]

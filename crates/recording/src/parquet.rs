@@ -7,7 +7,7 @@
 
 use crate::error::{Place, RecordingError};
 use crate::file::ROOM;
-use crate::finding::{Finding, Severity, told};
+use crate::finding::{Finding, Severity, listed};
 use crate::header::{TIMES, header_cell, seconds};
 use crate::recording::{Channel, Recording};
 use ::parquet::basic::{LogicalType, TimeUnit, Type};
@@ -83,14 +83,14 @@ fn read(bytes: Vec<u8>, label: &str, name: &str) -> Result<Recording, RecordingE
             .map_err(|e| damaged(Some(&path), &e))?;
         columns.push((Channel { name, unit, values }, scale));
     }
-    let left_out = told(left_out);
+    let left_out = listed(left_out);
     let time =
         TIMES.iter().find_map(|t| columns.iter().position(|(c, scale)| c.name == *t && scale.is_some()));
     let Some(time) = time else {
         let mut found: Vec<String> = columns.iter().map(|(c, _)| format!("`{}`", c.header())).collect();
         found.extend((!left_out.is_empty()).then_some(left_out));
         let help = "call the column of times, in s, `t`";
-        return Err(RecordingError::NoTime { place: place(), found: told(found), help });
+        return Err(RecordingError::NoTime { place: place(), found: listed(found), help });
     };
     let (time, scale) = columns.remove(time);
     if columns.is_empty() {

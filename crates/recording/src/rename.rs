@@ -1,7 +1,7 @@
 //! Channels under the names that a model uses.
 
 use crate::error::Place;
-use crate::finding::told;
+use crate::finding::listed;
 use crate::header::header_cell;
 use crate::recording::Recording;
 use std::fmt;
@@ -38,7 +38,7 @@ pub enum RenameError {
         found: String,
     },
     /// The file has no such channel.
-    #[error("{file}: there is no channel `{channel}`; the file has {}", told(available.iter().map(|a| format!("`{a}`")).collect()))]
+    #[error("{file}: there is no channel `{channel}`; the file has {}", listed(available.iter().map(|a| format!("`{a}`")).collect()))]
     Unknown {
         /// The recording.
         file: String,

@@ -94,9 +94,9 @@ fn names(data: &Data) -> Vec<String> {
 }
 
 /// An interval in SI as one in the unit that `told` converts to.
-fn interval(ci: Option<(f64, f64)>, told: impl Fn(f64) -> f64) -> Option<Interval> {
+fn interval(ci: Option<(f64, f64)>, reported: impl Fn(f64) -> f64) -> Option<Interval> {
     ci.map(|(low, high)| {
-        let (a, b) = (told(low), told(high));
+        let (a, b) = (reported(low), reported(high));
         Interval { low: a.min(b), high: a.max(b) }
     })
 }
@@ -220,8 +220,8 @@ fn remainder_plan(d: &Diagnosis, reach: &Reach) -> Option<Experiment> {
 
 /// The experiment that separates a mechanism from its alternatives, if it has any.
 fn plan(found: &IdentifiedMechanism, improved: &Model, reach: &Reach) -> Option<Experiment> {
-    let told = found.alternatives.iter().find(|a| !a.separate.is_empty());
-    let alternative = told.or(found.alternatives.first())?;
+    let reported = found.alternatives.iter().find(|a| !a.separate.is_empty());
+    let alternative = reported.or(found.alternatives.first())?;
     let value = |name: &str| {
         // In the model a name may carry the equation's behind it.
         let is =
@@ -414,15 +414,15 @@ fn parameters(d: &Diagnosis) -> Ordered<Parameter> {
         .iter()
         .map(|p| {
             let parameter = &d.nominal.parameters[p.index];
-            let told = |si: f64| parameter.unit.as_ref().map_or(si, |u| u.from_si(si));
+            let reported = |si: f64| parameter.unit.as_ref().map_or(si, |u| u.from_si(si));
             let entry = Parameter {
-                nominal: told(p.nominal),
-                value: told(p.improved.value),
-                ci95: interval(p.improved.ci95, told),
+                nominal: reported(p.nominal),
+                value: reported(p.improved.value),
+                ci95: interval(p.improved.ci95, reported),
                 unit: parameter.unit.as_ref().map(|u| u.text.clone()),
                 fixed: parameter.fixed,
-                calibrated: Some(told(p.calibrated.value)),
-                calibrated_ci95: interval(p.calibrated.ci95, told),
+                calibrated: Some(reported(p.calibrated.value)),
+                calibrated_ci95: interval(p.calibrated.ci95, reported),
             };
             (parameter.name.clone(), entry)
         })
@@ -825,9 +825,9 @@ fn correlations(
             let after = after?;
             // With itself a residual is the same at both sides, and one at lag zero.
             let from = if with.is_some() { 0 } else { reach + stride };
-            let told = || (from..=2 * reach).step_by(stride);
-            let lag = told().map(|k| (k as f64 - reach as f64) * piece.dt).collect();
-            let part = |c: Correlation| told().map(|k| c.values[k]).collect::<Vec<f64>>();
+            let reported = || (from..=2 * reach).step_by(stride);
+            let lag = reported().map(|k| (k as f64 - reach as f64) * piece.dt).collect();
+            let part = |c: Correlation| reported().map(|k| c.values[k]).collect::<Vec<f64>>();
             let bound = after.bound;
             Some(Lagged { with, lag, before: before.map_or_else(Vec::new, part), after: part(after), bound })
         })
@@ -951,17 +951,17 @@ mod tests {
             stated: None,
         }];
         let reach = Reach { inputs, dt: 0.01, ..Reach::default() };
-        let told = mechanism(&found, &model, &reach);
-        assert_eq!(told.drifting.as_deref(), Some("g"));
-        assert_eq!(told.states["a"], "ma*a'' = ka*(z - a)");
+        let reported = mechanism(&found, &model, &reach);
+        assert_eq!(reported.drifting.as_deref(), Some("g"));
+        assert_eq!(reported.states["a"], "ma*a'' = ka*(z - a)");
         let units: Vec<(&str, &str)> =
-            told.parameters.iter().map(|(n, e)| (n.as_str(), e.unit.as_str())).collect();
+            reported.parameters.iter().map(|(n, e)| (n.as_str(), e.unit.as_str())).collect();
         assert_eq!(units, [("g", "m/s^2"), ("f0", "Hz"), ("zeta", "1")]);
-        assert_eq!(told.parameters["f0"].ci95, Some(Interval::new(3.6, 4.4)));
-        let alternative = &told.alternatives[0];
+        assert_eq!(reported.parameters["f0"].ci95, Some(Interval::new(3.6, 4.4)));
+        let alternative = &reported.alternatives[0];
         assert_eq!((&alternative.equation, &alternative.channel), (&Some("fall".into()), &None));
         assert_eq!(alternative.replaces.as_deref(), Some("u"));
-        let experiment = told.experiment.unwrap();
+        let experiment = reported.experiment.unwrap();
         assert_eq!(experiment.input.as_deref(), Some("u"), "the input of the equation");
         let band = experiment.band_hz.unwrap();
         assert!(band.low < 4.0 && 4.0 < band.high, "around f0: {band:?}");
@@ -1016,19 +1016,19 @@ mod tests {
             e = "tau*e' + e = 0"
         "#;
         let model = Model::from_toml(text, "m.toml").unwrap();
-        let told = |e: &str| converted(e, &model);
-        assert_eq!(told("phi").as_deref(), Some("rad"));
-        assert_eq!(told("phi'").as_deref(), Some("rad/s"));
-        assert_eq!(told("abs(h')").as_deref(), Some("m/s"));
-        assert_eq!(told("q").as_deref(), Some("m^3/s"));
-        assert_eq!(told("phi - psi").as_deref(), Some("rad"));
-        assert_eq!(told("Ti").as_deref(), Some("K"));
-        assert_eq!(told("Ti'").as_deref(), Some("K/s"));
-        assert_eq!(told("e").as_deref(), Some("1"));
+        let reported = |e: &str| converted(e, &model);
+        assert_eq!(reported("phi").as_deref(), Some("rad"));
+        assert_eq!(reported("phi'").as_deref(), Some("rad/s"));
+        assert_eq!(reported("abs(h')").as_deref(), Some("m/s"));
+        assert_eq!(reported("q").as_deref(), Some("m^3/s"));
+        assert_eq!(reported("phi - psi").as_deref(), Some("rad"));
+        assert_eq!(reported("Ti").as_deref(), Some("K"));
+        assert_eq!(reported("Ti'").as_deref(), Some("K/s"));
+        assert_eq!(reported("e").as_deref(), Some("1"));
         assert_eq!(coherent(&Unit::parse("degC").unwrap()), "K");
         assert_eq!(coherent(&Unit::parse("count").unwrap()), "count");
         for plain in ["psi'", "t", "z", "h*q"] {
-            assert_eq!(told(plain), None, "{plain}");
+            assert_eq!(reported(plain), None, "{plain}");
         }
     }
 }

@@ -61,13 +61,13 @@ fn note(group: &[&Finding]) -> Note {
     let first = group[0];
     let of = |recording: Option<&str>| -> Vec<&str> {
         let own = group.iter().filter(|f| f.recording.as_deref() == recording);
-        let mut told: Vec<&str> = Vec::new();
+        let mut reported: Vec<&str> = Vec::new();
         for finding in own {
-            if !told.contains(&finding.message.as_str()) {
-                told.push(&finding.message);
+            if !reported.contains(&finding.message.as_str()) {
+                reported.push(&finding.message);
             }
         }
-        told
+        reported
     };
     let mut recordings: Vec<&str> = Vec::new();
     for recording in group.iter().filter_map(|f| f.recording.as_deref()) {

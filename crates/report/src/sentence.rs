@@ -572,11 +572,11 @@ mod tests {
             let names: Vec<String> = names.iter().map(|n| (*n).to_owned()).collect();
             Alternative { channel: Some(names.into()), ..equal("sensor_offset") }
         };
-        let told = |kind, alternatives| inseparable(&mechanism(kind, "hub", alternatives));
+        let reported = |kind, alternatives| inseparable(&mechanism(kind, "hub", alternatives));
         // As a report without places has it.
-        assert_eq!(told("presliding_friction", vec![equal("presliding_friction")]), None);
+        assert_eq!(reported("presliding_friction", vec![equal("presliding_friction")]), None);
         assert_eq!(
-            told(
+            reported(
                 "presliding_friction",
                 vec![at("presliding_friction", "hub"), at("presliding_friction", "link")]
             )
@@ -587,15 +587,18 @@ mod tests {
             )
         );
         assert_eq!(
-            told("constant_offset", vec![input("u1"), input("u2"), sensors(&["x1"]), sensors(&["x1", "x2"])])
-                .as_deref(),
+            reported(
+                "constant_offset",
+                vec![input("u1"), input("u2"), sensors(&["x1"]), sensors(&["x1", "x2"])]
+            )
+            .as_deref(),
             Some(
                 "These recordings cannot separate constant offset from input offset of u₁, input offset of u₂, sensor \
                  offset of x₁ or sensor offset of x₁ and x₂ together."
             )
         );
         assert_eq!(
-            told(
+            reported(
                 "coulomb_friction",
                 vec![
                     at("stribeck_friction", "hub"),
@@ -668,16 +671,16 @@ mod tests {
                   "holdout_source": "b.csv"},
           "noise_floor": {}}"#;
         let mut report = Report::from_json(json).unwrap();
-        let told = super::summary(&report);
+        let reported = super::summary(&report);
         assert_eq!(
-            told[0],
+            reported[0],
             "Terms are missing from the model: −0.197·θ³ in the hub equation (SI units): the held-out error falls from \
              63 % to 0.19 %."
         );
-        assert_eq!(told[1], "The terms have no names: `greybox diagnose` looks for mechanisms.");
+        assert_eq!(reported[1], "The terms have no names: `greybox diagnose` looks for mechanisms.");
         report.candidates.clear();
-        let told = super::summary(&report);
-        assert!(told[0].contains("no term in the library explains it"), "{told:?}");
+        let reported = super::summary(&report);
+        assert!(reported[0].contains("no term in the library explains it"), "{reported:?}");
     }
 
     #[test]

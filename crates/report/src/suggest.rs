@@ -405,22 +405,22 @@ mod tests {
                 assert!(reached[0] <= low && low <= high && high <= reached[1], "{kind} {reached:?}: {text}");
             }
         }
-        let told = |kind| ask_within([0.0, 2.0], None, kind, &values).1;
+        let reported = |kind| ask_within([0.0, 2.0], None, kind, &values).1;
         assert_eq!(
-            told("gravity"),
+            reported("gravity"),
             "drive v slowly, up to 2 V, the most that these recordings reach, through |θ| < 1: look"
         );
-        let loud = told("quadratic_drag");
+        let loud = reported("quadratic_drag");
         assert!(
             loud.starts_with("drive v at up to 1 V and at up to 2 V, the most that these recordings reach"),
             "{loud}"
         );
         assert_eq!(
-            told("input_dead_zone"),
+            reported("input_dead_zone"),
             "ramp v slowly between 0 V and 2 V, the most that these recordings reach: look"
         );
         assert_eq!(
-            told("input_saturation"),
+            reported("input_saturation"),
             "step v from 1 V up to 2 V, the most that these recordings reach: look"
         );
         let negative = |kind| ask_within([-2.0, -0.5], None, kind, &values).1;
@@ -432,20 +432,21 @@ mod tests {
 
     #[test]
     fn what_the_model_states_of_the_actuator_is_allowed() {
-        let told = |stated, kind, values: &[(&str, f64)]| ask_within([-2.0, 2.0], Some(stated), kind, values);
-        assert_eq!(told([-10.0, 10.0], "gravity", &[]).0, Some([2.0, 3.0]));
-        let (amplitude, text) = told([-2.5, 2.5], "quadratic_drag", &[]);
+        let reported =
+            |stated, kind, values: &[(&str, f64)]| ask_within([-2.0, 2.0], Some(stated), kind, values);
+        assert_eq!(reported([-10.0, 10.0], "gravity", &[]).0, Some([2.0, 3.0]));
+        let (amplitude, text) = reported([-2.5, 2.5], "quadratic_drag", &[]);
         assert_eq!(amplitude, Some([2.0, 2.5]));
         assert!(text.starts_with("drive v as now, 2 V, and at up to 2.5 V"), "{text}");
-        let (amplitude, text) = told([-2.0, 2.0], "gravity", &[]);
+        let (amplitude, text) = reported([-2.0, 2.0], "gravity", &[]);
         assert_eq!(amplitude, Some([0.0, 2.0]));
         assert!(
             text.starts_with("drive v slowly, up to 2 V, the most that the model states for it, through"),
             "{text}"
         );
         // Even below what the recordings reached.
-        assert_eq!(told([-1.0, 1.0], "coulomb_friction", &[]).0, Some([0.0, 1.0]));
-        assert_eq!(told([-10.0, 10.0], "input_dead_zone", &[("udz", 3.0)]).0, Some([0.0, 6.0]));
+        assert_eq!(reported([-1.0, 1.0], "coulomb_friction", &[]).0, Some([0.0, 1.0]));
+        assert_eq!(reported([-10.0, 10.0], "input_dead_zone", &[("udz", 3.0)]).0, Some([0.0, 6.0]));
     }
 
     #[test]
@@ -461,14 +462,14 @@ mod tests {
 
     #[test]
     fn a_remainder_asks_for_its_variable_or_for_time() {
-        let told = |shape| for_remainder(&Location::default(), Some("v"), &reach(), shape).text;
+        let reported = |shape| for_remainder(&Location::default(), Some("v"), &reach(), shape).text;
         assert_eq!(
-            told("a term that depends on h"),
+            reported("a term that depends on h"),
             "drive v as now, 2 V, and at up to 3 V: the residual looks like a term that depends on h: slow sweeps \
              over the whole range of that variable, at two amplitudes"
         );
         assert_eq!(
-            told("a term that changes slowly with time"),
+            reported("a term that changes slowly with time"),
             "record the same again, v up to 2 V: the residual looks like a term that changes slowly with time: the \
              same short experiment at the beginning and at the end of a long run"
         );

@@ -154,11 +154,11 @@ fn a_malformed_report_names_the_place() {
 #[test]
 fn a_held_out_error_that_rises_is_told() {
     let mut report = sample::page().report;
-    let told = |report: &Report| {
+    let reported = |report: &Report| {
         let said = sentence::summary(report);
         said.into_iter().filter(|s| s.contains("does not carry over")).collect::<Vec<_>>()
     };
-    assert_eq!(told(&report), Vec::<String>::new());
+    assert_eq!(reported(&report), Vec::<String>::new());
     let channels: Vec<String> = report.fit.holdout.improved.keys().cloned().collect();
     let worse = &channels[0];
     report.fit.window_s = Some(2.0);
@@ -166,14 +166,14 @@ fn a_held_out_error_that_rises_is_told() {
     report.fit.holdout.calibrated[worse].nrmse_windowed = Some(0.2545);
     report.fit.holdout.improved[worse].nrmse = 0.3667;
     report.fit.holdout.improved[worse].nrmse_windowed = Some(0.241);
-    let said = told(&report);
+    let said = reported(&report);
     assert_eq!(said.len(), 1, "{said:?}");
     assert!(
         said[0].contains("rises from 32 % to 37 % (restarted every 2.00 s it falls from 25 % to 24 %)"),
         "{said:?}"
     );
     report.fit.holdout.improved[worse].nrmse = 0.321;
-    assert_eq!(told(&report), Vec::<String>::new());
+    assert_eq!(reported(&report), Vec::<String>::new());
 }
 
 /// The noise is as large in a recording that moves half as much, and twice as large a part of it.

@@ -331,15 +331,15 @@ fn a_remembered_past_stands_in_for_the_stretch_before() {
         t.y.iter().zip(&whole.y[cut..]).fold(0.0f64, |m, (a, b)| m.max((a - b).abs()))
     };
     let size = whole.y.iter().fold(0.0f64, |m, v| m.max(v.abs()));
-    let (told, untold, unknown) =
+    let (reported, untold, unknown) =
         (off(Some(&past(Some(&position[..=cut])))), off(None), off(Some(&past(None))));
     // Slopes by central differences are off by dt² x‴/6.
-    assert!(told < 1e-4 * size, "{told}");
-    assert!(untold > 100.0 * told, "{untold} {told}");
+    assert!(reported < 1e-4 * size, "{reported}");
+    assert!(untold > 100.0 * reported, "{untold} {reported}");
     assert_eq!(untold, unknown);
     // A past shorter than the delay holds its first value.
     let short = off(Some(&past(Some(&position[cut - 3..=cut]))));
-    assert!(told < short && short < untold, "{short}");
+    assert!(reported < short && short < untold, "{short}");
 }
 
 #[test]

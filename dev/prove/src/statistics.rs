@@ -236,7 +236,7 @@ enum Told {
 /// What one diagnosis says.
 #[derive(Debug, Clone)]
 struct Answer {
-    told: Told,
+    reported: Told,
     /// Kinds that it says these recordings do not tell from the first mechanism.
     equals: usize,
     /// Confidence of the first mechanism, if any.
@@ -259,7 +259,7 @@ impl Answer {
                 covered.count(strength, e.ci95);
             }
         }
-        let told = match diagnosis.mechanisms.first() {
+        let reported = match diagnosis.mechanisms.first() {
             None => Told::Nothing,
             Some(first) if first.kind == effect.kind => Told::Named,
             Some(first) if first.alternatives.iter().any(|a| a.equivalent && a.kind == effect.kind) => {
@@ -269,12 +269,12 @@ impl Answer {
         };
         let first = diagnosis.mechanisms.first();
         let equals = first.map_or(0, |f| f.alternatives.iter().filter(|a| a.equivalent).count());
-        Answer { told, equals, confidence: first.map(|f| f.confidence), covered }
+        Answer { reported, equals, confidence: first.map(|f| f.confidence), covered }
     }
 
     /// The confidence told, and whether it is right: the name, or, where equals count, one of them.
     fn judged(&self, equals_count: bool) -> Option<(f64, bool)> {
-        let right = self.told == Told::Named || (equals_count && self.told == Told::Equal);
+        let right = self.reported == Told::Named || (equals_count && self.reported == Told::Equal);
         self.confidence.map(|confidence| (confidence, right))
     }
 }
@@ -287,7 +287,7 @@ struct Bin {
     answers: usize,
     right: usize,
     /// Mean confidence.
-    told: f64,
+    reported: f64,
 }
 
 impl Bin {
@@ -306,7 +306,7 @@ impl Bin {
     /// Whether the confidence is no higher than the answers deserve: so few right ones, or fewer, come by chance in 2.5 %
     /// at least, were it so (exact binomial test).
     fn is_honest(&self) -> bool {
-        let by_chance = Binomial::new(self.told.clamp(0.0, 1.0), self.answers as u64);
+        let by_chance = Binomial::new(self.reported.clamp(0.0, 1.0), self.answers as u64);
         by_chance.is_ok_and(|d| d.cdf(self.right as u64) >= 0.025)
     }
 }
@@ -321,7 +321,7 @@ fn bins(answers: &[(f64, bool)]) -> Vec<Bin> {
             high: bounds[1],
             answers: inside.len(),
             right: inside.iter().filter(|a| a.1).count(),
-            told: inside.iter().map(|a| a.0).sum::<f64>() / inside.len().max(1) as f64,
+            reported: inside.iter().map(|a| a.0).sum::<f64>() / inside.len().max(1) as f64,
         }
     };
     BINS.windows(2).map(bin).collect()
@@ -398,21 +398,21 @@ fn effect_figures(found: &[(Effect, Answer)]) -> Vec<Figure> {
 
 /// How answers name what is left out, what they take it for, and how many of their intervals hold.
 fn summary(answers: &[&Answer]) -> String {
-    let count = |told: &Told| answers.iter().filter(|a| a.told == *told).count();
+    let count = |reported: &Told| answers.iter().filter(|a| a.reported == *reported).count();
     let mut text = format!("{} of {} named", count(&Told::Named), answers.len());
     if count(&Told::Equal) > 0 {
         text += &format!(", {} reported as equivalent", count(&Told::Equal));
     }
     let mut others = BTreeMap::new();
     for answer in answers {
-        if let Told::Otherwise(kind) = &answer.told {
+        if let Told::Otherwise(kind) = &answer.reported {
             *others.entry(kind).or_insert(0) += 1;
         }
     }
     for (kind, n) in others {
         text += &format!(", {n} taken for {kind}");
     }
-    let named: Vec<usize> = answers.iter().filter(|a| a.told == Told::Named).map(|a| a.equals).collect();
+    let named: Vec<usize> = answers.iter().filter(|a| a.reported == Told::Named).map(|a| a.equals).collect();
     if named.iter().any(|n| *n > 0) {
         let mean = named.iter().sum::<usize>() as f64 / named.len() as f64;
         text += &format!("; {mean:.2} equals beside the name");
@@ -426,7 +426,7 @@ fn summary(answers: &[&Answer]) -> String {
 }
 
 fn bin_figures(bins: &[Bin]) -> Vec<Figure> {
-    let told = |b: &Bin| {
+    let reported = |b: &Bin| {
         let (low, high) = b.interval();
         let name = format!("confidence {:.2} to {:.2}", b.low, b.high);
         let measured = format!(
@@ -435,11 +435,11 @@ fn bin_figures(bins: &[Bin]) -> Vec<Figure> {
             b.answers,
             100.0 * low,
             100.0 * high,
-            100.0 * b.told
+            100.0 * b.reported
         );
         Figure::judged(name, measured, "no less than told", b.is_honest())
     };
-    bins.iter().filter(|b| b.answers > 0).map(told).collect()
+    bins.iter().filter(|b| b.answers > 0).map(reported).collect()
 }
 
 /// What a run found.
@@ -475,10 +475,10 @@ fn table(found: &Found) -> String {
 fn diagram(bins: &[Vec<Bin>; 2]) -> Result<String> {
     let mut series = vec![Series::new("as told", Style::Dashed, vec![[0.0, 0.0], [100.0, 100.0]])];
     for (name, bins) in ["measured", "measured, little recorded"].into_iter().zip(bins) {
-        let told = || bins.iter().filter(|b| b.answers > 0);
+        let reported = || bins.iter().filter(|b| b.answers > 0);
         let percent = |(low, high): (f64, f64)| (100.0 * low, 100.0 * high);
-        let points = told().map(|b| [100.0 * b.told, 100.0 * b.rate()]).collect();
-        let errors = told().map(|b| percent(b.interval())).collect();
+        let points = reported().map(|b| [100.0 * b.reported, 100.0 * b.rate()]).collect();
+        let errors = reported().map(|b| percent(b.interval())).collect();
         series.push(Series::new(name, Style::Points, points).with_errors(errors));
     }
     let plot = Plot {

@@ -90,9 +90,10 @@ impl Answer {
 fn refitted(nominal: &Model, parameters: &Ordered<Parameter>) -> Result<Model> {
     let mut model = nominal.clone();
     for parameter in &mut model.parameters {
-        let told = parameters.get(&parameter.name).and_then(|p| p.calibrated);
-        let told = told.with_context(|| format!("report.json: no refitted value of `{}`", parameter.name))?;
-        parameter.value = parameter.unit.as_ref().map_or(told, |unit| unit.to_si(told));
+        let reported = parameters.get(&parameter.name).and_then(|p| p.calibrated);
+        let reported =
+            reported.with_context(|| format!("report.json: no refitted value of `{}`", parameter.name))?;
+        parameter.value = parameter.unit.as_ref().map_or(reported, |unit| unit.to_si(reported));
     }
     Ok(model)
 }
@@ -366,7 +367,7 @@ mod tests {
         let text = "[states]\nx = { unit = \"m\" }\n[parameters]\nl = { value = 2, unit = \"mm\" }\nc = { value = 1, unit = \"1/s\" }\n\
                     [equations]\nx = \"x' + c*(x - l) = 0\"\n";
         let nominal = Model::from_toml(text, "x.toml").unwrap();
-        let told = |value: f64| Parameter {
+        let reported = |value: f64| Parameter {
             nominal: value,
             value,
             ci95: None,
@@ -375,7 +376,8 @@ mod tests {
             calibrated: Some(value),
             calibrated_ci95: None,
         };
-        let mut report = Ordered::from_iter([("l".to_owned(), told(3.0)), ("c".to_owned(), told(0.5))]);
+        let mut report =
+            Ordered::from_iter([("l".to_owned(), reported(3.0)), ("c".to_owned(), reported(0.5))]);
         let model = refitted(&nominal, &report).unwrap();
         let values: Vec<f64> = model.parameters.iter().map(|p| p.value).collect();
         assert!((values[0] - 0.003).abs() < 1e-12 && (values[1] - 0.5).abs() < 1e-12, "{values:?}");

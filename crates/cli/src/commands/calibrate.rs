@@ -40,7 +40,7 @@ fn work(arguments: &Arguments) -> Result<Answer, Failure> {
     drop(progress);
     let results = Results::of(&calibration, &loaded, train, holdout)?;
     out.write(&results.files())?;
-    let told = arguments.inputs.study.out.display();
-    let text = format!("{}Written: {told}/model.toml, {told}/report.json\n", results.story);
+    let reported = arguments.inputs.study.out.display();
+    let text = format!("{}Written: {reported}/model.toml, {reported}/report.json\n", results.story);
     Ok(Answer::new(text, results.json))
 }

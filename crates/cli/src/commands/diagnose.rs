@@ -107,8 +107,8 @@ pub(crate) fn answer(
     let [json, html, (_, text)] = results.files();
     out.write(&[json, html, (improved, text)])?;
     let tried = own.map(tried).unwrap_or_default();
-    let told = format!("{}{tried}\n{}", results.story, written(&study.out, improved));
-    Ok(Answer::new(told, results.json))
+    let reported = format!("{}{tried}\n{}", results.story, written(&study.out, improved));
+    Ok(Answer::new(reported, results.json))
 }
 
 /// Which mechanisms beside the built-in ones were tried.

@@ -1034,13 +1034,13 @@ fn places() -> Vec<Row> {
 
 fn limits() -> Vec<Row> {
     const S: &str = "Searches that meet their limit";
-    let told = |what, run| Row { code: 0, ..Row::new(S, what, NOTHING, run) };
+    let reported = |what, run| Row { code: 0, ..Row::new(S, what, NOTHING, run) };
     vec![
-        told(
+        reported(
             "a search with too little work",
             "greybox diagnose model.toml run.csv --work 0 --out out | grep -A 1 limit",
         ),
-        told(
+        reported(
             "an identification with too little work",
             "greybox identify run.csv --states x --inputs f --order 2 --work 0 --out out | grep -A 1 limit",
         ),

@@ -2,7 +2,7 @@
 
 use super::level5::{Array, Value, Variable};
 use crate::error::{Place, RecordingError};
-use crate::finding::{Finding, Severity, told};
+use crate::finding::{Finding, Severity, listed};
 use crate::header::{TIMES, header_cell, seconds};
 use crate::recording::{Channel, MIN_SAMPLES, Recording};
 
@@ -75,7 +75,7 @@ pub(super) fn recording(
         ));
         found.clocks.push(clock);
     }
-    let left_out = found.told();
+    let left_out = found.listed();
     let (mut clocks, idle): (Vec<Clock>, Vec<Clock>) =
         found.clocks.into_iter().partition(|clock| !clock.signals.is_empty());
     if clocks.is_empty() {
@@ -233,12 +233,12 @@ impl Found {
     }
 
     /// What is not read, in words.
-    fn told(&self) -> String {
+    fn listed(&self) -> String {
         let arrays = self.loose.iter().map(|a| {
             let size: Vec<String> = a.array.dimensions.iter().map(usize::to_string).collect();
             format!("`{}` ({})", a.path, size.join("×"))
         });
-        told(arrays.chain(self.others.iter().cloned()).collect())
+        listed(arrays.chain(self.others.iter().cloned()).collect())
     }
 }
 

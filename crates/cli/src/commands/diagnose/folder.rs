@@ -195,13 +195,13 @@ impl Batch<'_> {
     fn diagnosed(&self, task: &Task) -> Result<Diagnosed, Failure> {
         let inputs = self.inputs(&task.recording)?;
         let [json_name, html_name, _] = FILES;
-        let told = |json: &str| {
+        let reported = |json: &str| {
             let page = format!("{}/{html_name}", task.name);
             let name = loading::file_name(&task.recording);
             Report::from_json(json).map(|report| merge::map(&name, Some(&page), &report))
         };
         if let Some(statistics) =
-            Done::read(task.out.path(), &inputs, json_name).and_then(|json| told(&json).ok())
+            Done::read(task.out.path(), &inputs, json_name).and_then(|json| reported(&json).ok())
         {
             return Ok(Diagnosed { statistics, before: true });
         }
@@ -214,7 +214,7 @@ impl Batch<'_> {
         let done = serde_json::to_string_pretty(&Done::new(inputs, &results.files()))
             .map_err(|e| unwritten(e.into()))?;
         task.out.write(&[&results.files()[..], &[(done::FILE, done.as_bytes())]].concat())?;
-        Ok(Diagnosed { statistics: told(&results.report_json).map_err(unwritten)?, before: false })
+        Ok(Diagnosed { statistics: reported(&results.report_json).map_err(unwritten)?, before: false })
     }
 
     /// What the results of a recording depend on.
