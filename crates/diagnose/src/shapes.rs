@@ -220,7 +220,7 @@ impl Group {
         k
     }
 
-    /// [`log_marginal`] of the shape, its values at the knots being normal about zero with deviation `width`.
+    /// The marginal likelihood (its logarithm) of the shape, its values at the knots being normal about zero with deviation `width`.
     pub fn evidence(&self, gg: &[f64], gr: &[f64], weight: f64, width: f64) -> f64 {
         log_marginal(&qr::cholesky(&self.covariance(), gr.len()), gg, gr, weight, width)
     }

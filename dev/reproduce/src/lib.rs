@@ -1,7 +1,7 @@
 //! `cargo xtask reproduce`: every table and figure of the thesis that can honestly be made again, beside its
 //! numbers, judged against the bounds in `fixtures/thesis`.
 //!
-//! One table or figure is one function that returns a [`Piece`]; the chapters list theirs. What the thesis
+//! One table or figure is one function that returns a `Piece`; the chapters list theirs. What the thesis
 //! prints stands in `fixtures/thesis/*.json`, corrected by the errata that each file names; what we measure
 //! stands in the piece, and its bounds in the file. Nothing is random but for fixed seeds.
 
