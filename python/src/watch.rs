@@ -89,7 +89,7 @@ impl greybox_diagnose::ProgressListener for Watch {
     }
 
     fn stage(&self, stage: Stage) {
-        Watch::stage(self, diagnose::reported(stage));
+        Watch::stage(self, diagnose::stage_text(stage));
     }
 
     fn tried(&self, _kind: &str, _expression: &str, _evidence: &Evidence) {
@@ -115,7 +115,7 @@ impl greybox_identify::ProgressListener for Watch {
     }
 
     fn stage(&self, name: &str) {
-        Watch::stage(self, identify::reported(name));
+        Watch::stage(self, identify::stage_text(name));
     }
 }
 

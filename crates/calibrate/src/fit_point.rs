@@ -3,16 +3,16 @@
 use crate::problem::Point;
 use crate::setup::{Segmentation, Setup};
 
-/// Where a model is evaluated: on these segments, at this point of its parameters and starts, its residuals in units of this
-/// scale (SI, one for each channel).
+/// Where a model is evaluated: its residuals are r = (y − ŷ(x₀, p))/scale for the parameters p and the starts x₀ of a point, each
+/// segment simulated from its own start.
 #[derive(Clone, Copy)]
 pub struct FitPoint<'a> {
     /// Model, data, free parameters.
     pub setup: &'a Setup,
     /// The segments.
     pub level: &'a Segmentation,
-    /// Residual scale per channel, SI.
+    /// Residual scale, one for each channel, SI.
     pub scale: &'a [f64],
-    /// Values of the parameters and of the segments' starts.
+    /// p, all of the model's, and x₀, one state for each segment, SI.
     pub point: &'a Point,
 }

@@ -91,10 +91,10 @@ pub fn input_noise(setup: &Setup, parameters: &[f64], run: &FreeRun) -> Vec<Inpu
 
 /// [`input_noise`] in words: for parameters that were fitted, a warning where the noise is a good part of what they leave.
 pub fn findings(setup: &Setup, parameters: &[f64], run: &FreeRun, fitted: bool) -> Vec<Finding> {
-    input_noise(setup, parameters, run).into_iter().map(|found| reported(setup, &found, fitted)).collect()
+    input_noise(setup, parameters, run).into_iter().map(|found| finding(setup, &found, fitted)).collect()
 }
 
-fn reported(setup: &Setup, found: &InputNoise, fitted: bool) -> Finding {
+fn finding(setup: &Setup, found: &InputNoise, fitted: bool) -> Finding {
     let input = &setup.model.inputs[found.input];
     let output = &setup.data.channels[found.output];
     let severity =

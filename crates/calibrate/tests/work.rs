@@ -40,3 +40,34 @@ fn a_fit_ends_at_its_own_limit() {
     let (same, _) = fit(Some(2 * cost));
     assert_eq!(same.point, whole.point);
 }
+
+/// A point that is alone is simulated once, with its derivatives; one beside another is priced first. The fit is the same.
+#[test]
+fn a_fit_does_not_depend_on_how_its_start_was_simulated() {
+    let (n, dt) = (600, 0.01);
+    let f = force(7, n, dt, 1.0, 5.0);
+    let model = Model::from_toml(OSCILLATOR, "oscillator.toml").unwrap();
+    let measured = measure(&model, &f, dt, &[0.0, 0.0]);
+    let free = setup(&model, &f, dt, &measured);
+    let level = free.level(4);
+    for factor in [0.4, 1.2, 3.0] {
+        let parameters: Vec<f64> = free.values().iter().map(|v| factor * v).collect();
+        let point = Point { starts: free.starts(&level, &parameters), parameters };
+        for iterations in [0, 1, 2, 50] {
+            let limits = Limits { iterations, tolerance: 1e-12 };
+            let work = |points: &[Point]| {
+                let work = Arc::new(Work::default());
+                let setup = Setup { work: work.clone(), ..free.clone() };
+                (setup.fit(&level, &free.data.sigma, points, limits), work.done())
+            };
+            let (alone, cost) = work(std::slice::from_ref(&point));
+            let (beside, dearer) = work(&[point.clone(), point.clone()]);
+            assert_eq!(
+                (&alone.point, alone.cost, alone.iterations),
+                (&beside.point, beside.cost, beside.iterations)
+            );
+            assert_eq!((&alone.rss, alone.ending), (&beside.rss, beside.ending));
+            assert!(cost < dearer, "{cost} {dearer}");
+        }
+    }
+}

@@ -72,7 +72,7 @@ impl Progress {
 
 impl ProgressListener for Progress {
     fn stage(&self, stage: Stage) {
-        Progress::stage(self, diagnose::reported(stage));
+        Progress::stage(self, diagnose::stage_text(stage));
     }
 
     fn weighed(&self, weighed: &Weighed<'_>) {
@@ -84,7 +84,7 @@ impl ProgressListener for Progress {
 
 impl greybox_identify::ProgressListener for Progress {
     fn stage(&self, name: &str) {
-        Progress::stage(self, identify::reported(name));
+        Progress::stage(self, identify::stage_text(name));
     }
 }
 

@@ -8,7 +8,7 @@ use serde_json::{Value, json};
 /// Most significant digits of a number that may be a value of a recording.
 const DIGITS: usize = 3;
 /// Significant digits by which values are told from each other.
-const TOLD: usize = 12;
+const DISTINCT_DIGITS: usize = 12;
 
 /// What is known of a recording without its values: sizes, sampling, ranges to two digits, health.
 pub fn statistics(recording: &Recording, findings: &[Finding]) -> Value {
@@ -93,7 +93,7 @@ impl Values {
 
 /// The leading digits of a number as a whole number, whatever its sign and power of ten.
 fn digits(value: f64) -> u64 {
-    let text = format!("{:.*e}", TOLD - 1, value.abs());
+    let text = format!("{:.*e}", DISTINCT_DIGITS - 1, value.abs());
     let mantissa = text.split('e').next().unwrap_or_default();
     mantissa.bytes().filter(u8::is_ascii_digit).fold(0, |n, digit| 10 * n + u64::from(digit - b'0'))
 }

@@ -68,7 +68,7 @@ fn unwritten(error: ReportError) -> Failure {
 }
 
 /// A stage in words.
-pub fn reported(stage: Stage) -> String {
+pub fn stage_text(stage: Stage) -> String {
     match stage {
         Stage::Calibrating => "calibrating the model as it is".to_owned(),
         Stage::Screening { candidates, found } => {

@@ -57,7 +57,7 @@ impl Results {
 }
 
 /// A stage in words.
-pub fn reported(stage: &str) -> &str {
+pub fn stage_text(stage: &str) -> &str {
     match stage {
         "weak form" => "first estimates (weak form)",
         "output error" => "choosing and fitting terms on simulated outputs",

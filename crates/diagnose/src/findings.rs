@@ -90,8 +90,8 @@ pub(crate) fn findings(
         let accepted = found.accepted.iter().find(|a| a.candidate == *candidate);
         let evidence = accepted.map_or(Evidence::NONE, |a| a.evidence);
         let tried = accepted.map_or(&[][..], |a| &a.alternatives[..]);
-        let Beside { confidence, alternatives, equations } =
-            Beside::of(part, evidence, tried, (&setup.model, nominal), library);
+        let AmongAlternatives { confidence, alternatives, equations } =
+            AmongAlternatives::of(part, evidence, tried, (&setup.model, nominal), library);
         let estimate = |name: &String| {
             let index = setup.model.parameter(name)?;
             let value = parameters[index];
@@ -131,7 +131,7 @@ pub(crate) fn findings(
 }
 
 /// A mechanism beside the others that explain the same.
-struct Beside {
+struct AmongAlternatives {
     /// Its probability.
     confidence: f64,
     alternatives: Vec<Alternative>,
@@ -139,7 +139,7 @@ struct Beside {
     equations: Vec<String>,
 }
 
-impl Beside {
+impl AmongAlternatives {
     /// Of a part of a model, with what was `tried` in its place, and their evidence.
     fn of(
         part: &MechanismTerm,
@@ -147,7 +147,7 @@ impl Beside {
         tried: &[AlternativeTerm],
         (model, nominal): (&Model, &Model),
         library: &[Mechanism],
-    ) -> Beside {
+    ) -> AmongAlternatives {
         let MechanismTerm { candidate, instance, .. } = part;
         let mechanism = &library[candidate.mechanism];
         // Posterior weights of the explanations tried; equivalent ones share their weight.
@@ -215,7 +215,11 @@ impl Beside {
                 equations.push(name);
             }
         }
-        Beside { confidence, alternatives: distinct(alternatives, &mechanism.kind, &site), equations }
+        AmongAlternatives {
+            confidence,
+            alternatives: distinct(alternatives, &mechanism.kind, &site),
+            equations,
+        }
     }
 }
 

@@ -626,7 +626,7 @@ pub fn clock_offsets(recording: &Recording, inputs: &[&str], outputs: &[&str]) -
         else {
             break;
         };
-        let finding = listed(recording, &strongest, piece.dt, roles && is(inputs, strongest.pair[1]));
+        let finding = clocks_differ(recording, &strongest, piece.dt, roles && is(inputs, strongest.pair[1]));
         // Without roles it may be an input and its answer.
         let severity = if roles { Severity::Warning } else { Severity::Info };
         findings.push(Finding { severity, ..finding });
@@ -666,7 +666,8 @@ fn odd_one(offsets: &[Offset], channels: usize) -> Option<usize> {
     (0..channels).max_by_key(|&c| times(c)).filter(|&c| times(c).0 > 0)
 }
 
-fn listed(recording: &Recording, offset: &Offset, dt: f64, acausal: bool) -> Finding {
+/// That the clocks of two channels differ by this offset.
+fn clocks_differ(recording: &Recording, offset: &Offset, dt: f64, acausal: bool) -> Finding {
     let [early, late] = offset.pair.map(|c| recording.channels[c].name.as_str());
     let Lag { samples, correlation } = offset.lag;
     let [agree, tell] = offset.parts;

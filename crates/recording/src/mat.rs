@@ -42,11 +42,11 @@ pub fn parse_mat(bytes: &[u8], name: &str) -> Result<Recording, RecordingError> 
 }
 
 pub(crate) fn parse(bytes: &[u8], label: &str, name: &str) -> Result<Recording, RecordingError> {
-    let variables = level5::variables(bytes).map_err(|fault| listed(fault, Place::file(label)))?;
+    let variables = level5::variables(bytes).map_err(|fault| refused(fault, Place::file(label)))?;
     layout::recording(&variables, label, name)
 }
 
-fn listed(fault: Fault, place: Place) -> RecordingError {
+fn refused(fault: Fault, place: Place) -> RecordingError {
     match fault {
         Fault::Format(found, help) => RecordingError::Format { place, found: found.to_owned(), help },
         Fault::Damaged { variable, what, at } => {

@@ -222,7 +222,7 @@ impl Covered {
 
 /// What one diagnosis of a machine with something left out says of it.
 #[derive(Debug, Clone, PartialEq)]
-enum Told {
+enum Reported {
     /// Its kind.
     Named,
     /// Another kind, which these recordings do not tell from it: the report says so.
@@ -236,7 +236,7 @@ enum Told {
 /// What one diagnosis says.
 #[derive(Debug, Clone)]
 struct Answer {
-    reported: Told,
+    reported: Reported,
     /// Kinds that it says these recordings do not tell from the first mechanism.
     equals: usize,
     /// Confidence of the first mechanism, if any.
@@ -260,12 +260,12 @@ impl Answer {
             }
         }
         let reported = match diagnosis.mechanisms.first() {
-            None => Told::Nothing,
-            Some(first) if first.kind == effect.kind => Told::Named,
+            None => Reported::Nothing,
+            Some(first) if first.kind == effect.kind => Reported::Named,
             Some(first) if first.alternatives.iter().any(|a| a.equivalent && a.kind == effect.kind) => {
-                Told::Equal
+                Reported::Equal
             }
-            Some(first) => Told::Otherwise(first.kind.clone()),
+            Some(first) => Reported::Otherwise(first.kind.clone()),
         };
         let first = diagnosis.mechanisms.first();
         let equals = first.map_or(0, |f| f.alternatives.iter().filter(|a| a.equivalent).count());
@@ -274,7 +274,7 @@ impl Answer {
 
     /// The confidence told, and whether it is right: the name, or, where equals count, one of them.
     fn judged(&self, equals_count: bool) -> Option<(f64, bool)> {
-        let right = self.reported == Told::Named || (equals_count && self.reported == Told::Equal);
+        let right = self.reported == Reported::Named || (equals_count && self.reported == Reported::Equal);
         self.confidence.map(|confidence| (confidence, right))
     }
 }
@@ -398,21 +398,22 @@ fn effect_figures(found: &[(Effect, Answer)]) -> Vec<Figure> {
 
 /// How answers name what is left out, what they take it for, and how many of their intervals hold.
 fn summary(answers: &[&Answer]) -> String {
-    let count = |reported: &Told| answers.iter().filter(|a| a.reported == *reported).count();
-    let mut text = format!("{} of {} named", count(&Told::Named), answers.len());
-    if count(&Told::Equal) > 0 {
-        text += &format!(", {} reported as equivalent", count(&Told::Equal));
+    let count = |reported: &Reported| answers.iter().filter(|a| a.reported == *reported).count();
+    let mut text = format!("{} of {} named", count(&Reported::Named), answers.len());
+    if count(&Reported::Equal) > 0 {
+        text += &format!(", {} reported as equivalent", count(&Reported::Equal));
     }
     let mut others = BTreeMap::new();
     for answer in answers {
-        if let Told::Otherwise(kind) = &answer.reported {
+        if let Reported::Otherwise(kind) = &answer.reported {
             *others.entry(kind).or_insert(0) += 1;
         }
     }
     for (kind, n) in others {
         text += &format!(", {n} taken for {kind}");
     }
-    let named: Vec<usize> = answers.iter().filter(|a| a.reported == Told::Named).map(|a| a.equals).collect();
+    let named: Vec<usize> =
+        answers.iter().filter(|a| a.reported == Reported::Named).map(|a| a.equals).collect();
     if named.iter().any(|n| *n > 0) {
         let mean = named.iter().sum::<usize>() as f64 / named.len() as f64;
         text += &format!("; {mean:.2} equals beside the name");
