@@ -197,3 +197,152 @@ fn what_cannot_be_controlled_is_said() {
     assert_eq!(code, Some(0), "{err}");
     assert!(out.contains("left out of arm"), "{out}");
 }
+
+/// With an observer the loop rests on the set point in spite of friction and load, and its code, fed with what the sensors
+/// said, gives the commands of the simulated loop, in C and in Rust alike, also where a measurement is missing.
+#[test]
+fn output_feedback_gives_code_that_repeats_the_loop() {
+    let folder = tempfile::tempdir().unwrap();
+    std::fs::write(folder.path().join("arm.toml"), MODEL.replace("value = 0.005", "value = 0.05")).unwrap();
+    let settings = [
+        "--to",
+        "0.8",
+        "--size",
+        "theta=0.4",
+        "--size",
+        "theta'=4",
+        "--input-size",
+        "5",
+        "--limit",
+        "10",
+        "--dt",
+        "0.002",
+        "--members",
+        "10",
+        "--hold",
+        "3",
+        "--json",
+    ];
+    for observer in ["kalman", "eso"] {
+        let own = [
+            "--feedback",
+            "output",
+            "--observer",
+            observer,
+            "--resolution",
+            "theta=0.0015",
+            "--out",
+            observer,
+        ];
+        let all = [&["control", "arm.toml"][..], &settings, &own].concat();
+        let (code, out, err) = greybox(folder.path(), &all);
+        assert_eq!(code, Some(0), "{observer}: {err}");
+        let report: serde_json::Value = serde_json::from_str(&out).unwrap();
+        assert_eq!((&report["observer"]["kind"], &report["verdict"]), (&observer.into(), &"settles".into()));
+        assert_eq!(report["family"]["settled"], 10, "{observer}");
+        for point in report["closed_loop"]["set_points"].as_array().unwrap() {
+            assert!(point["final_error"].as_f64().unwrap().abs() < 2.0 * 0.0015, "{observer}: {point}");
+            assert!(point["peak_to_peak"].as_f64().unwrap() < 2.0 * 0.0015, "{observer}: {point}");
+        }
+        for check in report["checks"].as_array().unwrap() {
+            let with = &check["with_observer"]["margins"];
+            let (own, full) = (with["phase"].as_f64().unwrap(), check["margins"]["phase"].as_f64().unwrap());
+            assert!(own > 0.5 && own < full, "{observer}: {own} {full}");
+        }
+        let read = |name: &str| std::fs::read_to_string(folder.path().join(observer).join(name)).unwrap();
+        let html = read("report.html");
+        assert!(
+            html.contains("Margins of the sampled loop with its observer")
+                && html.contains("What is measured")
+        );
+        assert!(!html.contains("There is no integral action"));
+        repeats(&folder.path().join(observer), &read("observer_vectors.csv"));
+    }
+    // What belongs to an observer is not for the full state.
+    let more = ["--noise", "theta=0.1", "--out", "o"];
+    let (code, _, err) = greybox(folder.path(), &[&["control", "arm.toml"][..], &settings, &more].concat());
+    assert!(code == Some(2) && err.contains("--feedback output"), "{err}");
+}
+
+/// Runs the observer's code over the measurements, in C and in Rust.
+fn repeats(folder: &Path, vectors: &str) {
+    let rows: Vec<Vec<f64>> =
+        vectors.lines().skip(1).map(|line| line.split(',').map(|v| v.parse().unwrap()).collect()).collect();
+    assert_eq!(vectors.lines().next(), Some("t,theta,set_point,command"));
+    assert!(rows.len() == 2000 && rows[0].len() == 4);
+    let n = rows.len();
+    let cells = |open: &str, close: &str| {
+        let row = |r: &Vec<f64>| format!("{open}{:?}, {:?}{close}", r[1], r[2]);
+        rows.iter().map(row).collect::<Vec<_>>().join(", ")
+    };
+    let rust = format!(
+        "#![allow(dead_code)]\nmod libm {{\n pub fn sin(x: f64) -> f64 {{ x.sin() }}\n pub fn cos(x: f64) -> f64 {{ x.cos() }}\n \
+         pub fn pow(x: f64, y: f64) -> f64 {{ x.powf(y) }}\n pub fn fabs(x: f64) -> f64 {{ x.abs() }}\n}}\n\
+         mod law {{\n use super::libm;\n include!(\"law.rs\");\n}}\nmod observer {{\n use super::libm;\n include!(\"observer.rs\");\n}}\n\
+         static IN: [[f64; 2]; {n}] = [{}];\nfn main() {{\n for missing in [false, true] {{\n  let mut o = observer::Observer::new();\n  \
+         for (k, [y, r]) in IN.iter().enumerate() {{\n   let y = if missing && k % 50 == 7 {{ f64::NAN }} else {{ *y }};\n   \
+         println!(\"{{:?}}\", o.step(&[y], &[*r], law::control_law));\n  }}\n }}\n}}\n",
+        cells("[", "]")
+    );
+    std::fs::write(folder.join("main.rs"), rust).unwrap();
+    let run = |program: &str| -> Vec<f64> {
+        let run = Command::new(folder.join(program)).output().unwrap();
+        String::from_utf8(run.stdout).unwrap().lines().map(|l| l.parse().unwrap()).collect()
+    };
+    let rustc = std::env::var_os("RUSTC").unwrap_or_else(|| "rustc".into());
+    let made = Command::new(rustc)
+        .current_dir(folder)
+        .args(["--edition", "2024", "-O", "-A", "unused_imports", "-o", "run_rust", "main.rs"])
+        .output()
+        .unwrap();
+    assert!(made.status.success(), "{}", String::from_utf8_lossy(&made.stderr));
+    let by_rust = run("run_rust");
+    let off = |a: &[f64], b: &mut dyn Iterator<Item = f64>| {
+        a.iter()
+            .zip(b)
+            .map(|(a, b)| (a - b).abs())
+            .fold(0.0, |worst: f64, d| if d <= worst { worst } else { d })
+    };
+    let worst = off(&by_rust[..n], &mut rows.iter().map(|r| r[3]));
+    assert!(by_rust.len() == 2 * n && worst < 1e-8, "{worst:e}");
+    // Forty missing measurements change little, and end nothing.
+    let missing = off(&by_rust[n..], &mut rows.iter().map(|r| r[3]));
+    assert!(missing > 1e-6 && missing < 8.0, "{missing}");
+    if Command::new("gcc").arg("--version").output().is_err() {
+        println!("skipped: no C compiler here");
+        return;
+    }
+    let head: String = std::fs::read_to_string(folder.join("observer.c")).unwrap();
+    let kind = head.split("typedef struct").nth(1).unwrap().split("observer_memory;").next().unwrap();
+    let main = format!(
+        "#include <math.h>\n#include <stdio.h>\ntypedef struct{kind}observer_memory;\nvoid observer_start(observer_memory *memory);\n\
+         double observer_step(observer_memory *memory, const double measured[1], const double set_point[1]);\n\
+         static const double in[{n}][2] = {{{}}};\nint main(void) {{\n for (int missing = 0; missing < 2; missing++) {{\n  \
+         observer_memory m;\n  observer_start(&m);\n  for (int i = 0; i < {n}; i++) {{\n   double y[1];\n   \
+         y[0] = missing && i % 50 == 7 ? NAN : in[i][0];\n   printf(\"%.17g\\n\", observer_step(&m, y, in[i] + 1));\n  }}\n }}\n \
+         return 0;\n}}\n",
+        cells("{", "}")
+    );
+    std::fs::write(folder.join("main.c"), main).unwrap();
+    let strict = [
+        "-std=c99",
+        "-O2",
+        "-ffreestanding",
+        "-Wall",
+        "-Wextra",
+        "-Wpedantic",
+        "-Wconversion",
+        "-Werror",
+        "-c",
+    ];
+    let links = ["main.c", "law.o", "observer.o", "-lm", "-o", "run_c"];
+    for arguments in
+        [[&strict[..], &["law.c"]].concat(), [&strict[..], &["observer.c"]].concat(), links.to_vec()]
+    {
+        let made = Command::new("gcc").current_dir(folder).args(arguments).output().unwrap();
+        assert!(made.status.success(), "{}", String::from_utf8_lossy(&made.stderr));
+    }
+    let by_c = run("run_c");
+    let worst = off(&by_c, &mut by_rust.iter().copied());
+    assert!(by_c.len() == 2 * n && worst < 1e-8, "{worst:e}");
+}

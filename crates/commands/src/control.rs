@@ -4,10 +4,11 @@ use std::fmt::Write as _;
 use std::path::Path;
 
 use greybox_control::{
-    ClosedLoop, Controller, DesignOptions, Family, FamilyOptions, LoopOptions, Method, Metrics, Plant,
-    PlantOptions, Pole, Reference, Run, design,
+    ClosedLoop, Controller, DesignOptions, Family, FamilyOptions, Feedback, LoopOptions, Margins, Method,
+    Metrics, ObserverMethod, OutputFeedback, OutputOptions, Plant, PlantOptions, Pole, Reference, Run,
+    Sensor, UNSTATED_NOISE, design, observer,
 };
-use greybox_export::{Constant, Function, Group, Language, Member};
+use greybox_export::{ChainForm, Constant, Function, Group, Language, Member, ObserverCode, ObserverForm};
 use greybox_model::Model;
 use greybox_recording::write_csv;
 use greybox_report::contract::Producer;
@@ -27,6 +28,21 @@ pub const FILES: [(&str, &str); 6] = [
     ("law.rs", "the law as Rust without the standard library"),
     ("vectors.csv", "states and set points with the command that the code must give"),
 ];
+/// Further files with an observer.
+pub const OBSERVER_FILES: [(&str, &str); 3] = [
+    ("observer.c", "the observer as C99: its step calls the law"),
+    ("observer.rs", "the observer as Rust without the standard library"),
+    (
+        "observer_vectors.csv",
+        "measurements and set points of the simulated loop with the command that the step must give",
+    ),
+];
+/// Samples of the simulated loop that the observer's code must reproduce.
+const OBSERVED: usize = 2000;
+/// Change of the disturbance in one second that an observer expects where nothing is stated, over the command's size.
+const DISTURBANCE: f64 = 0.2;
+/// Bandwidth of an extended-state observer where none is stated, over the fastest pole of the loop.
+const FASTER: f64 = 4.0;
 /// States at which the exported code must agree, for each set point.
 const VECTORS: usize = 32;
 
@@ -63,10 +79,40 @@ pub struct Request {
     pub ignore_time_terms: bool,
     /// Take friction, smoothed, out of the motion (smc).
     pub compensate_friction: bool,
+    /// What the law is given: the full state, or what an observer makes of the measured ones.
+    pub observer: Option<ObserverRequest>,
+    /// The law is given what was measured so long ago, s, in the simulated loop.
+    pub delay: f64,
     /// Perturbed plants on which the law is tried.
     pub members: usize,
     /// Seed of the perturbed plants.
     pub seed: u64,
+}
+
+/// An observer, and the sensors that it has; all numbers in SI.
+#[derive(Debug, Clone, PartialEq, Default)]
+pub struct ObserverRequest {
+    /// Which one.
+    pub kind: ObserverKind,
+    /// Standard deviations of the sensors' noise, by measured state.
+    pub noise: Vec<(String, f64)>,
+    /// Steps of the sensors' values, by measured state.
+    pub resolution: Vec<(String, f64)>,
+    /// Change of the disturbance in one second, in units of the command; a fifth of its size where none is given
+    /// (Kalman).
+    pub disturbance: Option<f64>,
+    /// Bandwidth, 1/s; four times the fastest pole of the loop where none is given (ESO).
+    pub bandwidth: Option<f64>,
+}
+
+/// The observers.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
+pub enum ObserverKind {
+    /// Steady-state Kalman filter with the disturbance of the command as a state.
+    #[default]
+    Kalman,
+    /// Extended-state observer.
+    Eso,
 }
 
 /// The methods.
@@ -98,6 +144,8 @@ impl Default for Request {
             eta: None,
             ignore_time_terms: false,
             compensate_friction: false,
+            observer: None,
+            delay: 0.0,
             members: 50,
             seed: 0,
         }
@@ -107,8 +155,8 @@ impl Default for Request {
 /// A controller as the files and words that users see.
 #[derive(Debug)]
 pub struct Results {
-    /// Content of each of [`FILES`], in their order.
-    contents: [Vec<u8>; 6],
+    /// Names and contents of [`FILES`], and of [`OBSERVER_FILES`] where there is an observer.
+    contents: Vec<(&'static str, Vec<u8>)>,
     /// The controller in plain language.
     pub story: String,
     /// The content of `report.json`.
@@ -120,7 +168,7 @@ pub struct Results {
 impl Results {
     /// The files, by name.
     pub fn files(&self) -> Vec<(&'static str, &[u8])> {
-        FILES.iter().zip(&self.contents).map(|((name, _), content)| (*name, content.as_slice())).collect()
+        self.contents.iter().map(|(name, content)| (*name, content.as_slice())).collect()
     }
 }
 
@@ -151,7 +199,12 @@ pub fn control(
     };
     let controller = design(&plant, &method(request), &wanted).map_err(refused)?;
     stage("simulating");
-    let closed = ClosedLoop::new(model, &controller, &LoopOptions::default()).map_err(refused)?;
+    let output = request.observer.as_ref().map(|o| output_feedback(o, request, &controller)).transpose();
+    let output = output.map_err(refused)?;
+    let feedback = output.clone().map_or(Feedback::FullState, |o| Feedback::Output(Box::new(o)));
+    let options =
+        LoopOptions { feedback, delay: request.delay, seed: request.seed, ..LoopOptions::default() };
+    let closed = ClosedLoop::new(model, &controller, &options).map_err(refused)?;
     let reference = Reference::square(request.to, request.hold, 4);
     let run = closed.run(&reference).map_err(refused)?;
     stage("perturbing");
@@ -167,25 +220,28 @@ pub fn control(
         Some(closed.family(&reference, &options).map_err(refused)?)
     };
     stage("writing the report");
+    let files = files(request);
     let producer = Producer { version: env!("CARGO_PKG_VERSION").into(), seed: request.seed };
     let page = convert::page(&ControlSources {
         model_file: &loaded.file,
         model,
         controller: &controller,
+        output: output.as_ref(),
+        delay: request.delay,
         run: &run,
         family: family.as_ref().map(|f| (f, deviations.as_slice())),
         producer: &producer,
-        files: &FILES[1..],
+        files: &files[1..],
     });
 
-    let function = function(model, &controller, &loaded.file);
+    let function = function(model, &controller, output.as_ref(), &loaded.file);
     let written = |e: greybox_export::ExportError| Failure::file(&loaded.path, e);
     let (c, rust) =
         (function.code(Language::C99).map_err(written)?, function.code(Language::Rust).map_err(written)?);
-    let vectors = vectors(&function, &controller, request.to).map_err(written)?;
-    let json = report(&page, &controller, &run, family.as_ref());
+    let vectors = vectors(&function, &controller, output.as_ref(), request.to).map_err(written)?;
+    let json = report(&page, request, &controller, output.as_ref(), &run, family.as_ref());
     let html = page.to_html().map_err(|e| Failure::internal(e.to_string()))?;
-    let contents = [
+    let mut texts = vec![
         html.into_bytes(),
         format!("{json:#}\n").into_bytes(),
         series(&run)?,
@@ -193,7 +249,15 @@ pub fn control(
         rust.into_bytes(),
         vectors.into_bytes(),
     ];
-    let story = in_words(request, &loaded.file, &controller, &run, family.as_ref());
+    if let Some(output) = &output {
+        let code = observer_code(model, &controller, output, &function, &loaded.file);
+        for language in [Language::C99, Language::Rust] {
+            texts.push(code.code(language).map_err(written)?.into_bytes());
+        }
+        texts.push(observed(&controller, output, &run)?);
+    }
+    let contents = files.iter().map(|(name, _)| *name).zip(texts).collect();
+    let story = in_words(request, &loaded.file, &controller, output.as_ref(), &run, family.as_ref());
     Ok(Results { contents, story, json, run })
 }
 
@@ -266,26 +330,169 @@ fn method(request: &Request) -> Method {
     }
 }
 
-/// The law as a function of the state and the set point.
-fn function(model: &Model, controller: &Controller, file: &str) -> Function {
-    let plant = controller.plant();
-    // Rates have no unit text of their own.
-    let member = |(name, primes): &(String, u8)| {
-        let unit = model.state(name).map_or("", |i| model.states[i].unit.text.as_str());
-        let unit = match (unit, primes) {
-            ("", _) => String::new(),
-            (unit, 0) => format!("SI of {unit}"),
-            (unit, 1) => format!("SI of {unit} per s"),
-            (unit, n) => format!("SI of {unit} per s^{n}"),
-        };
-        Member::new(name, *primes, &unit)
+/// The files of a request.
+#[must_use]
+pub fn files(request: &Request) -> Vec<(&'static str, &'static str)> {
+    let further: &[(&str, &str)] = if request.observer.is_some() { &OBSERVER_FILES } else { &[] };
+    FILES.iter().chain(further).copied().collect()
+}
+
+/// The observer that is asked for.
+fn output_feedback(
+    wanted: &ObserverRequest,
+    request: &Request,
+    controller: &Controller,
+) -> Result<OutputFeedback, greybox_control::ControlError> {
+    let fastest = controller.design_point().poles.iter().fold(0.0f64, |f, p| f.max(p.magnitude()));
+    let method = match wanted.kind {
+        ObserverKind::Kalman => ObserverMethod::Kalman {
+            disturbance: wanted.disturbance.unwrap_or(DISTURBANCE * request.input_size),
+        },
+        ObserverKind::Eso => ObserverMethod::Eso { bandwidth: wanted.bandwidth.unwrap_or(FASTER * fastest) },
     };
+    let mut sensors: Vec<(String, Sensor)> = Vec::new();
+    let names = || wanted.noise.iter().chain(&wanted.resolution).map(|(name, _)| name);
+    for name in names() {
+        if sensors.iter().any(|(n, _)| n == name) {
+            continue;
+        }
+        let of = |list: &[(String, f64)]| list.iter().rev().find(|(n, _)| n == name).map(|(_, v)| *v);
+        let resolution = of(&wanted.resolution).unwrap_or(0.0);
+        // An encoder has no noise but its counts; another sensor of which nothing is stated has.
+        let size = controller.plant().state(name).map_or(1.0, |i| controller.plant().sizes()[i]);
+        let unstated = if resolution > 0.0 { 0.0 } else { UNSTATED_NOISE * size };
+        sensors.push((name.clone(), Sensor { noise: of(&wanted.noise).unwrap_or(unstated), resolution }));
+    }
+    OutputFeedback::new(controller, &OutputOptions { method, sensors })
+}
+
+/// A state with its unit.
+fn state_member(model: &Model, name: &str, primes: u8) -> Member {
+    let unit = model.state(name).map_or("", |i| model.states[i].unit.text.as_str());
+    // Rates have no unit text of their own.
+    let unit = match (unit, primes) {
+        ("", _) => String::new(),
+        (unit, 0) => format!("SI of {unit}"),
+        (unit, 1) => format!("SI of {unit} per s"),
+        (unit, n) => format!("SI of {unit} per s^{n}"),
+    };
+    Member::new(name, primes, &unit)
+}
+
+/// The parameters as constants.
+fn constants(model: &Model, plant: &Plant) -> Vec<Constant> {
     let parameter = |(name, value): &(String, f64)| {
         let unit = model.parameter(name).and_then(|i| model.parameters[i].unit.as_ref());
         Constant::new(name, *value, unit.map_or("", |u| u.text.as_str()))
     };
-    let law = controller.law().first().cloned().unwrap_or(greybox_model::Expr::Num(0.0));
+    plant.parameters().iter().map(parameter).collect()
+}
+
+/// The observer and the equations that it predicts with.
+fn observer_code(
+    model: &Model,
+    controller: &Controller,
+    output: &OutputFeedback,
+    law: &Function,
+    file: &str,
+) -> ObserverCode {
+    let plant = controller.plant();
+    let (f, g) = plant.frictionless();
+    let input = greybox_model::Expr::var(plant.input_name());
+    let rates = f.iter().zip(g).zip(plant.state_names());
+    let state = plant.symbols().iter().map(|(name, primes)| state_member(model, name, *primes));
+    let rate = Function {
+        name: "plant_rate".into(),
+        summary: vec![
+            format!("Equations of motion of {}, friction dropped, for the observer.", model.name),
+            format!("Made by greybox {} from {file}.", env!("CARGO_PKG_VERSION")),
+        ],
+        arguments: vec![
+            Group { name: "state".into(), members: state.collect() },
+            Group { name: "command".into(), members: vec![Member::new(plant.input_name(), 0, "SI")] },
+        ],
+        constants: constants(model, plant),
+        outputs: rates
+            .map(|((f, g), name)| {
+                (format!("rate of {name}"), (f.clone() + g.clone() * input.clone()).simplify())
+            })
+            .collect(),
+    };
+    let form = match output.observer().form() {
+        observer::Form::Kalman { gain, substeps } => ObserverForm::Kalman { gain, substeps },
+        observer::Form::Eso(chains) => ObserverForm::Chains(
+            chains
+                .into_iter()
+                .map(|c| ChainForm {
+                    first: c.first,
+                    a: c.a,
+                    before: c.before,
+                    now: c.now,
+                    input: c.input,
+                    gain: c.gain,
+                    weight: c.weight,
+                })
+                .collect(),
+        ),
+    };
+    ObserverCode {
+        summary: vec![format!(
+            "{}. Call observer_step once a sample; it calls {} of the law's file.",
+            observer_in_words(output),
+            law.name
+        )],
+        rate,
+        law: law.clone(),
+        dt: controller.dt(),
+        measured: output.observer().measured().to_vec(),
+        dead_zone: plant.dead_zone(),
+        rest: output.tracked(),
+        form,
+    }
+}
+
+/// What the sensors said in the simulated loop, and the command that the observer's code must give.
+fn observed(controller: &Controller, output: &OutputFeedback, run: &Run) -> Result<Vec<u8>, Failure> {
+    let names = controller.plant().state_names();
+    let count = run.t.len().min(OBSERVED);
+    let mut columns: Vec<(&str, &[f64])> = Vec::new();
+    for (&i, y) in output.observer().measured().iter().zip(&run.y) {
+        columns.push((names[i].as_str(), &y[..count]));
+    }
+    columns.extend([("set_point", &run.r[..count]), ("command", &run.u[..count])]);
+    let mut csv = Vec::new();
+    write_csv(&mut csv, &run.t[..count], &columns)?;
+    Ok(csv)
+}
+
+fn observer_in_words(output: &OutputFeedback) -> String {
+    match output.method() {
+        ObserverMethod::Kalman { disturbance } => format!(
+            "Kalman filter, disturbance of {} of the command in a second",
+            format::number(*disturbance)
+        ),
+        ObserverMethod::Eso { bandwidth } => {
+            format!("Extended-state observer, bandwidth {} 1/s", format::number(*bandwidth))
+        }
+    }
+}
+
+/// The law as a function of the state, the disturbance where an observer estimates it, and the set point.
+fn function(model: &Model, controller: &Controller, output: Option<&OutputFeedback>, file: &str) -> Function {
+    let plant = controller.plant();
+    let member = |(name, primes): &(String, u8)| state_member(model, name, *primes);
+    let law = match output {
+        Some(output) => output.law().clone(),
+        None => controller.law().first().cloned().unwrap_or(greybox_model::Expr::Num(0.0)),
+    };
     let (low, high) = controller.limits();
+    let disturbance = output.map(|o| Group {
+        name: "disturbance".into(),
+        members: vec![Member::new(o.disturbance(), 0, "units of the command")],
+    });
+    let set_point =
+        Group { name: "set_point".into(), members: vec![member(&(controller.reference().to_owned(), 0))] };
+    let state = Group { name: "state".into(), members: plant.symbols().iter().map(member).collect() };
     Function {
         name: "control_law".into(),
         summary: vec![
@@ -293,14 +500,8 @@ fn function(model: &Model, controller: &Controller, file: &str) -> Function {
             format!("Made by greybox {} from {file}.", env!("CARGO_PKG_VERSION")),
             format!("Call it every {} s and hold the command; range {low} to {high}.", controller.dt()),
         ],
-        arguments: vec![
-            Group { name: "state".into(), members: plant.symbols().iter().map(member).collect() },
-            Group {
-                name: "set_point".into(),
-                members: vec![member(&(controller.reference().to_owned(), 0))],
-            },
-        ],
-        constants: plant.parameters().iter().map(parameter).collect(),
+        arguments: [Some(state), disturbance, Some(set_point)].into_iter().flatten().collect(),
+        constants: constants(model, plant),
         outputs: vec![(format!("{}, SI", plant.input_name()), law)],
     }
 }
@@ -309,6 +510,7 @@ fn function(model: &Model, controller: &Controller, file: &str) -> Function {
 fn vectors(
     function: &Function,
     controller: &Controller,
+    output: Option<&OutputFeedback>,
     to: f64,
 ) -> Result<String, greybox_export::ExportError> {
     let plant = controller.plant();
@@ -320,12 +522,17 @@ fn vectors(
             let spread = |i: usize| 2.0 * (k as f64 * roots[i % roots.len()].sqrt()).fract() - 1.0;
             let state = check.equilibrium.state.iter().zip(plant.sizes()).enumerate();
             let mut point: Vec<f64> = state.map(|(i, (x, size))| x + size * spread(i)).collect();
+            if output.is_some() {
+                point.push(plant.input_size() * spread(plant.order()));
+            }
             point.push(if k % 2 == 0 { check.set_point } else { 0.5 * to });
             points.push(point);
         }
     }
-    let mut text = plant.state_names().join(",");
-    let _ = writeln!(text, ",{},{}", controller.reference(), plant.input_name());
+    let mut names = plant.state_names();
+    names.extend(output.map(|o| o.disturbance().to_owned()));
+    names.extend([controller.reference().to_owned(), plant.input_name().to_owned()]);
+    let mut text = names.join(",") + "\n";
     for vector in function.vectors(&points)? {
         let numbers: Vec<String> =
             vector.arguments.iter().chain(&vector.outputs).map(|v| format!("{v:?}")).collect();
@@ -343,18 +550,37 @@ fn series(run: &Run) -> Result<Vec<u8>, Failure> {
     Ok(csv)
 }
 
-fn report(page: &ControlPage, controller: &Controller, run: &Run, family: Option<&Family>) -> Value {
+fn report(
+    page: &ControlPage,
+    request: &Request,
+    controller: &Controller,
+    output: Option<&OutputFeedback>,
+    run: &Run,
+    family: Option<&Family>,
+) -> Value {
     let plant = controller.plant();
     let (low, high) = controller.limits();
     let limit = |v: f64| if v.is_finite() { json!(v) } else { Value::Null };
+    let margins = |m: &Margins| {
+        json!({
+            "gain": limit(m.gain), "lower_gain": m.lower_gain, "phase": m.phase, "delay": limit(m.delay),
+            "sensitivity": m.sensitivity,
+        })
+    };
+    let full = controller.margins();
     let checks: Vec<Value> = controller
         .checks()
         .iter()
-        .map(|c| {
+        .enumerate()
+        .map(|(k, c)| {
             let poles = |poles: &[Pole]| poles.iter().map(|p| [p.re, p.im]).collect::<Vec<_>>();
             json!({
                 "set_point": c.set_point, "state": c.equilibrium.state, "command": c.equilibrium.input,
                 "poles": poles(&c.poles), "held_poles": poles(&c.held_poles), "spectral_radius": c.spectral_radius,
+                "margins": full.get(k).and_then(Option::as_ref).map(margins),
+                "with_observer": output.and_then(|o| o.checks().get(k)).map(|c| json!({
+                    "spectral_radius": c.spectral_radius, "margins": margins(&c.margins),
+                })),
             })
         })
         .collect();
@@ -371,7 +597,12 @@ fn report(page: &ControlPage, controller: &Controller, run: &Run, family: Option
         "dt": controller.dt(),
         "limits": [limit(low), limit(high)],
         "gains": controller.gains(),
-        "law": controller.law().iter().map(ToString::to_string).collect::<Vec<_>>(),
+        "law": match output {
+            Some(output) => vec![output.law().to_string()],
+            None => controller.law().iter().map(ToString::to_string).collect(),
+        },
+        "delay": request.delay,
+        "observer": output.map(|o| observer_report(plant, o)),
         "checks": checks,
         "left_out": plant.dropped().iter().map(|d| json!({
             "equation": d.equation, "term": d.term.to_string(),
@@ -388,18 +619,47 @@ fn report(page: &ControlPage, controller: &Controller, run: &Run, family: Option
     })
 }
 
+fn observer_report(plant: &Plant, output: &OutputFeedback) -> Value {
+    let names = plant.state_names();
+    let sensors = output.observer().measured().iter().zip(output.sensors());
+    let (kind, setting) = match output.method() {
+        ObserverMethod::Kalman { disturbance } => ("kalman", json!({ "disturbance": disturbance })),
+        ObserverMethod::Eso { bandwidth } => ("eso", json!({ "bandwidth": bandwidth })),
+    };
+    let gain = match output.observer().form() {
+        observer::Form::Kalman { gain, .. } => json!(gain),
+        observer::Form::Eso(_) => Value::Null,
+    };
+    json!({
+        "kind": kind, "setting": setting, "gain": gain,
+        "sensors": sensors.map(|(&i, s)| json!({
+            "state": names[i], "noise": s.noise, "resolution": s.resolution,
+        })).collect::<Vec<_>>(),
+    })
+}
+
 fn metrics(m: &Metrics) -> Value {
     json!({
         "set_point": m.set_point, "settling": m.settling, "overshoot": m.overshoot,
-        "final_error": m.final_error, "rms_error": m.rms_error, "largest_command": m.largest_command,
+        "final_error": m.final_error, "peak_to_peak": m.peak_to_peak, "rms_error": m.rms_error, "largest_command": m.largest_command,
         "saturated": m.saturated, "effort": m.effort,
     })
+}
+
+/// The worst margins over the set points, of the loop as it is fed back.
+fn worst_margins(controller: &Controller, output: Option<&OutputFeedback>) -> Option<Margins> {
+    let all: Vec<Margins> = match output {
+        Some(output) => output.checks().iter().map(|c| c.margins).collect(),
+        None => controller.margins().into_iter().flatten().collect(),
+    };
+    all.into_iter().reduce(Margins::worse)
 }
 
 fn in_words(
     request: &Request,
     file: &str,
     controller: &Controller,
+    output: Option<&OutputFeedback>,
     run: &Run,
     family: Option<&Family>,
 ) -> String {
@@ -419,6 +679,35 @@ fn in_words(
     for (name, gain) in plant.state_names().iter().zip(controller.gains()) {
         let _ = writeln!(text, "  gain of {name}: {}", format::number(*gain));
     }
+    if let Some(output) = output {
+        let sensors = output.observer().measured().iter().zip(output.sensors()).map(|(&i, s)| {
+            let name = plant.state_names().get(i).cloned().unwrap_or_default();
+            match (s.noise, s.resolution) {
+                (noise, 0.0) => format!("{name} (noise {})", format::number(noise)),
+                (0.0, resolution) => format!("{name} (in steps of {})", format::number(resolution)),
+                (noise, resolution) => {
+                    format!(
+                        "{name} (noise {}, in steps of {})",
+                        format::number(noise),
+                        format::number(resolution)
+                    )
+                }
+            }
+        });
+        let sensors: Vec<String> = sensors.collect();
+        let _ = writeln!(text, "  {}; measured: {}", observer_in_words(output), sensors.join(", "));
+    }
+    let worst = worst_margins(controller, output);
+    if let Some(m) = worst {
+        let _ = writeln!(
+            text,
+            "  margins: gain × {} to {}, phase {}°, delay {} s",
+            format::number(m.lower_gain),
+            format::number(m.gain),
+            format::number(m.phase.to_degrees()),
+            format::number(m.delay),
+        );
+    }
     for dropped in plant.dropped() {
         let _ = writeln!(text, "  left out of {}: {}", dropped.equation, dropped.term);
     }
@@ -427,10 +716,11 @@ fn in_words(
             m.settling.map_or("does not settle".into(), |s| format!("settles in {} s", format::number(s)));
         let _ = writeln!(
             text,
-            "  to {}: {settling}, overshoot {}, ends {} off, command up to {}",
+            "  to {}: {settling}, overshoot {}, ends {} off (peak to peak {}), command up to {}",
             format::number(m.set_point),
             format::percent(m.overshoot),
             format::number(m.final_error.abs()),
+            format::number(m.peak_to_peak),
             format::number(m.largest_command),
         );
     }

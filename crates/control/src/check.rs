@@ -103,6 +103,6 @@ impl Examined<'_> {
 }
 
 /// The largest magnitude.
-fn largest(poles: &[Pole]) -> f64 {
+pub(crate) fn largest(poles: &[Pole]) -> f64 {
     poles.iter().fold(0.0f64, |radius, p| radius.max(p.magnitude()))
 }

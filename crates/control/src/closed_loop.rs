@@ -2,9 +2,12 @@
 
 use greybox_model::{Hold, Model, System};
 use greybox_simulate::{Carry, Environment, Method as Integration, Seeds, Signal, Simulation};
+use rand::SeedableRng;
+use rand_pcg::Pcg64Mcg;
 
 use crate::controller::Controller;
 use crate::error::{ControlError, listed};
+use crate::output::OutputFeedback;
 use crate::run::metrics;
 pub use crate::run::{MOST_SAMPLES, Reference, Run};
 
@@ -12,22 +15,29 @@ pub use crate::run::{MOST_SAMPLES, Reference, Run};
 const FAR: f64 = 1e9;
 
 /// What the law is given of the state.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
+#[derive(Debug, Clone, Default)]
 pub enum Feedback {
     /// All of it.
     #[default]
     FullState,
     /// Measured states, and rates by differences of the last two samples.
     Differences,
+    /// What an observer makes of the measured states; their sensors have noise and resolution.
+    Output(Box<OutputFeedback>),
 }
 
 /// How a closed loop is simulated.
-#[derive(Debug, Clone, PartialEq)]
+#[derive(Debug, Clone)]
 pub struct LoopOptions {
     /// Start, a value for each entry of the model's state vector; zeros where there is none.
     pub start: Option<Vec<f64>>,
     /// What the law is given.
     pub feedback: Feedback,
+    /// The law is given the state of so long ago, s: sensors, network and computing together. Between two samples it is
+    /// on the line through them.
+    pub delay: f64,
+    /// Of the sensors' noise: the same seed gives the same noise, in every member of a family.
+    pub seed: u64,
     /// Integration between two commands.
     pub integration: Integration,
 }
@@ -35,7 +45,7 @@ pub struct LoopOptions {
 impl Default for LoopOptions {
     fn default() -> Self {
         let integration = Integration::Adaptive { rtol: 1e-7, atol: 1e-10 };
-        Self { start: None, feedback: Feedback::FullState, integration }
+        Self { start: None, feedback: Feedback::FullState, delay: 0.0, seed: 0, integration }
     }
 }
 
@@ -80,6 +90,9 @@ pub struct ClosedLoop<'a> {
     held: Vec<f64>,
     integration: Integration,
     delays: bool,
+    output: Option<OutputFeedback>,
+    delay: f64,
+    seed: u64,
 }
 
 impl<'a> ClosedLoop<'a> {
@@ -93,6 +106,14 @@ impl<'a> ClosedLoop<'a> {
         controller: &'a Controller,
         options: &LoopOptions,
     ) -> Result<ClosedLoop<'a>, ControlError> {
+        if !(options.delay >= 0.0 && options.delay.is_finite()) {
+            let what = "the delay of the loop".to_owned();
+            return Err(ControlError::Option {
+                what,
+                value: options.delay,
+                wanted: "a finite time, zero or more",
+            });
+        }
         let system = System::compile(model)?;
         let plant = controller.plant();
         let mut states = Vec::with_capacity(system.nx);
@@ -116,7 +137,7 @@ impl<'a> ClosedLoop<'a> {
         let constant = |name: &str| plant.held().iter().find(|(n, _)| n == name).map_or(0.0, |(_, v)| *v);
         let held = model.inputs.iter().map(|i| constant(&i.name)).collect();
         let mut rates = vec![None; names.len()];
-        if options.feedback == Feedback::Differences {
+        if matches!(options.feedback, Feedback::Differences) {
             for (i, (name, primes)) in plant.symbols().iter().enumerate() {
                 if plant.measured()[i] {
                     continue;
@@ -145,6 +166,12 @@ impl<'a> ClosedLoop<'a> {
             held,
             integration: options.integration,
             delays,
+            output: match &options.feedback {
+                Feedback::Output(output) => Some(OutputFeedback::clone(output)),
+                _ => None,
+            },
+            delay: options.delay,
+            seed: options.seed,
         })
     }
 
@@ -178,6 +205,7 @@ impl<'a> ClosedLoop<'a> {
             r: Vec::with_capacity(samples + 1),
             u: Vec::with_capacity(samples + 1),
             x: vec![Vec::with_capacity(samples + 1); self.system.nx],
+            y: vec![Vec::new(); self.output.as_ref().map_or(0, |o| o.observer().measured().len())],
             states: self.states.clone(),
             tracked: self.places[self.controller.tracked()],
             diverged: None,
@@ -193,13 +221,18 @@ impl<'a> ClosedLoop<'a> {
             .collect();
         let mut x = self.start.clone();
         let mut carry: Option<Carry> = None;
+        let mut memory = self.output.as_ref().map(OutputFeedback::start);
+        let mut random = Pcg64Mcg::seed_from_u64(self.seed);
         let mut known: Vec<f64> = self.places.iter().map(|&p| x[p]).collect();
         for k in 0..=samples {
             let t = k as f64 * dt;
             let r = reference.at(t);
             let before = known.clone();
+            for (series, x) in run.x.iter_mut().zip(&x) {
+                series.push(*x);
+            }
             for (i, &place) in self.places.iter().enumerate() {
-                known[i] = x[place];
+                known[i] = self.sensed(&run.x[place], k);
             }
             for i in 0..known.len() {
                 // At the start there is no sample before: nothing moves yet.
@@ -207,13 +240,18 @@ impl<'a> ClosedLoop<'a> {
                     known[i] = if k == 0 { 0.0 } else { (known[below] - before[below]) / dt };
                 }
             }
-            let u = self.controller.command(&known, r);
+            let u = match (&self.output, &mut memory) {
+                (Some(output), Some(memory)) => {
+                    let sensors = output.observer().measured().iter().zip(output.sensors());
+                    let y: Vec<f64> = sensors.map(|(&i, s)| s.read(known[i], &mut random)).collect();
+                    run.y.iter_mut().zip(&y).for_each(|(series, y)| series.push(*y));
+                    output.command(memory, &y, r)
+                }
+                _ => self.controller.command(&known, r),
+            };
             run.t.push(t);
             run.r.push(r);
             run.u.push(u);
-            for (series, x) in run.x.iter_mut().zip(&x) {
-                series.push(*x);
-            }
             let away = self.places.iter().zip(&far).any(|(&p, far)| x[p].abs() > *far);
             if away || !u.is_finite() {
                 run.diverged = Some(k);
@@ -232,6 +270,20 @@ impl<'a> ClosedLoop<'a> {
         }
         run.metrics = metrics(&run, reference, dt, self.controller.limits());
         Ok(run)
+    }
+
+    /// A state as the law is given it at sample `k`, the last of `series`.
+    fn sensed(&self, series: &[f64], k: usize) -> f64 {
+        if self.delay == 0.0 {
+            return series[k];
+        }
+        let back = self.delay / self.controller.dt();
+        if back >= k as f64 {
+            return series[0];
+        }
+        let at = k as f64 - back;
+        let (low, w) = (at.floor() as usize, at.fract());
+        series[low] + w * (series[(low + 1).min(k)] - series[low])
     }
 
     /// The state one sample later under the last of the commands `u`; none where it left every bound.

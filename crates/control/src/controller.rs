@@ -27,6 +27,8 @@ pub struct Controller {
     pub(crate) unlimited: Expr,
     pub(crate) law: Vec<Expr>,
     pub(crate) compiled: Compiled,
+    /// The law without limits and without its compensation of friction.
+    pub(crate) frictionless: Compiled,
 }
 
 impl Controller {

@@ -75,7 +75,7 @@ pub fn design(plant: &Plant, method: &Method, options: &DesignOptions) -> Result
             wanted: n,
         });
     }
-    let reference = free_name(plant);
+    let reference = free_name(plant, "r", &[]);
     let least = options.set_points.iter().copied().fold(f64::INFINITY, f64::min);
     let most = options.set_points.iter().copied().fold(f64::NEG_INFINITY, f64::max);
     let guess = options.guess.clone().unwrap_or_else(|| Equilibrium::origin(n));
@@ -119,6 +119,7 @@ pub fn design(plant: &Plant, method: &Method, options: &DesignOptions) -> Result
     }
     Ok(Controller {
         compiled: compile(&limited)?,
+        frictionless: examined.frictionless,
         plant: plant.clone(),
         method: method.clone(),
         tracked,
@@ -136,15 +137,16 @@ pub fn design(plant: &Plant, method: &Method, options: &DesignOptions) -> Result
     })
 }
 
-/// `r`, or a name like it that the model does not use.
-fn free_name(plant: &Plant) -> String {
+/// `name`, or one like it that neither the model nor `others` use.
+pub(crate) fn free_name(plant: &Plant, name: &str, others: &[&str]) -> String {
     let taken = |name: &str| {
-        name == plant.input_name()
+        others.contains(&name)
+            || name == plant.input_name()
             || plant.symbols().iter().any(|(n, _)| n == name)
             || plant.parameters().iter().any(|(n, _)| n == name)
             || plant.held().iter().any(|(n, _)| n == name)
     };
-    let mut name = "r".to_owned();
+    let mut name = name.to_owned();
     while taken(&name) {
         name.push_str("_set");
     }
@@ -153,7 +155,7 @@ fn free_name(plant: &Plant) -> String {
 
 /// The command within its limits, with what a dead zone swallows added. Near zero, within δ = [`NEAR_ZERO`] of the
 /// input's size, the addition is linear: it never exceeds what is swallowed, and does not chatter.
-fn limited(law: &Expr, plant: &Plant, low: f64, high: f64) -> Expr {
+pub(crate) fn limited(law: &Expr, plant: &Plant, low: f64, high: f64) -> Expr {
     let mut u = law.clone();
     if plant.dead_zone() > 0.0 {
         let steep = Expr::Num(plant.dead_zone() / (NEAR_ZERO * plant.input_size())) * law.clone();

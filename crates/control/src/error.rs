@@ -1,5 +1,6 @@
 //! What can be wrong on the way from a model to a controller.
 
+use greybox_eso::EsoError;
 use greybox_hjb::{HjbError, RiccatiError};
 use greybox_model::system::CompileError;
 use greybox_model::tape::UnknownName;
@@ -289,6 +290,58 @@ pub enum ControlError {
     NoPoles {
         /// Where.
         set_point: f64,
+    },
+    /// Plant and observer together are unstable when sampled.
+    #[error(
+        "with its observer the closed loop is unstable at the set point {set_point} (a pole in z of magnitude {radius:.4}, \
+         sampled every {dt} s): sample faster, or give the observer another bandwidth or disturbance"
+    )]
+    UnstableOutput {
+        /// Where.
+        set_point: f64,
+        /// Sample time, s.
+        dt: f64,
+        /// The largest magnitude.
+        radius: f64,
+    },
+    /// No Kalman filter.
+    #[error(
+        "the observer cannot be designed: {source}; the measured states must determine the others and a constant \
+         disturbance of the command: measure the tracked state too"
+    )]
+    Observer {
+        /// Why.
+        source: RiccatiError,
+    },
+    /// No extended-state observer.
+    #[error("the extended-state observer cannot be designed: {source}")]
+    Eso {
+        /// Why.
+        source: EsoError,
+    },
+    /// A coordinate of too high an order for an extended-state observer.
+    #[error(
+        "the coordinate `{name}` has {order} states, and an extended-state observer is made for 1 to 3: use the Kalman filter"
+    )]
+    EsoOrder {
+        /// The coordinate.
+        name: String,
+        /// Its number of states.
+        order: usize,
+    },
+    /// No state of the plant is measured.
+    #[error("none of the states {known} is measured: an observer needs one that a channel measures as it is")]
+    NothingMeasured {
+        /// The plant's states.
+        known: String,
+    },
+    /// A sensor of a state that is not measured.
+    #[error("no sensor measures `{name}`: give one of {known}")]
+    NotMeasured {
+        /// As given.
+        name: String,
+        /// The measured states.
+        known: String,
     },
     /// The model does not compile.
     #[error("the model cannot be simulated: {0}")]

@@ -4,6 +4,8 @@
 pub const BAND: f64 = 0.02;
 /// The share of a set point's time, at its end, over which the final error is averaged.
 const LAST: f64 = 0.05;
+/// The share of a set point's time, at its end, in which the loop should be at rest.
+const REST: f64 = 0.25;
 
 /// How one set point was reached.
 #[derive(Debug, Clone, Copy, PartialEq)]
@@ -20,6 +22,9 @@ pub struct Metrics {
     pub overshoot: f64,
     /// Mean of (tracked state − set point) over the last twentieth of the time.
     pub final_error: f64,
+    /// Largest less least tracked state in the last quarter of the time: what a limit cycle (friction hunted by an
+    /// integral action, quantisation) moves, where the final error averages it.
+    pub peak_to_peak: f64,
     /// Root mean square of (tracked state − set point) over the whole of the time.
     pub rms_error: f64,
     /// Largest |u|.
@@ -52,6 +57,9 @@ impl Metrics {
         };
         let beyond = y.iter().map(|y| (y - set_point) * step.signum()).fold(0.0, f64::max);
         let tail = &y[y.len() - ((y.len() as f64 * LAST) as usize).max(1)..];
+        let rest = &y[y.len() - ((y.len() as f64 * REST) as usize).max(1)..];
+        let largest = rest.iter().fold(f64::NEG_INFINITY, |m, y| m.max(*y));
+        let least = rest.iter().fold(f64::INFINITY, |m, y| m.min(*y));
         let mean = |values: &[f64], of: fn(f64) -> f64| {
             values.iter().map(|y| of(y - set_point)).sum::<f64>() / values.len() as f64
         };
@@ -62,6 +70,7 @@ impl Metrics {
             settling,
             overshoot: if step == 0.0 { 0.0 } else { beyond / step.abs() },
             final_error: mean(tail, |e| e),
+            peak_to_peak: largest - least,
             rms_error: mean(y, |e| e * e).sqrt(),
             largest_command: u.iter().fold(0.0, |m, u| m.max(u.abs())),
             saturated: at_an_end as f64 / u.len().max(1) as f64,

@@ -68,7 +68,9 @@ pub struct Run {
     pub u: Vec<f64>,
     /// States of the model (all, also those that the law does not know), one series each.
     pub x: Vec<Vec<f64>>,
-    /// Their names.
+    /// What the sensors of an observer said, one series for each measured state; none without an observer.
+    pub y: Vec<Vec<f64>>,
+    /// Names of the states.
     pub states: Vec<String>,
     /// The tracked state's index.
     pub tracked: usize,

@@ -5,4 +5,5 @@ mod common;
 mod errors;
 mod link;
 mod loops;
+mod output;
 mod plants;

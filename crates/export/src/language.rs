@@ -62,12 +62,12 @@ fn write(function: &Function, graph: &Graph, language: Language) -> String {
 }
 
 /// The shortest text that reads back as the same number.
-fn number(v: f64) -> String {
+pub(crate) fn number(v: f64) -> String {
     format!("{v:?}")
 }
 
 /// Text that ends no comment.
-fn comment(text: &str) -> String {
+pub(crate) fn comment(text: &str) -> String {
     text.replace("*/", "* /").replace(['\n', '\r'], " ")
 }
 

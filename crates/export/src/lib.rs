@@ -9,6 +9,7 @@ mod language;
 mod latex;
 mod modelica;
 mod names;
+mod observer;
 mod python;
 
 pub use error::ExportError;
@@ -16,4 +17,5 @@ pub use function::{Constant, Function, Group, Member, Vector};
 pub use language::Language;
 pub use latex::{latex, latex_document};
 pub use modelica::modelica;
+pub use observer::{ChainForm, ObserverCode, ObserverForm};
 pub use python::python;

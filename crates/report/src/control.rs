@@ -3,7 +3,7 @@
 //! Plain data, filled by the caller ([`crate::convert::control`]). All numbers are SI; units are those of
 //! [`Quantity::unit`]. A number that is not finite is shown as unknown.
 
-use greybox_control::{Metrics, Verdict};
+use greybox_control::{Margins, Metrics, Verdict};
 
 use crate::contract::{ModelId, Producer};
 
@@ -36,6 +36,10 @@ pub struct ControlPage {
     pub reference: String,
     /// The law in the model language.
     pub law: String,
+    /// The observer between the sensors and the law; none where the law is given the full state.
+    pub observer: Option<ObserverPage>,
+    /// How old what the law is given is in the simulated loop, s.
+    pub delay: f64,
     /// Terms of the model that the design left out: equation and term.
     pub left_out: Vec<(String, String)>,
     /// The tangent of the loop at each set point.
@@ -48,6 +52,28 @@ pub struct ControlPage {
     pub run: LoopRun,
     /// The files beside the page and what they hold.
     pub files: Vec<(&'static str, &'static str)>,
+}
+
+/// An observer.
+#[derive(Debug, Clone, PartialEq)]
+pub struct ObserverPage {
+    /// Which one.
+    pub kind: &'static str,
+    /// The name of the estimated disturbance in the law.
+    pub disturbance: String,
+    /// What is measured.
+    pub sensors: Vec<SensorPage>,
+}
+
+/// A sensor.
+#[derive(Debug, Clone, PartialEq)]
+pub struct SensorPage {
+    /// The measured state.
+    pub quantity: Quantity,
+    /// Standard deviation of its noise.
+    pub noise: f64,
+    /// Step of its values; zero for none.
+    pub resolution: f64,
 }
 
 /// How a law was found.
@@ -94,6 +120,8 @@ pub struct SetPoint {
     pub poles: Vec<[f64; 2]>,
     /// Poles in z with the command held over the sample time.
     pub held_poles: Vec<[f64; 2]>,
+    /// Margins of the loop as it is fed back, cut at the command.
+    pub margins: Option<Margins>,
 }
 
 /// One law on perturbed plants.

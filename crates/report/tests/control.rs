@@ -24,6 +24,7 @@ fn page() -> ControlPage {
         settling: Some(0.489),
         overshoot: 0.0123,
         final_error: 0.00213,
+        peak_to_peak: 0.0004,
         rms_error: 0.0871,
         largest_command: 10.0,
         saturated: 0.04,
@@ -35,6 +36,7 @@ fn page() -> ControlPage {
         command: 0.6 * value,
         poles: vec![[-6.0, 8.0], [-6.0, -8.0]],
         held_poles: vec![[0.99, 0.008], [0.99, -0.008]],
+        margins: None,
     };
     let widened = |by: f64| theta.iter().map(|v| v + by).collect::<Vec<f64>>();
     ControlPage {
@@ -54,6 +56,8 @@ fn page() -> ControlPage {
         tracked: 0,
         reference: "r".into(),
         law: "saturate(0.6*r - 10.3*(theta - r) - 1.25*theta', 10)".into(),
+        observer: None,
+        delay: 0.0,
         left_out: vec![("arm".into(), "ad*sin(om*t)".into())],
         set_points: vec![point(-0.5), point(0.5)],
         steps: vec![step(0.5), step(-0.5)],

@@ -3,7 +3,7 @@
 use std::path::PathBuf;
 
 use clap::{Args, ValueEnum};
-use greybox_commands::control::{self as commands, FILES, Request};
+use greybox_commands::control::{self as commands, ObserverKind, ObserverRequest, Request};
 
 use crate::answer::Answer;
 use crate::failure::Failure;
@@ -16,12 +16,14 @@ use crate::study::whole;
 #[derive(Debug, Args)]
 #[command(after_help = "Examples:
   greybox control improved.toml --report report.json --track theta --to 0.5 --size theta=0.5 --size \"theta'=5\" --out controller
+  greybox control improved.toml --track theta --to 0.5 --feedback output --resolution theta=0.0015 --out controller
   greybox control improved.toml --method smc --lambda 16 --rate 100 --track theta --to 0.5 --limit 10 --out controller
 
 All numbers are in SI. Sizes are the typical deviations of states and input: weights (Bryson's rule), the width of
 smoothed friction and the perturbation of the state follow from them.
 DIR receives report.html (self-contained, with plots), report.json, closed_loop.csv (a square wave between the set
-points), law.c (C99), law.rs (no_std Rust) and vectors.csv (states and set points with the command that the code must give).")]
+points), law.c (C99), law.rs (no_std Rust) and vectors.csv (states and set points with the command that the code must give);
+with --feedback output also observer.c, observer.rs and observer_vectors.csv.")]
 pub(crate) struct Arguments {
     /// Model (TOML), for example the improved.toml of a diagnosis
     #[arg(value_name = "MODEL.toml")]
@@ -87,6 +89,34 @@ pub(crate) struct Arguments {
     #[arg(long)]
     compensate_friction: bool,
 
+    /// What the law is given: the full state, or what an observer makes of the measured states (output)
+    #[arg(long, value_enum, default_value_t = Feedback::State)]
+    feedback: Feedback,
+
+    /// How the state is estimated (output)
+    #[arg(long, value_enum, default_value_t = Observer::Kalman)]
+    observer: Observer,
+
+    /// Noise of a measured state, NAME=STD (may be given more than once); a thousandth of its size where nothing is stated (output)
+    #[arg(long, value_name = "NAME=STD")]
+    noise: Vec<String>,
+
+    /// Step of a measured state, NAME=STEP, such as one count of an encoder (may be given more than once) (output)
+    #[arg(long, value_name = "NAME=STEP")]
+    resolution: Vec<String>,
+
+    /// Change of the disturbance in one second, in units of the command; a fifth of its size where none is given (kalman)
+    #[arg(long, value_name = "VALUE", allow_negative_numbers = true)]
+    disturbance: Option<f64>,
+
+    /// Bandwidth of the observer, 1/s; four times the fastest pole of the loop where none is given (eso)
+    #[arg(long, value_name = "RATE", allow_negative_numbers = true)]
+    bandwidth: Option<f64>,
+
+    /// Delay of the simulated loop, s: sensors, network and computing together
+    #[arg(long, value_name = "SECONDS", default_value_t = 0.0, allow_negative_numbers = true)]
+    delay: f64,
+
     /// Report of the diagnosis or calibration the model is from: how sure its parameters are
     #[arg(long, value_name = "report.json")]
     report: Option<PathBuf>,
@@ -123,6 +153,24 @@ enum Way {
     Smc,
 }
 
+/// What the law is given, as on the command line.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, ValueEnum)]
+enum Feedback {
+    /// Every state
+    State,
+    /// The estimate of an observer
+    Output,
+}
+
+/// The observers, as on the command line.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, ValueEnum)]
+enum Observer {
+    /// Steady-state Kalman filter with the disturbance of the command as a state
+    Kalman,
+    /// Extended-state observer
+    Eso,
+}
+
 impl From<Way> for commands::Way {
     fn from(way: Way) -> commands::Way {
         match way {
@@ -136,8 +184,9 @@ impl From<Way> for commands::Way {
 pub(crate) fn run(arguments: &Arguments) -> Result<Answer, Failure> {
     let loaded = loading::model(&arguments.model)?;
     let out = OutputFolder::prepare(&arguments.out)?;
-    out.spares(&FILES.map(|(name, _)| name), [&arguments.model])?;
     let request = request(arguments)?;
+    let names: Vec<&str> = commands::files(&request).iter().map(|(name, _)| *name).collect();
+    out.spares(&names, [&arguments.model])?;
     let report = arguments.report.as_deref().map(loading::text).transpose()?;
     let report = arguments.report.as_deref().zip(report.as_deref());
     let progress = Progress::open();
@@ -145,27 +194,59 @@ pub(crate) fn run(arguments: &Arguments) -> Result<Answer, Failure> {
     drop(progress);
     out.write(&results.files())?;
     let place = arguments.out.display();
-    let files: Vec<String> = FILES.iter().map(|(f, _)| format!("{place}/{f}")).collect();
+    let files: Vec<String> = names.iter().map(|f| format!("{place}/{f}")).collect();
     let text = format!("{}Written: {}\n", results.story, files.join(", "));
     Ok(Answer::new(text, results.json))
 }
 
 fn request(arguments: &Arguments) -> Result<Request, Failure> {
-    let size = |text: &String| -> Result<(String, f64), Failure> {
-        let parsed =
-            text.rsplit_once('=').and_then(|(name, v)| Some((name.trim(), v.trim().parse::<f64>().ok()?)));
-        match parsed {
-            Some((name, value)) if value > 0.0 && value.is_finite() => Ok((name.to_owned(), value)),
-            _ => Err(Failure::input(format!("`--size {text}` is no size of a state"))
-                .help("write it as NAME=VALUE with a positive number, such as `--size theta=0.5`")),
-        }
+    let named = |option: &str, what: &str, list: &[String]| -> Result<Vec<(String, f64)>, Failure> {
+        let one = |text: &String| {
+            let parsed = text
+                .rsplit_once('=')
+                .and_then(|(name, v)| Some((name.trim(), v.trim().parse::<f64>().ok()?)));
+            match parsed {
+                Some((name, value)) if value > 0.0 && value.is_finite() => Ok((name.to_owned(), value)),
+                _ => Err(Failure::input(format!("`--{option} {text}` is no {what} of a state")).help(
+                    format!("write it as NAME=VALUE with a positive number, such as `--{option} theta=0.5`"),
+                )),
+            }
+        };
+        list.iter().map(one).collect()
     };
+    let observer = match arguments.feedback {
+        Feedback::State => None,
+        Feedback::Output => Some(ObserverRequest {
+            kind: match arguments.observer {
+                Observer::Kalman => ObserverKind::Kalman,
+                Observer::Eso => ObserverKind::Eso,
+            },
+            noise: named("noise", "noise", &arguments.noise)?,
+            resolution: named("resolution", "step", &arguments.resolution)?,
+            disturbance: arguments.disturbance,
+            bandwidth: arguments.bandwidth,
+        }),
+    };
+    let unused = [
+        ("--noise", !arguments.noise.is_empty()),
+        ("--resolution", !arguments.resolution.is_empty()),
+        ("--disturbance", arguments.disturbance.is_some()),
+        ("--bandwidth", arguments.bandwidth.is_some()),
+    ];
+    if observer.is_none()
+        && let Some((option, _)) = unused.iter().find(|(_, given)| *given)
+    {
+        return Err(Failure::input(format!(
+            "`{option}` belongs to an observer, and the law is given the full state"
+        ))
+        .help("add `--feedback output`"));
+    }
     Ok(Request {
         method: arguments.method.into(),
         input: arguments.input.clone(),
         track: arguments.track.clone(),
         to: arguments.to,
-        sizes: arguments.size.iter().map(size).collect::<Result<_, _>>()?,
+        sizes: named("size", "size", &arguments.size)?,
         input_size: arguments.input_size,
         limit: arguments.limit,
         dt: arguments.dt,
@@ -176,6 +257,8 @@ fn request(arguments: &Arguments) -> Result<Request, Failure> {
         eta: arguments.eta,
         ignore_time_terms: arguments.ignore_time_terms,
         compensate_friction: arguments.compensate_friction,
+        observer,
+        delay: arguments.delay,
         members: arguments.members,
         seed: arguments.seed,
     })

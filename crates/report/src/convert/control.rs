@@ -1,11 +1,15 @@
 //! From a controller and its simulated loops to the page.
 
-use greybox_control::{Controller, Family, Method, Metrics, Run, Spread};
+use greybox_control::{
+    Controller, Family, Margins, Method, Metrics, ObserverMethod, OutputFeedback, Run, Spread,
+};
 use greybox_model::{Expr, Model};
 
 use super::coherent;
 use crate::contract::{ModelId, Producer};
-use crate::control::{ControlPage, Figure, LawKind, LawState, LoopRun, Perturbed, Quantity, SetPoint};
+use crate::control::{
+    ControlPage, Figure, LawKind, LawState, LoopRun, ObserverPage, Perturbed, Quantity, SensorPage, SetPoint,
+};
 use crate::format;
 
 /// What a page is made from.
@@ -17,6 +21,10 @@ pub struct ControlSources<'a> {
     pub model: &'a Model,
     /// The law.
     pub controller: &'a Controller,
+    /// The observer between the sensors and the law.
+    pub output: Option<&'a OutputFeedback>,
+    /// How old what the law is given is in the simulated loop, s.
+    pub delay: f64,
     /// Its loop on the model.
     pub run: &'a Run,
     /// The perturbed plants, with the standard deviations (SI) of their parameters.
@@ -54,7 +62,12 @@ pub fn page(sources: &ControlSources<'_>) -> ControlPage {
         unit: model.input(plant.input_name()).map_or_else(String::new, |i| coherent(&model.inputs[i].unit)),
     };
     let pole = |p: &greybox_control::Pole| [p.re, p.im];
-    let set_points = controller.checks().iter().map(|c| SetPoint {
+    let margins: Vec<Option<Margins>> = match sources.output {
+        Some(output) => output.checks().iter().map(|c| Some(c.margins)).collect(),
+        None => controller.margins(),
+    };
+    let set_points = controller.checks().iter().zip(margins).map(|(c, margins)| SetPoint {
+        margins,
         value: c.set_point,
         // What is rounding is not shown.
         state: c.equilibrium.state.iter().zip(plant.sizes()).map(|(x, size)| rounded(*x, *size)).collect(),
@@ -86,12 +99,33 @@ pub fn page(sources: &ControlSources<'_>) -> ControlPage {
             Method::Hjb { .. } => LawKind::Hjb,
             Method::Smc { .. } => LawKind::Smc,
         },
-        settings: settings(controller, &input),
+        settings: settings(controller, sources.output, &input),
         limits: [low, high],
         dt: controller.dt(),
         tracked: controller.tracked(),
         reference: controller.reference().to_owned(),
-        law: controller.law().first().map(ToString::to_string).unwrap_or_default(),
+        law: match sources.output {
+            Some(output) => output.law().to_string(),
+            None => controller.law().first().map(ToString::to_string).unwrap_or_default(),
+        },
+        observer: sources.output.map(|output| ObserverPage {
+            disturbance: output.disturbance().to_owned(),
+            kind: match output.method() {
+                ObserverMethod::Kalman { .. } => "steady-state Kalman filter",
+                ObserverMethod::Eso { .. } => "extended-state observer",
+            },
+            sensors: output
+                .observer()
+                .measured()
+                .iter()
+                .zip(output.sensors())
+                .filter_map(|(&i, s)| {
+                    let quantity = states.get(i)?.quantity.clone();
+                    Some(SensorPage { quantity, noise: s.noise, resolution: s.resolution })
+                })
+                .collect(),
+        }),
+        delay: sources.delay,
         left_out: plant.dropped().iter().map(|d| (d.equation.clone(), d.term.to_string())).collect(),
         set_points: set_points.collect(),
         steps: run.metrics.clone(),
@@ -127,7 +161,11 @@ pub(super) fn per_second(unit: &str, primes: u8) -> String {
     }
 }
 
-fn settings(controller: &Controller, input: &Quantity) -> Vec<(&'static str, String)> {
+fn settings(
+    controller: &Controller,
+    output: Option<&OutputFeedback>,
+    input: &Quantity,
+) -> Vec<(&'static str, String)> {
     let plant = controller.plant();
     let of_input = |value: f64| format::with_unit(&format::plain(value), &input.unit);
     let mut out = Vec::new();
@@ -141,6 +179,15 @@ fn settings(controller: &Controller, input: &Quantity) -> Vec<(&'static str, Str
         }
     }
     out.push(("Typical size of the command", of_input(plant.input_size())));
+    match output.map(OutputFeedback::method) {
+        Some(ObserverMethod::Kalman { disturbance }) => {
+            out.push(("Disturbance, change in one second", of_input(*disturbance)));
+        }
+        Some(ObserverMethod::Eso { bandwidth }) => {
+            out.push(("Bandwidth of the observer", format!("{} 1/s", format::number(*bandwidth))));
+        }
+        None => {}
+    }
     if plant.dead_zone() > 0.0 {
         out.push(("Dead zone made up for", of_input(plant.dead_zone())));
     }

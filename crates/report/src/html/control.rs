@@ -56,7 +56,16 @@ struct View {
     input_html: String,
     dt: String,
     is_sliding: bool,
+    fed_back: String,
+    observer: Option<ObserverView>,
+    margins: Vec<[String; 6]>,
     files: Vec<(&'static str, &'static str)>,
+}
+
+struct ObserverView {
+    kind: &'static str,
+    disturbance_html: String,
+    sensors: Vec<[String; 3]>,
 }
 
 struct FamilyView {
@@ -169,6 +178,23 @@ impl View {
             input_html: expression::html(&page.input.name),
             dt: format::plain(page.dt),
             is_sliding: page.method == LawKind::Smc,
+            fed_back: fed_back(page),
+            observer: page.observer.as_ref().map(|o| ObserverView {
+                kind: o.kind,
+                disturbance_html: expression::html(&o.disturbance),
+                sensors: o
+                    .sensors
+                    .iter()
+                    .map(|s| {
+                        let size = |v: f64| match v {
+                            0.0 => "none".to_owned(),
+                            v => format::with_unit(&format::number(v), &s.quantity.unit),
+                        };
+                        [expression::html(&s.quantity.name), size(s.noise), size(s.resolution)]
+                    })
+                    .collect(),
+            }),
+            margins: margins(page),
             files: page.files.clone(),
         }
     }
@@ -200,6 +226,33 @@ fn formula(kind: LawKind) -> &'static str {
              \u{2003}<var>s</var> = <var>L</var>\u{202f}(<var>x</var> − <var>x</var><sub>e</sub>(<var>r</var>))"
         }
     }
+}
+
+/// What the law of the simulated loop is given.
+fn fed_back(page: &ControlPage) -> String {
+    let what = match &page.observer {
+        None => "every state known".to_owned(),
+        Some(o) => format!("what its {} makes of the sensors", o.kind),
+    };
+    if page.delay == 0.0 { what } else { format!("{what}, {} s late", format::number(page.delay)) }
+}
+
+/// A row for each set point that has margins.
+fn margins(page: &ControlPage) -> Vec<[String; 6]> {
+    let unit = page.states.get(page.tracked).map_or("", |s| s.quantity.unit.as_str());
+    let bounded = |v: f64| if v.is_finite() { format::number(v) } else { "any".to_owned() };
+    let row = |s: &crate::control::SetPoint| {
+        let m = s.margins?;
+        Some([
+            format::with_unit(&format::plain(s.value), unit),
+            bounded(m.gain),
+            format::number(m.lower_gain),
+            format::number(m.phase.to_degrees()),
+            bounded(m.delay),
+            format::number(m.sensitivity),
+        ])
+    };
+    page.set_points.iter().filter_map(row).collect()
 }
 
 /// The headline figures: name, value, what it is.
@@ -305,6 +358,7 @@ fn step_heads(tracked: &Quantity, input: &Quantity) -> Vec<(&'static str, String
         ("Settling to 2 %", unit("s")),
         ("Overshoot", "of the step".to_owned()),
         ("Final error", unit(&tracked.unit)),
+        ("Peak to peak at rest", unit(&tracked.unit)),
         ("RMS error", unit(&tracked.unit)),
         ("Largest command", unit(&input.unit)),
         ("At its limit", "of the samples".to_owned()),
@@ -320,6 +374,7 @@ fn steps(page: &ControlPage) -> Vec<Vec<String>> {
             s.settling.map_or_else(|| "not reached".to_owned(), format::number),
             format::percent_short(s.overshoot),
             format::number(s.final_error),
+            format::number(s.peak_to_peak),
             format::number(s.rms_error),
             format::number(s.largest_command),
             format::percent_short(s.saturated),

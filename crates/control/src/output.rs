@@ -1,0 +1,327 @@
+//! Output feedback: an observer between the sensors and the law.
+
+use greybox_model::Expr;
+use nalgebra::DMatrix;
+
+use crate::check::largest;
+use crate::compiled::Compiled;
+use crate::controller::Controller;
+use crate::design::{free_name, limited};
+use crate::error::{ControlError, listed};
+use crate::margins::{CutLoop, Margins};
+use crate::observer::{Memory, Observer, ObserverMethod, Sensor};
+use crate::stability;
+
+/// Noise of a sensor of which nothing is stated, over the size of its state.
+pub const UNSTATED_NOISE: f64 = 1e-3;
+
+/// An observer to put between the sensors and the law.
+#[derive(Debug, Clone, PartialEq)]
+pub struct OutputOptions {
+    /// How the state is estimated.
+    pub method: ObserverMethod,
+    /// Sensors by the name of the measured state; those not named have noise of [`UNSTATED_NOISE`] of the state's size.
+    pub sensors: Vec<(String, Sensor)>,
+}
+
+/// The loop with the observer at a set point, friction dropped.
+#[derive(Debug, Clone, PartialEq)]
+pub struct OutputCheck {
+    /// The set point.
+    pub set_point: f64,
+    /// Largest magnitude of the poles in z of plant and observer together.
+    pub spectral_radius: f64,
+    /// Margins of the loop with the observer, cut at the command.
+    pub margins: Margins,
+}
+
+/// A controller that is given what the sensors say. At each sample the observer takes the measurements y and the last
+/// command, and the command is
+///
+/// ```text
+/// u = κ(x̂, r) − d̂          within the limits
+/// ```
+///
+/// with the law κ of the [`Controller`]. The estimated disturbance d̂ is its integral action: friction, loads and wrong
+/// parameters leave no error where the loop comes to rest. The observer is given the command as it is after the limits,
+/// so that nothing winds up. While the tracked state is measured within one resolution of the set point, d̂ stands: an
+/// integral that works on an error that the sensor cannot show makes friction hunt.
+///
+/// ```
+/// use greybox_control::{
+///     ClosedLoop, DesignOptions, Feedback, LoopOptions, Method, ObserverMethod, OutputFeedback, OutputOptions, Plant,
+///     PlantOptions, Reference, Sensor, design,
+/// };
+/// # let model = greybox_model::Model::from_toml(r#"
+/// # [inputs]
+/// # tau = { unit = "N m" }
+/// # [states]
+/// # theta = { unit = "rad" }
+/// # [parameters]
+/// # J = { value = 0.02, unit = "kg m^2" }
+/// # mgl = { value = 0.5, unit = "N m" }
+/// # fc = { value = 0.02, unit = "N m" }
+/// # [equations]
+/// # arm = "J*theta'' + fc*sign(theta') + mgl*sin(theta) = tau"
+/// # "#, "pendulum.toml")?;
+/// let plant = Plant::of(&model, "tau", &PlantOptions::default())?;
+/// let law = design(&plant, &Method::Lqr, &DesignOptions::new("theta", &[-0.5, 0.5], 1e-3))?;
+/// // An encoder of 4096 counts a turn is all that is measured.
+/// let encoder = Sensor { noise: 0.0, resolution: std::f64::consts::TAU / 4096.0 };
+/// let observer = OutputFeedback::new(&law, &OutputOptions {
+///     method: ObserverMethod::Kalman { disturbance: 1.0 },
+///     sensors: vec![("theta".into(), encoder)],
+/// })?;
+/// let options = LoopOptions { feedback: Feedback::Output(Box::new(observer)), ..LoopOptions::default() };
+/// let run = ClosedLoop::new(&model, &law, &options)?.run(&Reference::square(0.5, 5.0, 2))?;
+/// assert!(run.metrics.iter().all(|m| m.final_error.abs() < 2.0 * encoder.resolution));
+/// # Ok::<(), Box<dyn std::error::Error>>(())
+/// ```
+#[derive(Debug, Clone)]
+pub struct OutputFeedback {
+    pub(crate) observer: Observer,
+    sensors: Vec<Sensor>,
+    /// Place of the tracked state among the measured ones, and its resolution.
+    tracked: Option<(usize, f64)>,
+    disturbance: String,
+    law: Expr,
+    compiled: Compiled,
+    limits: (f64, f64),
+    dead_zone: f64,
+    method: ObserverMethod,
+    checks: Vec<OutputCheck>,
+}
+
+/// What a controller with an observer remembers between two samples.
+#[derive(Debug, Clone)]
+pub struct OutputMemory {
+    observer: Memory,
+    /// d̂ as the law is given it.
+    compensated: f64,
+    /// The last command.
+    command: f64,
+}
+
+impl OutputMemory {
+    /// x̂, in the plant's order.
+    #[must_use]
+    pub fn state(&self) -> &[f64] {
+        &self.observer.estimate[..self.observer.estimate.len() - 1]
+    }
+
+    /// d̂, in units of the command.
+    #[must_use]
+    pub fn disturbance(&self) -> f64 {
+        self.observer.estimate[self.observer.estimate.len() - 1]
+    }
+}
+
+impl OutputFeedback {
+    /// An observer for a controller, checked with it at each of its set points.
+    ///
+    /// # Errors
+    /// [`ControlError::NothingMeasured`], [`ControlError::Unmeasured`] and [`ControlError::EsoOrder`] for states that the
+    /// observer does not reach, [`ControlError::Observer`] where the measured states do not determine the others,
+    /// [`ControlError::Eso`], [`ControlError::Option`], [`ControlError::UnknownState`],
+    /// [`ControlError::UnstableOutput`].
+    pub fn new(controller: &Controller, options: &OutputOptions) -> Result<OutputFeedback, ControlError> {
+        let plant = controller.plant();
+        let names = plant.state_names();
+        let measured: Vec<usize> = (0..plant.order()).filter(|i| plant.measured()[*i]).collect();
+        let mut sensors: Vec<Sensor> = measured
+            .iter()
+            .map(|&i| Sensor { noise: UNSTATED_NOISE * plant.sizes()[i], resolution: 0.0 })
+            .collect();
+        for (name, sensor) in &options.sensors {
+            let at = measured.iter().position(|&i| names[i] == *name).ok_or_else(|| {
+                ControlError::NotMeasured {
+                    name: name.clone(),
+                    known: listed(measured.iter().map(|&i| &names[i])),
+                }
+            })?;
+            for (what, value) in [("noise", sensor.noise), ("resolution", sensor.resolution)] {
+                if !(value >= 0.0 && value.is_finite()) {
+                    let what = format!("the {what} of `{name}`");
+                    return Err(ControlError::Option {
+                        what,
+                        value,
+                        wanted: "a finite number, zero or more",
+                    });
+                }
+            }
+            if sensor.deviation() == 0.0 {
+                let what = format!("the noise and the resolution of `{name}`");
+                return Err(ControlError::Option {
+                    what,
+                    value: 0.0,
+                    wanted: "above zero, at least one of them",
+                });
+            }
+            sensors[at] = *sensor;
+        }
+        let at = &controller.design_point().equilibrium;
+        let observer = Observer::new(plant, at, controller.dt(), &options.method, &sensors)?;
+        let disturbance = free_name(plant, "d", &[controller.reference()]);
+        let (low, high) = controller.limits();
+        let compensated = controller.unlimited().clone() - Expr::var(&disturbance);
+        let law = limited(&compensated, plant, low, high);
+        let mut variables = plant.symbols().to_vec();
+        variables.extend([(disturbance.clone(), 0), (controller.reference().to_owned(), 0)]);
+        let compiled = Compiled::new(std::slice::from_ref(&law), &variables, plant.parameters())?;
+        let place = measured.iter().position(|&i| i == controller.tracked());
+        let mut feedback = OutputFeedback {
+            tracked: place.map(|k| (k, sensors[k].resolution)),
+            observer,
+            sensors,
+            disturbance,
+            law,
+            compiled,
+            limits: (low, high),
+            dead_zone: plant.dead_zone(),
+            method: options.method,
+            checks: Vec::new(),
+        };
+        for check in controller.checks() {
+            let found = feedback.check(controller, check.set_point, &check.equilibrium)?;
+            feedback.checks.push(found);
+        }
+        Ok(feedback)
+    }
+
+    /// The observer.
+    #[must_use]
+    pub fn observer(&self) -> &Observer {
+        &self.observer
+    }
+
+    /// How it was designed.
+    #[must_use]
+    pub fn method(&self) -> &ObserverMethod {
+        &self.method
+    }
+
+    /// The sensors, in the order of [`Observer::measured`].
+    #[must_use]
+    pub fn sensors(&self) -> &[Sensor] {
+        &self.sensors
+    }
+
+    /// The command, within the limits, as an expression of the states, the disturbance
+    /// ([`disturbance`](Self::disturbance)), the set point and the plant's parameters.
+    #[must_use]
+    pub fn law(&self) -> &Expr {
+        &self.law
+    }
+
+    /// The name of the disturbance in the law: `d`, unless the model has a name like that.
+    #[must_use]
+    pub fn disturbance(&self) -> &str {
+        &self.disturbance
+    }
+
+    /// The tracked state's place among the measured ones and the error at which d̂ stands; none where it is not measured.
+    #[must_use]
+    pub fn tracked(&self) -> Option<(usize, f64)> {
+        self.tracked
+    }
+
+    /// The loop at each set point of the controller.
+    #[must_use]
+    pub fn checks(&self) -> &[OutputCheck] {
+        &self.checks
+    }
+
+    /// What there is to remember before the first sample.
+    #[must_use]
+    pub fn start(&self) -> OutputMemory {
+        OutputMemory { observer: self.observer.start(), compensated: 0.0, command: 0.0 }
+    }
+
+    /// The command at a sample, from its measurements (in the order of [`Observer::measured`]) and the set point. A
+    /// measurement that is not a number is left out of the estimate. Not a number where the law is none there: the
+    /// caller must then do what is safe.
+    pub fn command(&self, memory: &mut OutputMemory, y: &[f64], r: f64) -> f64 {
+        let u = memory.command;
+        let behind = if u.is_finite() { u - u.clamp(-self.dead_zone, self.dead_zone) } else { 0.0 };
+        self.observer.update(&mut memory.observer, y, behind);
+        let near = self.tracked.is_some_and(|(k, resolution)| {
+            resolution > 0.0 && y.get(k).is_some_and(|y| (y - r).abs() <= resolution)
+        });
+        if !near {
+            memory.compensated = memory.disturbance();
+        }
+        let mut at = memory.state().to_vec();
+        at.extend([memory.compensated, r]);
+        let mut u = [f64::NAN];
+        if at.iter().all(|v| v.is_finite()) {
+            self.compiled.eval(&at, 0, &mut u);
+        }
+        // The comparisons of a limit would make a number of what is none.
+        memory.command = if u[0].is_nan() { f64::NAN } else { u[0].max(self.limits.0).min(self.limits.1) };
+        memory.command
+    }
+
+    fn check(
+        &self,
+        controller: &Controller,
+        set_point: f64,
+        at: &crate::equilibrium::Equilibrium,
+    ) -> Result<OutputCheck, ControlError> {
+        let plant = controller.plant();
+        let none = || ControlError::NoPoles { set_point };
+        let tangent = plant.frictionless_tangent(&at.state, at.input);
+        let held =
+            stability::held(&tangent, controller.dt(), plant.sizes(), plant.input_size()).ok_or_else(none)?;
+        let observer = self.observer.tangent(at, set_point)?;
+        let n = plant.order();
+        let gain = controller.frictionless_gain(&at.state, set_point);
+        // u = −H c, of x̂ and d̂.
+        let read = DMatrix::from_fn(1, n + 1, |_, j| if j < n { -gain[j] } else { 1.0 });
+        let h = read * &observer.estimate;
+        let size = observer.carry.nrows();
+        let measures = &observer.measured * self.observer.selection(n);
+        let own = &observer.carry - &observer.input * &h;
+        let (below_a, below_b) = (&measures * &held.a, &measures * &held.b);
+        let a = DMatrix::from_fn(n + size, n + size, |i, j| match (i < n, j < n) {
+            (true, true) => held.a[(i, j)],
+            (true, false) => 0.0,
+            (false, true) => below_a[(i - n, j)],
+            (false, false) => own[(i - n, j - n)],
+        });
+        let b = DMatrix::from_fn(n + size, 1, |i, _| if i < n { held.b[i] } else { below_b[i - n] });
+        let c = DMatrix::from_fn(1, n + size, |_, j| if j < n { 0.0 } else { -h[j - n] });
+        let sizes = vec![1.0; n + size];
+        let poles = stability::poles(&(&a + &b * &c), &sizes).ok_or_else(none)?;
+        let spectral_radius = largest(&poles);
+        if spectral_radius.is_nan() || spectral_radius >= 1.0 {
+            let dt = controller.dt();
+            return Err(ControlError::UnstableOutput { set_point, dt, radius: spectral_radius });
+        }
+        let margins = CutLoop { a, b, c }.margins(controller.dt());
+        Ok(OutputCheck { set_point, spectral_radius, margins })
+    }
+}
+
+impl Controller {
+    /// ∂u/∂x at a state of rest, friction dropped.
+    pub(crate) fn frictionless_gain(&self, x: &[f64], r: f64) -> Vec<f64> {
+        let mut at = x.to_vec();
+        at.push(r);
+        self.frictionless.jacobian(&at).row(0).iter().take(x.len()).copied().collect()
+    }
+
+    /// Margins of the loop with the full state fed back, at each set point; none where a number is not finite.
+    #[must_use]
+    pub fn margins(&self) -> Vec<Option<Margins>> {
+        let plant = self.plant();
+        let of = |check: &crate::check::Check| {
+            let at = &check.equilibrium;
+            let tangent = plant.frictionless_tangent(&at.state, at.input);
+            let held = stability::held(&tangent, self.dt(), plant.sizes(), plant.input_size())?;
+            let gain = self.frictionless_gain(&at.state, check.set_point);
+            let c = DMatrix::from_row_slice(1, plant.order(), &gain);
+            Some(CutLoop { a: held.a, b: held.b, c }.margins(self.dt()))
+        };
+        self.checks().iter().map(of).collect()
+    }
+}

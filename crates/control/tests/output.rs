@@ -1,0 +1,196 @@
+//! Output feedback: an observer between the sensors and the law.
+
+use std::f64::consts::TAU;
+
+use greybox_control::{
+    ClosedLoop, ControlError, Controller, DesignOptions, FamilyOptions, Feedback, LoopOptions, Method,
+    ObserverMethod, OutputFeedback, OutputOptions, Plant, PlantOptions, Reference, Run, Sensor, design,
+};
+use greybox_model::Model;
+
+const KALMAN: ObserverMethod = ObserverMethod::Kalman { disturbance: 1.0 };
+const ESO: ObserverMethod = ObserverMethod::Eso { bandwidth: 80.0 };
+
+fn arm(friction: f64) -> Model {
+    let text = format!(
+        r#"
+[inputs]
+v = {{ unit = "V" }}
+[states]
+theta = {{ unit = "rad" }}
+[parameters]
+J = {{ value = 0.02, unit = "kg m^2" }}
+b = {{ value = 0.15, unit = "N m s/rad" }}
+fc = {{ value = {friction}, unit = "N m" }}
+mgl = {{ value = 0.5, unit = "N m" }}
+kt = {{ value = 0.4, unit = "N m/V" }}
+umax = {{ value = 10.0, unit = "V" }}
+[equations]
+arm = "J*theta'' + b*theta' + fc*sign(theta') + mgl*sin(theta) = kt*saturate(v, umax)"
+"#
+    );
+    Model::from_toml(&text, "arm.toml").unwrap()
+}
+
+fn law(model: &Model) -> Controller {
+    let sizes = vec![("theta".to_string(), 0.2), ("theta'".to_string(), 4.0)];
+    let plant =
+        Plant::of(model, "v", &PlantOptions { sizes, input_size: 5.0, ..PlantOptions::default() }).unwrap();
+    design(&plant, &Method::Lqr, &DesignOptions::new("theta", &[-1.0, 1.0], 2e-3)).unwrap()
+}
+
+fn with(law: &Controller, method: ObserverMethod, sensor: Sensor) -> LoopOptions {
+    let options = OutputOptions { method, sensors: vec![("theta".into(), sensor)] };
+    let output = OutputFeedback::new(law, &options).unwrap();
+    LoopOptions { feedback: Feedback::Output(Box::new(output)), ..LoopOptions::default() }
+}
+
+fn run(model: &Model, law: &Controller, options: &LoopOptions, reference: &Reference) -> Run {
+    ClosedLoop::new(model, law, options).unwrap().run(reference).unwrap()
+}
+
+/// With a fine sensor and nothing unknown, the loop with the observer is that with the full state. (The extended-state
+/// observer knows nothing of the plant: it lags by 3/ω where the motor brakes from its limit.)
+#[test]
+fn with_nothing_unknown_the_observer_gives_the_loop_of_the_full_state() {
+    let model = arm(0.0);
+    let law = law(&model);
+    let reference = Reference::square(0.5, 2.0, 3);
+    let full = run(&model, &law, &LoopOptions::default(), &reference);
+    let fine = Sensor { noise: 1e-6, resolution: 0.0 };
+    for (method, bound) in [(KALMAN, 8e-5), (ESO, 0.08)] {
+        let seen = run(&model, &law, &with(&law, method, fine), &reference);
+        let far = full.x[0].iter().zip(&seen.x[0]).map(|(a, b)| (a - b).abs()).fold(0.0, f64::max);
+        println!("{method:?}: {far:.2e}");
+        assert!(far < bound, "{method:?}: {far}");
+    }
+}
+
+/// Friction leaves an error to a law without an integral; the disturbance takes it out, and the encoder's last count
+/// does not make it hunt.
+#[test]
+fn friction_and_a_wrong_parameter_leave_no_error_and_no_limit_cycle() {
+    let nominal = arm(0.0);
+    let law = law(&nominal);
+    // The machine: friction that the law knows nothing of, and a heavier arm.
+    let mut machine = arm(0.05);
+    let at = machine.parameter("mgl").unwrap();
+    machine.parameters[at].value = 0.6;
+    let reference = Reference::square(0.5, 4.0, 3);
+    let encoder = Sensor { noise: 0.0, resolution: TAU / 4096.0 };
+    let full = run(&machine, &law, &LoopOptions::default(), &reference);
+    assert!(full.metrics.iter().all(|m| m.final_error.abs() > 0.005), "{:?}", full.metrics);
+    for method in [KALMAN, ESO] {
+        let seen = run(&machine, &law, &with(&law, method, encoder), &reference);
+        for m in &seen.metrics {
+            println!("{method:?}: {:.2e} {:.2e} {:?}", m.final_error, m.peak_to_peak, m.settling);
+            assert!(m.final_error.abs() <= 1.5 * encoder.resolution, "{method:?}: {m:?}");
+            assert!(m.peak_to_peak <= 0.5 * encoder.resolution, "{method:?}: {m:?}");
+        }
+    }
+}
+
+/// The margins are those of the loop that is simulated: with a delay below the margin it comes to rest, beyond it does not.
+#[test]
+fn the_delay_margin_is_that_of_the_simulated_loop() {
+    let model = arm(0.0);
+    let law = law(&model);
+    let sensor = Sensor { noise: 1e-4, resolution: 0.0 };
+    let reference = Reference::step(0.02, 4.0);
+    for method in [KALMAN, ESO] {
+        let mut options = with(&law, method, sensor);
+        let Feedback::Output(output) = &options.feedback else { unreachable!() };
+        let margin = output.checks().iter().map(|c| c.margins.delay).fold(f64::INFINITY, f64::min);
+        assert!(margin > 1e-3 && margin < 0.1, "{margin}");
+        let mut end = |delay: f64| {
+            options.delay = delay;
+            let run = run(&model, &law, &options, &reference);
+            run.metrics.first().map_or(f64::INFINITY, |m| {
+                if run.diverged.is_some() { f64::INFINITY } else { m.peak_to_peak }
+            })
+        };
+        let (below, beyond) = (end(0.9 * margin), end(1.1 * margin));
+        println!("{method:?}: {below:.1e} {beyond:.1e}");
+        assert!(below < 1e-3, "{method:?}: {below}");
+        assert!(beyond > 0.025, "{method:?}: {beyond}");
+    }
+}
+
+/// LQR with the full state has the classical margins, near them when sampled fast.
+#[test]
+fn the_regulator_has_the_margins_of_the_book() {
+    let model = arm(0.0);
+    let law = law(&model);
+    for margins in law.margins() {
+        let m = margins.unwrap();
+        assert!(m.phase > 58f64.to_radians() && m.lower_gain < 0.52 && m.gain > 5.0, "{m:?}");
+    }
+}
+
+/// The estimate follows the state: friction as the disturbance, behind the command.
+#[test]
+fn the_disturbance_is_the_load() {
+    let nominal = arm(0.0);
+    let law = law(&nominal);
+    let mut machine = arm(0.0);
+    let at = machine.parameter("mgl").unwrap();
+    machine.parameters[at].value = 0.9;
+    let noise = Sensor { noise: 1e-4, resolution: 0.0 };
+    for method in [KALMAN, ESO] {
+        let options = with(&law, method, noise);
+        let Feedback::Output(output) = &options.feedback else { unreachable!() };
+        let seen = run(&machine, &law, &options, &Reference::step(1.0, 3.0));
+        let mut memory = output.start();
+        let mut d = 0.0;
+        for (k, theta) in seen.x[0].iter().enumerate() {
+            let u = output.command(&mut memory, &[*theta], seen.r[k]);
+            assert!(u.is_finite());
+            // The mean of the last second.
+            if k + 500 >= seen.t.len() {
+                d += memory.disturbance() / 500.0;
+            }
+        }
+        let load = -(0.9 - 0.5) * 1f64.sin() / 0.4;
+        println!("{method:?}: {d} {load}");
+        assert!((d / load - 1.0).abs() < 0.02, "{method:?}: {d} {load}");
+        assert!((memory.state()[0] - 1.0).abs() < 0.01);
+    }
+}
+
+/// The same seed gives the same noise, another one other noise; a family runs with it.
+#[test]
+fn noise_is_that_of_its_seed() {
+    let model = arm(0.02);
+    let law = law(&model);
+    let mut options = with(&law, KALMAN, Sensor { noise: 1e-3, resolution: 0.0 });
+    let reference = Reference::square(0.5, 1.0, 2);
+    let first = run(&model, &law, &options, &reference);
+    assert_eq!(first, run(&model, &law, &options, &reference));
+    options.seed = 1;
+    assert_ne!(first.u, run(&model, &law, &options, &reference).u);
+    let deviations = vec![("J".to_string(), 0.002), ("mgl".to_string(), 0.05)];
+    let looped = ClosedLoop::new(&model, &law, &options).unwrap();
+    let family = looped.family(&reference, &FamilyOptions { deviations, members: 8, seed: 1 }).unwrap();
+    assert_eq!(family.diverged, 0);
+}
+
+#[test]
+fn what_cannot_be_observed_is_refused() {
+    let model = arm(0.0);
+    let law = law(&model);
+    let make = |method, sensors| OutputFeedback::new(&law, &OutputOptions { method, sensors });
+    let sensor = |noise, resolution| vec![("theta".to_string(), Sensor { noise, resolution })];
+    assert!(matches!(make(KALMAN, sensor(-1.0, 0.0)), Err(ControlError::Option { .. })));
+    assert!(matches!(make(KALMAN, sensor(0.0, 0.0)), Err(ControlError::Option { .. })));
+    assert!(matches!(make(KALMAN, sensor(f64::NAN, 0.0)), Err(ControlError::Option { .. })));
+    let rate = vec![("theta'".to_string(), Sensor { noise: 1e-3, resolution: 0.0 })];
+    assert!(matches!(make(KALMAN, rate), Err(ControlError::NotMeasured { .. })));
+    for disturbance in [0.0, -1.0, f64::NAN, f64::INFINITY] {
+        let method = ObserverMethod::Kalman { disturbance };
+        assert!(matches!(make(method, Vec::new()), Err(ControlError::Option { .. })), "{disturbance}");
+    }
+    for bandwidth in [0.0, -1.0, f64::NAN] {
+        let method = ObserverMethod::Eso { bandwidth };
+        assert!(matches!(make(method, Vec::new()), Err(ControlError::Eso { .. })), "{bandwidth}");
+    }
+}
