@@ -446,7 +446,6 @@ fn observer_code(
         dt: controller.dt(),
         measured: output.observer().measured().to_vec(),
         dead_zone: plant.dead_zone(),
-        rest: output.tracked(),
         form,
     }
 }

@@ -44,8 +44,7 @@ pub struct OutputCheck {
 ///
 /// with the law κ of the [`Controller`]. The estimated disturbance d̂ is its integral action: friction, loads and wrong
 /// parameters leave no error where the loop comes to rest. The observer is given the command as it is after the limits,
-/// so that nothing winds up. While the tracked state is measured within one resolution of the set point, d̂ stands: an
-/// integral that works on an error that the sensor cannot show makes friction hunt.
+/// so that nothing winds up.
 ///
 /// ```
 /// use greybox_control::{
@@ -64,7 +63,8 @@ pub struct OutputCheck {
 /// # [equations]
 /// # arm = "J*theta'' + fc*sign(theta') + mgl*sin(theta) = tau"
 /// # "#, "pendulum.toml")?;
-/// let plant = Plant::of(&model, "tau", &PlantOptions::default())?;
+/// let sizes = vec![("theta".to_string(), 0.3)];
+/// let plant = Plant::of(&model, "tau", &PlantOptions { sizes, ..PlantOptions::default() })?;
 /// let law = design(&plant, &Method::Lqr, &DesignOptions::new("theta", &[-0.5, 0.5], 1e-3))?;
 /// // An encoder of 4096 counts a turn is all that is measured.
 /// let encoder = Sensor { noise: 0.0, resolution: std::f64::consts::TAU / 4096.0 };
@@ -74,15 +74,13 @@ pub struct OutputCheck {
 /// })?;
 /// let options = LoopOptions { feedback: Feedback::Output(Box::new(observer)), ..LoopOptions::default() };
 /// let run = ClosedLoop::new(&model, &law, &options)?.run(&Reference::square(0.5, 5.0, 2))?;
-/// assert!(run.metrics.iter().all(|m| m.final_error.abs() < 2.0 * encoder.resolution));
+/// assert!(run.metrics.iter().all(|m| m.final_error.abs() < encoder.resolution));
 /// # Ok::<(), Box<dyn std::error::Error>>(())
 /// ```
 #[derive(Debug, Clone)]
 pub struct OutputFeedback {
     pub(crate) observer: Observer,
     sensors: Vec<Sensor>,
-    /// Place of the tracked state among the measured ones, and its resolution.
-    tracked: Option<(usize, f64)>,
     disturbance: String,
     law: Expr,
     compiled: Compiled,
@@ -96,8 +94,6 @@ pub struct OutputFeedback {
 #[derive(Debug, Clone)]
 pub struct OutputMemory {
     observer: Memory,
-    /// d̂ as the law is given it.
-    compensated: f64,
     /// The last command.
     command: f64,
 }
@@ -168,9 +164,7 @@ impl OutputFeedback {
         let mut variables = plant.symbols().to_vec();
         variables.extend([(disturbance.clone(), 0), (controller.reference().to_owned(), 0)]);
         let compiled = Compiled::new(std::slice::from_ref(&law), &variables, plant.parameters())?;
-        let place = measured.iter().position(|&i| i == controller.tracked());
         let mut feedback = OutputFeedback {
-            tracked: place.map(|k| (k, sensors[k].resolution)),
             observer,
             sensors,
             disturbance,
@@ -219,12 +213,6 @@ impl OutputFeedback {
         &self.disturbance
     }
 
-    /// The tracked state's place among the measured ones and the error at which d̂ stands; none where it is not measured.
-    #[must_use]
-    pub fn tracked(&self) -> Option<(usize, f64)> {
-        self.tracked
-    }
-
     /// The loop at each set point of the controller.
     #[must_use]
     pub fn checks(&self) -> &[OutputCheck] {
@@ -234,7 +222,7 @@ impl OutputFeedback {
     /// What there is to remember before the first sample.
     #[must_use]
     pub fn start(&self) -> OutputMemory {
-        OutputMemory { observer: self.observer.start(), compensated: 0.0, command: 0.0 }
+        OutputMemory { observer: self.observer.start(), command: 0.0 }
     }
 
     /// The command at a sample, from its measurements (in the order of [`Observer::measured`]) and the set point. A
@@ -244,14 +232,8 @@ impl OutputFeedback {
         let u = memory.command;
         let behind = if u.is_finite() { u - u.clamp(-self.dead_zone, self.dead_zone) } else { 0.0 };
         self.observer.update(&mut memory.observer, y, behind);
-        let near = self.tracked.is_some_and(|(k, resolution)| {
-            resolution > 0.0 && y.get(k).is_some_and(|y| (y - r).abs() <= resolution)
-        });
-        if !near {
-            memory.compensated = memory.disturbance();
-        }
-        let mut at = memory.state().to_vec();
-        at.extend([memory.compensated, r]);
+        let mut at = memory.observer.estimate.clone();
+        at.push(r);
         let mut u = [f64::NAN];
         if at.iter().all(|v| v.is_finite()) {
             self.compiled.eval(&at, 0, &mut u);

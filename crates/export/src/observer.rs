@@ -22,9 +22,6 @@ pub struct ObserverCode {
     pub measured: Vec<usize>,
     /// Half width of the actuator's dead zone.
     pub dead_zone: f64,
-    /// Measurement and set point nearer than this leave the compensated disturbance as it is: (which measurement, how
-    /// near).
-    pub rest: Option<(usize, f64)>,
     /// The observer's equations.
     pub form: ObserverForm,
 }
@@ -108,7 +105,7 @@ impl ObserverCode {
         let _ = write!(
             out,
             "\nvoid {law}(const double state[{n}], const double disturbance[1], const double set_point[1], double out[1]);\n\n\
-             typedef struct {{\n    double estimate[{}]; /* the states, then the disturbance */\n    double compensated;\n    \
+             typedef struct {{\n    double estimate[{}]; /* the states, then the disturbance */\n    \
              double command;\n    int started;\n",
             n + 1
         );
@@ -124,7 +121,7 @@ impl ObserverCode {
             "}} observer_memory;\n\nvoid observer_start(observer_memory *memory);\n\
              double observer_step(observer_memory *memory, const double measured[{m}], const double set_point[1]);\n\n\
              /* Before the first sample. */\nvoid observer_start(observer_memory *memory)\n{{\n    int i;\n    \
-             for (i = 0; i < {}; i++) memory->estimate[i] = 0.0;\n    memory->compensated = 0.0;\n    \
+             for (i = 0; i < {}; i++) memory->estimate[i] = 0.0;\n    \
              memory->command = 0.0;\n    memory->started = 0;\n",
             n + 1
         );
@@ -203,17 +200,9 @@ impl ObserverCode {
                 let _ = write!(out, "        x[{n}] = below > 0.0 ? above / below : 0.0;\n    }}\n");
             }
         }
-        let freeze = match self.rest {
-            Some((k, near)) if near > 0.0 => format!(
-                "    /* An integral that works on an error that the sensor cannot show makes friction hunt. */\n    \
-                 if (!(fabs(measured[{k}] - set_point[0]) <= {})) memory->compensated = x[{n}];\n",
-                number(near)
-            ),
-            _ => format!("    memory->compensated = x[{n}];\n"),
-        };
         let _ = write!(
             out,
-            "    memory->started = 1;\n{freeze}    {law}(x, &memory->compensated, set_point, out);\n    \
+            "    memory->started = 1;\n    {law}(x, x + {n}, set_point, out);\n    \
              memory->command = out[0];\n    return out[0];\n}}\n"
         );
     }
@@ -254,12 +243,12 @@ impl ObserverCode {
             let _ = writeln!(out, "// {}", crate::language::comment(line));
         }
         let mut fields = format!(
-            "    /// The states, then the disturbance.\n    pub estimate: [f64; {}],\n    compensated: f64,\n    command: f64,\n    \
+            "    /// The states, then the disturbance.\n    pub estimate: [f64; {}],\n    command: f64,\n    \
              started: bool,\n",
             n + 1
         );
         let mut zeros = format!(
-            "            estimate: [0.0; {}],\n            compensated: 0.0,\n            command: 0.0,\n            started: false,\n",
+            "            estimate: [0.0; {}],\n            command: 0.0,\n            started: false,\n",
             n + 1
         );
         if !chains.is_empty() {
@@ -346,19 +335,10 @@ impl ObserverCode {
                 );
             }
         }
-        let freeze = match self.rest {
-            Some((k, near)) if near > 0.0 => format!(
-                "        // An integral that works on an error that the sensor cannot show makes friction hunt.\n        \
-                 let error = measured[{k}] - set_point[0];\n        \
-                 if !(-{near} <= error && error <= {near}) {{\n            self.compensated = self.estimate[{n}];\n        }}\n",
-                near = number(near)
-            ),
-            _ => format!("        self.compensated = self.estimate[{n}];\n"),
-        };
         let _ = write!(
             out,
-            "        self.started = true;\n{freeze}        {}        \
-             self.command = law(&x, &[self.compensated], set_point)[0];\n        self.command\n    }}\n}}\n\n\
+            "        self.started = true;\n        {}        \
+             self.command = law(&x, &[self.estimate[{n}]], set_point)[0];\n        self.command\n    }}\n}}\n\n\
              impl Default for Observer {{\n    fn default() -> Self {{\n        Self::new()\n    }}\n}}\n",
             states.replace("{0}", "        "),
         );
