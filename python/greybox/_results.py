@@ -245,6 +245,18 @@ class Control(_Result):
         """The law as Rust without the standard library."""
         return self.files["law.rs"].decode()
 
+    @property
+    def observer_c(self) -> str | None:
+        """The observer as C99; none where the law is given the full state."""
+        content = self.files.get("observer.c")
+        return None if content is None else content.decode()
+
+    @property
+    def observer_rust(self) -> str | None:
+        """The observer as Rust without the standard library; none where the law is given the full state."""
+        content = self.files.get("observer.rs")
+        return None if content is None else content.decode()
+
     def report_html(self, path: str | os.PathLike[str] | None = None) -> str:
         """The self-contained page with plots; written to ``path`` where one is named."""
         content = self.files["report.html"]

@@ -229,6 +229,13 @@ def control(
     eta: float | None = None,
     ignore_time_terms: bool = False,
     compensate_friction: bool = False,
+    feedback: str = "state",
+    observer: str = "kalman",
+    noise: Mapping[str, float] | None = None,
+    resolution: Mapping[str, float] | None = None,
+    disturbance: float | None = None,
+    bandwidth: float | None = None,
+    delay: float = 0.0,
     report: str | os.PathLike[str] | Diagnosis | Calibration | None = None,
     members: int = 50,
     seed: int = 0,
@@ -248,6 +255,11 @@ def control(
         hold: time for each set point of the simulated square wave, s.
         ignore_time_terms: drop disturbances that depend on the time from the design.
         compensate_friction: take friction, smoothed, out of the motion (smc).
+        feedback: what the law is given, ``state`` (all of it) or ``output`` (the estimate of an ``observer``).
+        observer: ``kalman`` (``disturbance``: its change in one second, in units of the command) or ``eso``
+            (``bandwidth``, 1/s).
+        noise, resolution: standard deviations and steps of the measured states' sensors.
+        delay: of the simulated loop, s.
         report: how sure the model's parameters are, for the perturbed plants (``members``, ``seed``).
         progress: hears what is being done.
 
@@ -294,6 +306,13 @@ def control(
         "eta": eta,
         "ignore_time_terms": ignore_time_terms,
         "compensate_friction": compensate_friction,
+        "feedback": feedback,
+        "observer": observer,
+        "noise": [(name, float(value)) for name, value in (noise or {}).items()],
+        "resolution": [(name, float(value)) for name, value in (resolution or {}).items()],
+        "disturbance": disturbance,
+        "bandwidth": bandwidth,
+        "delay": delay,
         "members": members,
         "seed": seed,
     }

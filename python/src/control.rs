@@ -3,7 +3,7 @@
 use std::path::PathBuf;
 
 use greybox_commands::Failure;
-use greybox_commands::control::{self as design, Request, Way};
+use greybox_commands::control::{self as design, ObserverKind, ObserverRequest, Request, Way};
 use numpy::PyArray1;
 use pyo3::prelude::*;
 use pyo3::types::PyBytes;
@@ -32,12 +32,49 @@ pub(crate) struct Wanted {
     eta: Option<f64>,
     ignore_time_terms: bool,
     compensate_friction: bool,
+    feedback: String,
+    observer: String,
+    noise: Vec<(String, f64)>,
+    resolution: Vec<(String, f64)>,
+    disturbance: Option<f64>,
+    bandwidth: Option<f64>,
+    delay: f64,
     members: usize,
     seed: u64,
 }
 
 impl Wanted {
+    /// The observer between the sensors and the law, where the law is not given the full state.
+    fn observer(&self) -> Result<Option<ObserverRequest>, Failure> {
+        let kind = match self.observer.as_str() {
+            "kalman" => ObserverKind::Kalman,
+            "eso" => ObserverKind::Eso,
+            other => {
+                return Err(
+                    Failure::input(format!("`{other}` is no observer")).help("choose `kalman` or `eso`")
+                );
+            }
+        };
+        match self.feedback.as_str() {
+            "state" if self.noise.is_empty() && self.resolution.is_empty() => Ok(None),
+            "state" => {
+                Err(Failure::input("sensors belong to an observer, and the law is given the full state")
+                    .help("add `feedback=\"output\"`"))
+            }
+            "output" => Ok(Some(ObserverRequest {
+                kind,
+                noise: self.noise.clone(),
+                resolution: self.resolution.clone(),
+                disturbance: self.disturbance,
+                bandwidth: self.bandwidth,
+            })),
+            other => Err(Failure::input(format!("`{other}` is nothing to feed back"))
+                .help("choose `state` or `output`")),
+        }
+    }
+
     fn request(self) -> Result<Request, Failure> {
+        let observer = self.observer()?;
         let method = match self.method.as_str() {
             "lqr" => Way::Lqr,
             "hjb" => Way::Hjb,
@@ -68,6 +105,8 @@ impl Wanted {
             eta: self.eta,
             ignore_time_terms: self.ignore_time_terms,
             compensate_friction: self.compensate_friction,
+            observer,
+            delay: self.delay,
             members: self.members,
             seed: self.seed,
         })

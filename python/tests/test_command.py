@@ -65,6 +65,21 @@ def test_a_controller_is_the_command_s(cart, command, tmp_path):
         assert content == (tmp_path / name).read_bytes(), name
 
 
+def test_an_observer_is_the_command_s(cart, command, tmp_path):
+    flags = ["--track", "x", "--to", "0.2", "--size", "x=0.2", "--limit", "8", "--hold", "3"]
+    more = ["--feedback", "output", "--observer", "eso", "--resolution", "x=0.001", "--delay", "0.001"]
+    command("control", cart["model"], *flags, *more, "--out", tmp_path)
+    law = greybox.control(
+        cart["model"], track="x", to=0.2, size={"x": 0.2}, limit=8, hold=3,
+        feedback="output", observer="eso", resolution={"x": 0.001}, delay=0.001,
+    )
+    assert law.to_json() == (tmp_path / "report.json").read_text()
+    assert law.observer_c == (tmp_path / "observer.c").read_text()
+    assert law.observer_rust == (tmp_path / "observer.rs").read_text()
+    with pytest.raises(greybox.InputError, match="feedback"):
+        greybox.control(cart["model"], resolution={"x": 0.001})
+
+
 def test_a_check_is_the_command_s(cart, command):
     done = command("check", cart["files"][0], "--model", cart["model"], "--json")
     assert greybox.check(cart["files"][0], cart["model"]).report == json.loads(done.stdout)
