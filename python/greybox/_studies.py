@@ -235,6 +235,7 @@ def control(
     resolution: Mapping[str, float] | None = None,
     disturbance: float | None = None,
     bandwidth: float | None = None,
+    integral: bool = True,
     delay: float = 0.0,
     report: str | os.PathLike[str] | Diagnosis | Calibration | None = None,
     members: int = 50,
@@ -257,7 +258,7 @@ def control(
         compensate_friction: take friction, smoothed, out of the motion (smc).
         feedback: what the law is given, ``state`` (all of it) or ``output`` (the estimate of an ``observer``).
         observer: ``kalman`` (``disturbance``: its change in one second, in units of the command) or ``eso``
-            (``bandwidth``, 1/s).
+            (``bandwidth``, 1/s); the law takes the disturbance that it estimates off the command, its ``integral`` action.
         noise, resolution: standard deviations and steps of the measured states' sensors.
         delay: of the simulated loop, s.
         report: how sure the model's parameters are, for the perturbed plants (``members``, ``seed``).
@@ -312,6 +313,7 @@ def control(
         "resolution": [(name, float(value)) for name, value in (resolution or {}).items()],
         "disturbance": disturbance,
         "bandwidth": bandwidth,
+        "integral": integral,
         "delay": delay,
         "members": members,
         "seed": seed,

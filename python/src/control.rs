@@ -38,6 +38,7 @@ pub(crate) struct Wanted {
     resolution: Vec<(String, f64)>,
     disturbance: Option<f64>,
     bandwidth: Option<f64>,
+    integral: bool,
     delay: f64,
     members: usize,
     seed: u64,
@@ -67,6 +68,7 @@ impl Wanted {
                 resolution: self.resolution.clone(),
                 disturbance: self.disturbance,
                 bandwidth: self.bandwidth,
+                no_integral: !self.integral,
             })),
             other => Err(Failure::input(format!("`{other}` is nothing to feed back"))
                 .help("choose `state` or `output`")),

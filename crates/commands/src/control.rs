@@ -103,6 +103,8 @@ pub struct ObserverRequest {
     pub disturbance: Option<f64>,
     /// Bandwidth, 1/s; four times the fastest pole of the loop where none is given (ESO).
     pub bandwidth: Option<f64>,
+    /// The law does not take the estimated disturbance off the command: no integral action.
+    pub no_integral: bool,
 }
 
 /// The observers.
@@ -363,7 +365,7 @@ fn output_feedback(
         let unstated = if resolution > 0.0 { 0.0 } else { UNSTATED_NOISE * size };
         sensors.push((name.clone(), Sensor { noise: of(&wanted.noise).unwrap_or(unstated), resolution }));
     }
-    OutputFeedback::new(controller, &OutputOptions { method, sensors })
+    OutputFeedback::new(controller, &OutputOptions { method, sensors, integral: !wanted.no_integral })
 }
 
 /// A state with its unit.
@@ -630,7 +632,7 @@ fn observer_report(plant: &Plant, output: &OutputFeedback) -> Value {
         observer::Form::Eso(_) => Value::Null,
     };
     json!({
-        "kind": kind, "setting": setting, "gain": gain,
+        "kind": kind, "setting": setting, "integral": output.integral(), "gain": gain,
         "sensors": sensors.map(|(&i, s)| json!({
             "state": names[i], "noise": s.noise, "resolution": s.resolution,
         })).collect::<Vec<_>>(),
@@ -694,7 +696,8 @@ fn in_words(
             }
         });
         let sensors: Vec<String> = sensors.collect();
-        let _ = writeln!(text, "  {}; measured: {}", observer_in_words(output), sensors.join(", "));
+        let integral = if output.integral() { "" } else { "; no integral action" };
+        let _ = writeln!(text, "  {}; measured: {}{integral}", observer_in_words(output), sensors.join(", "));
     }
     let worst = worst_margins(controller, output);
     if let Some(m) = worst {

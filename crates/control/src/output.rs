@@ -22,6 +22,9 @@ pub struct OutputOptions {
     pub method: ObserverMethod,
     /// Sensors by the name of the measured state; those not named have noise of [`UNSTATED_NOISE`] of the state's size.
     pub sensors: Vec<(String, Sensor)>,
+    /// Whether the law takes d̂ off the command: its integral action. Where friction is coupled into a coordinate that the
+    /// command does not reach, integral action hunts, and the loop without it rests, an error off.
+    pub integral: bool,
 }
 
 /// The loop with the observer at a set point, friction dropped.
@@ -42,7 +45,7 @@ pub struct OutputCheck {
 /// u = κ(x̂, r) − d̂          within the limits
 /// ```
 ///
-/// with the law κ of the [`Controller`]. The estimated disturbance d̂ is its integral action: friction, loads and wrong
+/// with the law κ of the [`Controller`]; without integral action d̂ stays out of it. The estimated disturbance d̂ is its integral action: friction, loads and wrong
 /// parameters leave no error where the loop comes to rest. The observer is given the command as it is after the limits,
 /// so that nothing winds up.
 ///
@@ -71,6 +74,7 @@ pub struct OutputCheck {
 /// let observer = OutputFeedback::new(&law, &OutputOptions {
 ///     method: ObserverMethod::Kalman { disturbance: 1.0 },
 ///     sensors: vec![("theta".into(), encoder)],
+///     integral: true,
 /// })?;
 /// let options = LoopOptions { feedback: Feedback::Output(Box::new(observer)), ..LoopOptions::default() };
 /// let run = ClosedLoop::new(&model, &law, &options)?.run(&Reference::square(0.5, 5.0, 2))?;
@@ -87,6 +91,7 @@ pub struct OutputFeedback {
     limits: (f64, f64),
     dead_zone: f64,
     method: ObserverMethod,
+    integral: bool,
     checks: Vec<OutputCheck>,
 }
 
@@ -159,8 +164,11 @@ impl OutputFeedback {
         let observer = Observer::new(plant, at, controller.dt(), &options.method, &sensors)?;
         let disturbance = free_name(plant, "d", &[controller.reference()]);
         let (low, high) = controller.limits();
-        let compensated = controller.unlimited().clone() - Expr::var(&disturbance);
-        let law = limited(&compensated, plant, low, high);
+        let law = match options.integral {
+            true => controller.unlimited().clone() - Expr::var(&disturbance),
+            false => controller.unlimited().clone(),
+        };
+        let law = limited(&law, plant, low, high);
         let mut variables = plant.symbols().to_vec();
         variables.extend([(disturbance.clone(), 0), (controller.reference().to_owned(), 0)]);
         let compiled = Compiled::new(std::slice::from_ref(&law), &variables, plant.parameters())?;
@@ -173,6 +181,7 @@ impl OutputFeedback {
             limits: (low, high),
             dead_zone: plant.dead_zone(),
             method: options.method,
+            integral: options.integral,
             checks: Vec::new(),
         };
         for check in controller.checks() {
@@ -192,6 +201,12 @@ impl OutputFeedback {
     #[must_use]
     pub fn method(&self) -> &ObserverMethod {
         &self.method
+    }
+
+    /// Whether the law takes the disturbance off the command.
+    #[must_use]
+    pub fn integral(&self) -> bool {
+        self.integral
     }
 
     /// The sensors, in the order of [`Observer::measured`].
@@ -258,7 +273,8 @@ impl OutputFeedback {
         let n = plant.order();
         let gain = controller.frictionless_gain(&at.state, set_point);
         // u = −H c, of x̂ and d̂.
-        let read = DMatrix::from_fn(1, n + 1, |_, j| if j < n { -gain[j] } else { 1.0 });
+        let taken_off = f64::from(u8::from(self.integral));
+        let read = DMatrix::from_fn(1, n + 1, |_, j| if j < n { -gain[j] } else { taken_off });
         let h = read * &observer.estimate;
         let size = observer.carry.nrows();
         let measures = &observer.measured * self.observer.selection(n);

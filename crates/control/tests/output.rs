@@ -47,7 +47,7 @@ fn law(model: &Model) -> Controller {
 }
 
 fn with(law: &Controller, method: ObserverMethod, sensor: Sensor) -> LoopOptions {
-    let options = OutputOptions { method, sensors: vec![("theta".into(), sensor)] };
+    let options = OutputOptions { method, sensors: vec![("theta".into(), sensor)], integral: true };
     let output = OutputFeedback::new(law, &options).unwrap();
     LoopOptions { feedback: Feedback::Output(Box::new(output)), ..LoopOptions::default() }
 }
@@ -191,7 +191,8 @@ fn noise_is_that_of_its_seed() {
 fn what_cannot_be_observed_is_refused() {
     let model = arm(0.0);
     let law = law(&model);
-    let make = |method, sensors| OutputFeedback::new(&law, &OutputOptions { method, sensors });
+    let make =
+        |method, sensors| OutputFeedback::new(&law, &OutputOptions { method, sensors, integral: true });
     let sensor = |noise, resolution| vec![("theta".to_string(), Sensor { noise, resolution })];
     assert!(matches!(make(KALMAN, sensor(-1.0, 0.0)), Err(ControlError::Option { .. })));
     assert!(matches!(make(KALMAN, sensor(0.0, 0.0)), Err(ControlError::Option { .. })));

@@ -61,6 +61,8 @@ pub struct ObserverPage {
     pub kind: &'static str,
     /// The name of the estimated disturbance in the law.
     pub disturbance: String,
+    /// Whether the law takes it off the command.
+    pub integral: bool,
     /// What is measured.
     pub sensors: Vec<SensorPage>,
 }

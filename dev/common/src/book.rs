@@ -28,6 +28,17 @@ pub fn put_table(root: &Path, page: &str, begin: &str, table: &str) -> Result<()
     put_file(root, page, &text)
 }
 
+/// Whether a page has this table behind the marker `begin`.
+///
+/// # Errors
+/// When the page cannot be read or lacks a marker.
+pub fn is_table(root: &Path, page: &str, begin: &str, table: &str) -> Result<bool> {
+    let path = place(root, page);
+    let text =
+        std::fs::read_to_string(&path).with_context(|| format!("{} cannot be read", path.display()))?;
+    Ok(between(&text, begin, table).with_context(|| path.display().to_string())? == text)
+}
+
 /// Writes a file beside the pages.
 ///
 /// # Errors

@@ -40,8 +40,9 @@ pub(crate) struct Heading {
     pub(crate) title: String,
 }
 
-/// The range in which a value must stay; an end that is missing is open.
-#[derive(Debug, Clone, Copy, Deserialize, Serialize)]
+/// The range in which a value must stay; an end that is missing is open. Each end is within a factor of two of what is
+/// measured, or there is a reason.
+#[derive(Debug, Clone, Deserialize, Serialize)]
 #[serde(deny_unknown_fields)]
 pub(crate) struct Bound {
     /// Least.
@@ -50,12 +51,22 @@ pub(crate) struct Bound {
     /// Most.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub(crate) max: Option<f64>,
+    /// Why it is wider than a factor of two.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub(crate) why: Option<String>,
 }
 
 impl Bound {
     /// Whether a value stays inside; what is not a number does not.
     pub(crate) fn holds(&self, value: f64) -> bool {
         !value.is_nan() && self.min.is_none_or(|min| value >= min) && self.max.is_none_or(|max| value <= max)
+    }
+
+    /// Whether each end is within a factor of two of a value, and of its opposite where zero lies between.
+    pub(crate) fn is_narrow(&self, value: f64) -> bool {
+        let size = value.abs();
+        let near = |end: f64| end.abs() <= 2.0 * size && (end * value <= 0.0 || end.abs() >= 0.5 * size);
+        self.min.into_iter().chain(self.max).all(near)
     }
 }
 

@@ -20,6 +20,7 @@ mod index;
 mod joint;
 pub mod link;
 mod optimal;
+mod pages;
 mod sliding;
 mod story;
 
@@ -44,6 +45,9 @@ pub struct Arguments {
     /// What `greybox demo link --out DIR` left: the story reads its models in place of diagnosing again
     #[arg(long, value_name = "DIR")]
     demo: Option<PathBuf>,
+    /// Write what is measured into the book (a whole run, with --demo)
+    #[arg(long, requires = "demo", conflicts_with = "only")]
+    write_docs: bool,
 }
 
 /// How a table or figure stands to that of the thesis.
@@ -253,6 +257,13 @@ pub fn run(root: &Path, arguments: &Arguments) -> Result<Ending> {
         println!("not made yet: {}", ids.join(", "));
     }
     println!("{}", out.join("index.html").display());
+    if arguments.write_docs {
+        pages::write(root, &outcomes)?;
+    } else if arguments.only.is_empty() && arguments.demo.is_some() && !pages::is_current(root, &outcomes)? {
+        // (The models of a diagnosis that is made here have more digits than those of its files.)
+        eprintln!("docs/src/reproduction.md says what is no longer measured: run this with --write-docs");
+        return Ok(Ending::Missed);
+    }
     Ok(if outcomes.iter().all(|o| o.failures.is_empty()) { Ending::Done } else { Ending::Missed })
 }
 
@@ -267,6 +278,12 @@ fn judge(piece: &Piece, fixture: &Fixture) -> Vec<String> {
             }
             Some(bound) if !bound.holds(check.measured) => {
                 failures.push(format!("`{}` = {} is outside {bound}", check.name, check.measured));
+            }
+            Some(bound) if bound.why.is_none() && !bound.is_narrow(check.measured) => {
+                failures.push(format!(
+                    "`{}` = {} is bounded by {bound}, more than a factor of two away: narrow it, or say `why`",
+                    check.name, check.measured
+                ));
             }
             Some(_) => {}
         }
@@ -314,6 +331,21 @@ mod tests {
         assert_eq!(judge(&piece, &bounded).len(), 1, "not a number is outside");
         piece.checks[0].measured = 0.1;
         assert!(judge(&piece, &bounded).is_empty());
+        piece.checks[0].measured = 0.04;
+        assert!(judge(&piece, &bounded)[0].contains("more than a factor of two"));
+        assert!(judge(&piece, &fixture(r#"{"m error": {"max": 0.1, "why": "seeds"}}"#)).is_empty());
+        for (value, bound, narrow) in [
+            (0.3, r#"{"min": 0.14}"#, false),
+            (0.3, r#"{"min": 0.16, "max": 0.59}"#, true),
+            (-0.3, r#"{"min": -0.59, "max": 0.59}"#, true),
+            (-0.3, r#"{"min": -0.61}"#, false),
+            (-0.3, r#"{"max": -0.14}"#, false),
+            (0.0, r#"{"max": 0}"#, true),
+            (0.0, r#"{"max": 0.1}"#, false),
+        ] {
+            let bound: fixture::Bound = serde_json::from_str(bound).unwrap();
+            assert!(bound.holds(value) && bound.is_narrow(value) == narrow, "{value}: {bound}");
+        }
         piece.checks.clear();
         piece.status = Status::Constants;
         assert!(judge(&piece, &bounded)[0].contains("nothing was measured"));

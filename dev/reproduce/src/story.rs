@@ -5,12 +5,13 @@ use std::path::Path;
 
 use anyhow::{Context, Result};
 use greybox_control::{
-    ControlError, Controller, DesignOptions, Method, Metrics, Plant, PlantOptions, design,
+    ControlError, Controller, DesignOptions, Method, Metrics, ObserverMethod, OutputFeedback, OutputOptions,
+    Plant, PlantOptions, Sensor, design,
 };
 use greybox_model::Model;
 use greybox_report::Report;
 use greybox_report::contract::{Ordered, Parameter};
-use greybox_simulate::rigs::{LinkRun, RigError, RotaryFlexibleLink, Sampling};
+use greybox_simulate::rigs::{LinkRun, RigError, RotaryFlexibleLink, Sampling, VoltageBalance};
 
 use super::chapter2::draw;
 use super::index::number;
@@ -34,6 +35,10 @@ const SIZES: [(&str, f64); 4] = [("theta", 0.35), ("alpha", 0.1), ("theta'", 5.0
 const VOLTS: f64 = 5.0;
 /// λ and η/φ of the thesis's sliding mode (section 4.2), 1/s.
 const SLIDING: (f64, f64) = (16.0, 100.0);
+/// Bandwidth of the extended-state observers, 1/s.
+const BANDWIDTH: f64 = 300.0;
+/// One count of an encoder of 4096 counts a turn, rad.
+const COUNT: f64 = std::f64::consts::TAU / 4096.0;
 const MODELS: [&str; 3] = ["nominal", "calibrated", "improved"];
 
 /// The piece.
@@ -107,22 +112,39 @@ struct Way {
     name: &'static str,
     method: Method,
     compensated: bool,
+    /// The observer between the encoders and the law, which else is given the true state; whether it has integral action.
+    observer: Option<(ObserverMethod, bool)>,
 }
 
 impl Way {
     /// The way for its own sake, not for comparison.
     fn is_shown(&self) -> bool {
-        !self.compensated
+        !self.compensated && self.observer.is_none()
     }
 }
 
-fn ways() -> [Way; 3] {
+fn ways() -> [Way; 6] {
     let eta = 10.0 * VOLTS;
+    let regulator = || Way { name: "regulator", method: Method::Lqr, compensated: false, observer: None };
+    let kalman = ObserverMethod::Kalman { disturbance: 0.2 * VOLTS };
+    let eso = ObserverMethod::Eso { bandwidth: BANDWIDTH };
     let sliding = || Method::Smc { lambda: SLIDING.0, eta, phi: eta / SLIDING.1 };
     [
-        Way { name: "regulator", method: Method::Lqr, compensated: false },
-        Way { name: "sliding mode", method: sliding(), compensated: false },
-        Way { name: "sliding mode, friction compensated", method: sliding(), compensated: true },
+        regulator(),
+        Way { name: "sliding mode", method: sliding(), compensated: false, observer: None },
+        Way {
+            name: "sliding mode, friction compensated",
+            method: sliding(),
+            compensated: true,
+            observer: None,
+        },
+        Way { name: "regulator, Kalman filter", observer: Some((kalman, false)), ..regulator() },
+        Way { name: "regulator, extended-state observer", observer: Some((eso, false)), ..regulator() },
+        Way {
+            name: "regulator, Kalman filter, integral action",
+            observer: Some((kalman, true)),
+            ..regulator()
+        },
     ]
 }
 
@@ -142,6 +164,13 @@ fn law(model: &Model, way: &Way, amplitude: f64) -> Result<Option<Controller>> {
     }
 }
 
+/// An observer behind encoders of both angles.
+fn observer(law: &Controller, method: ObserverMethod, integral: bool) -> Result<OutputFeedback> {
+    let encoder = Sensor { noise: 0.0, resolution: COUNT };
+    let sensors = ["theta", "alpha"].map(|name| (name.to_owned(), encoder)).to_vec();
+    Ok(OutputFeedback::new(law, &OutputOptions { method, sensors, integral })?)
+}
+
 fn samples() -> usize {
     (HOLD / DT).round() as usize
 }
@@ -150,21 +179,34 @@ fn reference(amplitude: f64, k: usize) -> f64 {
     if (k / samples()).is_multiple_of(2) { amplitude } else { -amplitude }
 }
 
-/// A law on the rig, given the true state: what differs comes from the model alone. `Err` with the time at which it took
-/// the hub out of the range of the rig.
-fn run(law: &Controller, amplitude: f64) -> Result<Result<LinkRun, f64>> {
+/// A law on the rig, given the true state (what differs comes from the model alone) or what its observer makes of two
+/// encoders. `Err` with the time at which it took the hub out of the range of the rig.
+fn run(
+    rig: &RotaryFlexibleLink,
+    law: &Controller,
+    observer: Option<&OutputFeedback>,
+    amplitude: f64,
+) -> Result<Result<LinkRun, f64>> {
     let names = law.plant().state_names();
-    let rig = ["theta", "alpha", "theta'", "alpha'"];
+    let order = ["theta", "alpha", "theta'", "alpha'"];
     let places: Vec<usize> = names
         .iter()
         .map(|name| {
-            rig.iter().position(|r| r == name).with_context(|| format!("the rig has no state {name}"))
+            order.iter().position(|r| r == name).with_context(|| format!("the rig has no state {name}"))
         })
         .collect::<Result<_>>()?;
     let sampling = Sampling { dt: DT, substeps: 4 };
-    let run = RIG.run_with_state(sampling, [0.0; 4], STEPS * samples(), |k, x| {
+    let mut memory = observer.map(OutputFeedback::start);
+    let run = rig.run_with_state(sampling, [0.0; 4], STEPS * samples(), |k, x| {
         let known: Vec<f64> = places.iter().map(|&i| x[i]).collect();
-        law.command(&known, reference(amplitude, k))
+        match (observer, &mut memory) {
+            (Some(observer), Some(memory)) => {
+                let read = |&i: &usize| (known[i] / COUNT).round() * COUNT;
+                let y: Vec<f64> = observer.observer().measured().iter().map(read).collect();
+                observer.command(memory, &y, reference(amplitude, k))
+            }
+            _ => law.command(&known, reference(amplitude, k)),
+        }
     });
     match run {
         Ok(run) => Ok(Ok(run)),
@@ -179,6 +221,7 @@ struct Reached {
     settling: f64,
     overshoot: f64,
     left: f64,
+    moves: f64,
     rms: f64,
     largest: f64,
     effort: f64,
@@ -189,6 +232,7 @@ impl Reached {
         settling: f64::INFINITY,
         overshoot: f64::INFINITY,
         left: f64::INFINITY,
+        moves: f64::INFINITY,
         rms: f64::INFINITY,
         largest: f64::INFINITY,
         effort: f64::INFINITY,
@@ -208,6 +252,7 @@ impl Reached {
             settling: worst(&|m| m.settling.unwrap_or(f64::INFINITY)),
             overshoot: worst(&|m| 100.0 * m.overshoot),
             left: worst(&|m| m.final_error.abs().to_degrees()),
+            moves: worst(&|m| m.peak_to_peak.to_degrees()),
             rms: worst(&|m| m.rms_error.to_degrees()),
             largest: worst(&|m| m.largest_command),
             effort: worst(&|m| m.effort),
@@ -216,7 +261,7 @@ impl Reached {
 
     fn cells(&self) -> Vec<String> {
         let settling = if self.settling.is_finite() { number(self.settling) } else { "not reached".into() };
-        let rest = [self.overshoot, self.left, self.rms, self.largest, self.effort];
+        let rest = [self.overshoot, self.left, self.moves, self.rms, self.largest, self.effort];
         [settling].into_iter().chain(rest.map(number)).collect()
     }
 }
@@ -228,6 +273,47 @@ fn curves(run: &LinkRun, amplitude: f64) -> [Vec<[f64; 2]>; 2] {
         at.clone().step_by(5).map(|k| [k as f64 * DT, value(k).to_degrees()]).collect()
     };
     [thin(&|k| run.states[k][0]), thin(&|k| run.states[k][0] - reference(amplitude, k))]
+}
+
+/// What makes integral action hunt: the same law on the rig, and on a rig whose friction turns the hub alone, so that α̈
+/// has it as −θ̈ does.
+fn hunting(piece: &mut Piece, improved: &Model) -> Result<()> {
+    let hub = RIG.hub.coulomb / RIG.hub.acceleration;
+    let on_the_hub = RotaryFlexibleLink {
+        link: VoltageBalance { coulomb: -hub * RIG.link.acceleration, ..RIG.link },
+        ..RIG
+    };
+    let way = ways().into_iter().find(|w| w.observer.is_some_and(|(_, integral)| integral));
+    let way = way.context("no way has integral action")?;
+    let mut rows = Vec::new();
+    for degrees in AMPLITUDES {
+        let amplitude = f64::to_radians(degrees);
+        let law = law(improved, &way, amplitude)?.context("the design is refused")?;
+        let observer = way.observer.map(|(method, integral)| observer(&law, method, integral)).transpose()?;
+        for (name, rig) in [("of the thesis", &RIG), ("friction on the hub alone", &on_the_hub)] {
+            let reached = match run(rig, &law, observer.as_ref(), amplitude)? {
+                Ok(run) => Reached::of(&run, amplitude),
+                Err(_) => Reached::LOST,
+            };
+            rows.push([vec![name.to_owned(), format!("±{degrees}°")], reached.cells()].concat());
+            if rig != &RIG {
+                let mut check = |what: &str, value: f64| {
+                    let name = format!("{}, ±{degrees}°, friction on the hub alone: {what}", way.name);
+                    piece.checks.push(Check::new(name, value));
+                };
+                check("error left in degrees", reached.left);
+                check("peak to peak at rest in degrees", reached.moves);
+            }
+        }
+    }
+    let mut headings = vec!["rig".to_owned(), "steps".to_owned()];
+    headings.extend(piece.tables[1].headings[3..].iter().cloned());
+    piece.tables.push(Table {
+        caption: "Integral action on a rig whose friction also acts on the deflection, and on one where it does not.".into(),
+        headings,
+        rows,
+    });
+    Ok(())
 }
 
 fn story(answer: &Answer) -> Result<Piece> {
@@ -261,7 +347,12 @@ fn story(answer: &Answer) -> Result<Piece> {
                 let head = [way.name.to_owned(), name.to_owned(), format!("±{degrees}°")].to_vec();
                 let ran = match law {
                     Some(law) => {
-                        run(&law, amplitude)?.map_err(|time| format!("leaves ±40° after {} s", number(time)))
+                        let observer = way
+                            .observer
+                            .map(|(method, integral)| observer(&law, method, integral))
+                            .transpose()?;
+                        run(&RIG, &law, observer.as_ref(), amplitude)?
+                            .map_err(|time| format!("leaves ±40° after {} s", number(time)))
                     }
                     None => Err("refused: unstable".to_owned()),
                 };
@@ -275,7 +366,7 @@ fn story(answer: &Answer) -> Result<Piece> {
                         reached.push(this);
                     }
                     Err(lost) => {
-                        rows.push([head, vec![lost], vec![String::new(); 5]].concat());
+                        rows.push([head, vec![lost], vec![String::new(); 6]].concat());
                         reached.push(Reached::LOST);
                     }
                 }
@@ -305,6 +396,7 @@ fn story(answer: &Answer) -> Result<Piece> {
             "settling (2 %) in s",
             "overshoot in %",
             "error left in degrees",
+            "peak to peak at rest in degrees",
             "RMS error in degrees",
             "largest voltage in V",
             "∫ u² dt in V² s",
@@ -313,6 +405,7 @@ fn story(answer: &Answer) -> Result<Piece> {
         .to_vec(),
         rows,
     });
+    hunting(&mut piece, &answer.improved)?;
     // Torque per volt of the data sheet: that of the nominal model, which holds it fixed.
     let value = |name: &str| -> Result<f64> {
         let model = &answer.improved;
@@ -334,6 +427,15 @@ fn judge(piece: &mut Piece, way: &Way, degrees: f64, reached: &[Reached]) {
     let mut check = |what: &str, value: f64| {
         piece.checks.push(Check::new(format!("{}, ±{degrees}°: {what}", way.name), value));
     };
+    if way.observer.is_some() {
+        check("error left in degrees, improved", improved.left);
+        check("peak to peak at rest in degrees, improved", improved.moves);
+        // With integral action it hunts, and does not settle.
+        if degrees > SMALL && way.observer.is_some_and(|(_, integral)| !integral) {
+            check("settling in s, improved", improved.settling);
+        }
+        return;
+    }
     if !way.is_shown() {
         check("refused or lost, improved", f64::from(u8::from(improved.left.is_infinite())));
         return;

@@ -113,6 +113,10 @@ pub(crate) struct Arguments {
     #[arg(long, value_name = "RATE", allow_negative_numbers = true)]
     bandwidth: Option<f64>,
 
+    /// Leave the estimated disturbance in: no integral action (output)
+    #[arg(long)]
+    no_integral: bool,
+
     /// Delay of the simulated loop, s: sensors, network and computing together
     #[arg(long, value_name = "SECONDS", default_value_t = 0.0, allow_negative_numbers = true)]
     delay: f64,
@@ -225,6 +229,7 @@ fn request(arguments: &Arguments) -> Result<Request, Failure> {
             resolution: named("resolution", "step", &arguments.resolution)?,
             disturbance: arguments.disturbance,
             bandwidth: arguments.bandwidth,
+            no_integral: arguments.no_integral,
         }),
     };
     let unused = [
@@ -232,6 +237,7 @@ fn request(arguments: &Arguments) -> Result<Request, Failure> {
         ("--resolution", !arguments.resolution.is_empty()),
         ("--disturbance", arguments.disturbance.is_some()),
         ("--bandwidth", arguments.bandwidth.is_some()),
+        ("--no-integral", arguments.no_integral),
     ];
     if observer.is_none()
         && let Some((option, _)) = unused.iter().find(|(_, given)| *given)

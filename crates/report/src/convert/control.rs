@@ -110,6 +110,7 @@ pub fn page(sources: &ControlSources<'_>) -> ControlPage {
         },
         observer: sources.output.map(|output| ObserverPage {
             disturbance: output.disturbance().to_owned(),
+            integral: output.integral(),
             kind: match output.method() {
                 ObserverMethod::Kalman { .. } => "steady-state Kalman filter",
                 ObserverMethod::Eso { .. } => "extended-state observer",

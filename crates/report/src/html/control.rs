@@ -57,6 +57,7 @@ struct View {
     dt: String,
     is_sliding: bool,
     fed_back: String,
+    is_integral: bool,
     observer: Option<ObserverView>,
     margins: Vec<[String; 6]>,
     files: Vec<(&'static str, &'static str)>,
@@ -65,6 +66,7 @@ struct View {
 struct ObserverView {
     kind: &'static str,
     disturbance_html: String,
+    integral: bool,
     sensors: Vec<[String; 3]>,
 }
 
@@ -179,9 +181,11 @@ impl View {
             dt: format::plain(page.dt),
             is_sliding: page.method == LawKind::Smc,
             fed_back: fed_back(page),
+            is_integral: page.observer.as_ref().is_some_and(|o| o.integral),
             observer: page.observer.as_ref().map(|o| ObserverView {
                 kind: o.kind,
                 disturbance_html: expression::html(&o.disturbance),
+                integral: o.integral,
                 sensors: o
                     .sensors
                     .iter()
