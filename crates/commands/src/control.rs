@@ -317,6 +317,7 @@ fn options(request: &Request) -> PlantOptions {
         sizes: request.sizes.clone(),
         input_size: request.input_size,
         ignore_time_terms: request.ignore_time_terms,
+        predict_input_delay: request.observer.is_some(),
         ..PlantOptions::default()
     }
 }
@@ -421,7 +422,7 @@ fn observer_code(
             .collect(),
     };
     let form = match output.observer().form() {
-        observer::Form::Kalman { gain, substeps } => ObserverForm::Kalman { gain, substeps },
+        observer::Form::Kalman { gain } => ObserverForm::Kalman { gain },
         observer::Form::Eso(chains) => ObserverForm::Chains(
             chains
                 .into_iter()
@@ -448,6 +449,8 @@ fn observer_code(
         dt: controller.dt(),
         measured: output.observer().measured().to_vec(),
         dead_zone: plant.dead_zone(),
+        substeps: output.observer().substeps(),
+        late: (output.observer().late().samples, output.observer().late().part),
         form,
     }
 }
@@ -603,6 +606,7 @@ fn report(
             None => controller.law().iter().map(ToString::to_string).collect(),
         },
         "delay": request.delay,
+        "input_delay": plant.input_delay(),
         "observer": output.map(|o| observer_report(plant, o)),
         "checks": checks,
         "left_out": plant.dropped().iter().map(|d| json!({
@@ -696,6 +700,13 @@ fn in_words(
             }
         });
         let sensors: Vec<String> = sensors.collect();
+        if plant.input_delay() > 0.0 {
+            let _ = writeln!(
+                text,
+                "  predicts over the delay of the command, {} s",
+                format::number(plant.input_delay())
+            );
+        }
         let integral = if output.integral() { "" } else { "; no integral action" };
         let _ = writeln!(text, "  {}; measured: {}{integral}", observer_in_words(output), sensors.join(", "));
     }

@@ -96,12 +96,24 @@ impl<'a> Builder<'a> {
         let mut range = Range::default();
         let mut dropped = Vec::new();
         let mut closed_gaps = Vec::new();
+        let mut late = Vec::new();
+        let mut mentions = 0;
         let residuals: Vec<Expr> = self
             .model
             .equations
             .iter()
             .map(|equation| {
                 let residual = self.constant(&equation.residual());
+                let residual = if self.options.predict_input_delay {
+                    let value = |e: &Expr| self.value(e, &[]);
+                    let prompt = terms::without_input_delay(&residual, self.input, &value, &mut late);
+                    prompt.walk(&mut |e| {
+                        mentions += usize::from(matches!(e, Expr::Var { name, .. } if **name == *self.input));
+                    });
+                    prompt
+                } else {
+                    residual
+                };
                 self.check(&equation.name, &residual)?;
                 let residual = self.timeless(&equation.name, &residual, &mut dropped)?;
                 let value = |e: &Expr| self.value(e, &[]);
@@ -113,6 +125,11 @@ impl<'a> Builder<'a> {
                 Ok(if self.options.close_gaps { bridged } else { free }.simplify())
             })
             .collect::<Result<_, ControlError>>()?;
+        // A command that acts at two times cannot be predicted over one.
+        let input_delay = late.first().copied().unwrap_or(0.0);
+        if !late.is_empty() && (late.len() < mentions || late.iter().any(|tau| *tau != input_delay)) {
+            return Err(ControlError::SeveralDelays { input: self.input.to_owned() });
+        }
         let limits = range.limits;
         if !(limits.0 < limits.1 && limits.0 <= 0.0 && limits.1 >= 0.0) {
             return Err(ControlError::Limits { low: limits.0, high: limits.1 });
@@ -155,6 +172,7 @@ impl<'a> Builder<'a> {
             limits,
             dead_zone: range.dead_zone.unwrap_or(0.0),
             dropped,
+            input_delay,
             open_gaps: !self.options.close_gaps && !closed_gaps.is_empty(),
             closed_gaps: if self.options.close_gaps { closed_gaps } else { Vec::new() },
             sizes: self.sizes.clone(),

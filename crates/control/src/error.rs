@@ -64,13 +64,30 @@ pub enum ControlError {
     /// A delay.
     #[error(
         "equation \"{equation}\": the plant remembers its past in `{expression}`, and a feedback of the state is no \
-         law for that: leave the delay out of the model for the design, and simulate the law on the model with it"
+         law for that: a delay of the command is predicted over by an observer (output feedback, `predict_input_delay`); leave any other \
+         out of the model for the design, and simulate the law on the model with it"
     )]
     Delay {
         /// Name of the equation.
         equation: String,
         /// The delayed expression.
         expression: String,
+    },
+    /// The command acts at several times.
+    #[error(
+        "the input `{input}` acts at several times: one delay of it can be predicted over, the same wherever it acts"
+    )]
+    SeveralDelays {
+        /// The input.
+        input: String,
+    },
+    /// A delay of too many samples.
+    #[error("the command acts {samples} samples late, and {most} can be predicted over: sample more slowly")]
+    LongDelay {
+        /// Samples, rounded up.
+        samples: usize,
+        /// How many would do.
+        most: usize,
     },
     /// An explicit time.
     #[error(

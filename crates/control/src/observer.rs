@@ -1,7 +1,7 @@
 //! State and disturbance from the measured states.
 
 use greybox_eso::{Design, EsoError, Fal, Observer as Chain, Scheme};
-use greybox_hjb::dare;
+use greybox_hjb::{Linear, dare};
 use nalgebra::{DMatrix, DVector};
 use rand_distr::{Distribution, StandardNormal};
 use rand_pcg::Pcg64Mcg;
@@ -15,6 +15,10 @@ use crate::stability;
 const LONGEST: f64 = 0.5;
 /// Most steps of the prediction between two samples.
 const MOST_SUBSTEPS: usize = 64;
+/// Most samples by which a command may be late.
+const MOST_LATE: usize = 40;
+/// A share of a sample that is rounding.
+const WHOLE: f64 = 1e-9;
 
 /// How the state is estimated. Both observers also estimate the disturbance d of ẋ = f(x) + g(x) (u + d): friction,
 /// loads and wrong parameters, as seen from the command.
@@ -72,6 +76,40 @@ pub struct Observer {
     dt: f64,
     measured: Vec<usize>,
     kind: Kind,
+    /// Runge–Kutta steps of a prediction over one sample.
+    substeps: usize,
+    late: Lateness,
+}
+
+/// How late the command acts: whole samples, and a part of one, s.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct Lateness {
+    /// Whole samples.
+    pub samples: usize,
+    /// What is left, below one sample, s.
+    pub part: f64,
+}
+
+impl Lateness {
+    fn new(delay: f64, dt: f64) -> Result<Lateness, ControlError> {
+        let all = delay / dt;
+        let whole = (all + WHOLE).floor();
+        let late = Lateness {
+            samples: whole as usize,
+            part: if all - whole < WHOLE { 0.0 } else { delay - whole * dt },
+        };
+        let samples = late.samples + usize::from(late.part > 0.0);
+        if samples > MOST_LATE {
+            return Err(ControlError::LongDelay { samples, most: MOST_LATE });
+        }
+        Ok(late)
+    }
+
+    /// Whether the command acts at once.
+    #[must_use]
+    pub fn is_none(&self) -> bool {
+        self.samples == 0 && self.part == 0.0
+    }
 }
 
 #[derive(Debug, Clone)]
@@ -79,7 +117,6 @@ enum Kind {
     Kalman {
         /// L, (states and d) × measured.
         gain: DMatrix<f64>,
-        substeps: usize,
     },
     Eso(Vec<Coordinate>),
 }
@@ -160,12 +197,10 @@ pub struct EsoStep {
 /// An observer in numbers, for code that runs it elsewhere.
 #[derive(Debug, Clone, PartialEq)]
 pub enum Form {
-    /// L, (states and d) × measured, and the Runge–Kutta steps of a prediction.
+    /// L, (states and d) × measured.
     Kalman {
         /// L, row by row.
         gain: Vec<Vec<f64>>,
-        /// Equal steps between two samples.
-        substeps: usize,
     },
     /// The chains.
     Eso(Vec<EsoStep>),
@@ -177,13 +212,16 @@ pub struct Memory {
     /// x̂ and d̂.
     pub(crate) estimate: Vec<f64>,
     chains: Vec<AnyChain>,
+    /// The last commands, the latest first, as many as still act or will.
+    past: Vec<f64>,
     started: bool,
 }
 
-/// An observer's tangent: c⁺ = M c + Γ u + N y⁺, with x̂ and d̂ = E c.
+/// An observer's tangent: c⁺ = M c + Γ₁ u₁ + Γ₀ u₀ + N y⁺, with x̂ and d̂ = E c. Over a sample first u₁ acts, then u₀.
 pub(crate) struct Tangent {
     pub(crate) carry: DMatrix<f64>,
-    pub(crate) input: DMatrix<f64>,
+    pub(crate) older: DMatrix<f64>,
+    pub(crate) newer: DMatrix<f64>,
     pub(crate) measured: DMatrix<f64>,
     pub(crate) estimate: DMatrix<f64>,
 }
@@ -202,11 +240,18 @@ impl Observer {
         if measured.is_empty() {
             return Err(ControlError::NothingMeasured { known: listed(plant.state_names()) });
         }
+        let late = Lateness::new(plant.input_delay(), dt)?;
+        let tangent = plant.frictionless_tangent(&at.state, at.input);
+        let fastest = stability::poles(&tangent.a, plant.sizes())
+            .ok_or(ControlError::NoPoles { set_point: 0.0 })?
+            .iter()
+            .fold(0.0f64, |fastest, p| fastest.max(p.magnitude()));
+        let substeps = ((fastest * dt / LONGEST).ceil() as usize).clamp(1, MOST_SUBSTEPS);
         let kind = match *method {
             ObserverMethod::Kalman { disturbance } => kalman(plant, at, dt, disturbance, &measured, sensors)?,
             ObserverMethod::Eso { bandwidth } => Kind::Eso(chains(plant, at, dt, bandwidth, &measured)?),
         };
-        Ok(Observer { plant: plant.clone(), dt, measured, kind })
+        Ok(Observer { plant: plant.clone(), dt, measured, kind, substeps, late })
     }
 
     /// Indices of the measured states.
@@ -215,13 +260,24 @@ impl Observer {
         &self.measured
     }
 
+    /// Steps of a prediction over one sample.
+    #[must_use]
+    pub fn substeps(&self) -> usize {
+        self.substeps
+    }
+
+    /// How late the command acts.
+    #[must_use]
+    pub fn late(&self) -> Lateness {
+        self.late
+    }
+
     /// The observer in numbers.
     #[must_use]
     pub fn form(&self) -> Form {
         match &self.kind {
-            Kind::Kalman { gain, substeps } => {
-                let rows = gain.row_iter().map(|row| row.iter().copied().collect()).collect();
-                Form::Kalman { gain: rows, substeps: *substeps }
+            Kind::Kalman { gain } => {
+                Form::Kalman { gain: gain.row_iter().map(|row| row.iter().copied().collect()).collect() }
             }
             Kind::Eso(coordinates) => Form::Eso(coordinates.iter().map(|c| c.step(&self.plant)).collect()),
         }
@@ -232,21 +288,25 @@ impl Observer {
             Kind::Kalman { .. } => Vec::new(),
             Kind::Eso(coordinates) => coordinates.iter().map(|c| c.chain.clone()).collect(),
         };
-        Memory { estimate: vec![0.0; self.plant.order() + 1], chains, started: false }
+        let past = vec![0.0; self.late.samples + 2];
+        Memory { estimate: vec![0.0; self.plant.order() + 1], chains, past, started: false }
     }
 
-    /// The estimate at a sample from its measurements `y` and the command `u` that acted since the last one (behind the
-    /// dead zone). The first sample finds the machine at rest. A measurement that is not a number is left out.
+    /// The estimate at a sample from its measurements `y` and the last command `u` (behind the dead zone). The first sample finds the machine at rest. A measurement that is not a number is left out.
     pub(crate) fn update(&self, memory: &mut Memory, y: &[f64], u: f64) {
+        memory.past.rotate_right(1);
+        memory.past[0] = u;
         if !memory.started {
             for (&i, y) in self.measured.iter().zip(y) {
                 memory.estimate[i] = if y.is_finite() { *y } else { 0.0 };
             }
         }
         match &self.kind {
-            Kind::Kalman { gain, substeps } => {
+            Kind::Kalman { gain } => {
                 if memory.started {
-                    self.predict(&mut memory.estimate, u, *substeps);
+                    let Lateness { samples, part } = self.late;
+                    self.predict(&mut memory.estimate, memory.past[samples + 1], part);
+                    self.predict(&mut memory.estimate, memory.past[samples], self.dt - part);
                     let innovation = |(&i, y): (&usize, &f64)| match y.is_finite() {
                         true => y - memory.estimate[i],
                         false => 0.0,
@@ -256,15 +316,41 @@ impl Observer {
                     memory.estimate.iter_mut().zip(correction.iter()).for_each(|(x, c)| *x += c);
                 }
             }
-            Kind::Eso(coordinates) => self.follow(memory, coordinates, y, u),
+            Kind::Eso(coordinates) => {
+                let Lateness { samples, part } = self.late;
+                let share = part / self.dt;
+                let acted = share * memory.past[samples + 1] + (1.0 - share) * memory.past[samples];
+                self.follow(memory, coordinates, y, acted);
+            }
         }
         memory.started = true;
     }
 
-    /// x̂ one sample later, by the classical Runge–Kutta method.
-    fn predict(&self, estimate: &mut [f64], u: f64, substeps: usize) {
+    /// x̂ and d̂ when the next command will act: over the delay by the commands that were given.
+    pub(crate) fn ahead(&self, memory: &Memory) -> Vec<f64> {
+        let Lateness { samples, part } = self.late;
+        let mut estimate = memory.estimate.clone();
+        self.predict(&mut estimate, memory.past[samples], part);
+        for k in (0..samples).rev() {
+            self.predict(&mut estimate, memory.past[k], self.dt);
+        }
+        estimate
+    }
+
+    /// The steps of a prediction over a time.
+    #[must_use]
+    pub fn steps(&self, time: f64) -> usize {
+        ((time / self.dt * self.substeps as f64 - WHOLE).ceil() as usize).max(1)
+    }
+
+    /// x̂ a time later under a command, by the classical Runge–Kutta method.
+    fn predict(&self, estimate: &mut [f64], u: f64, time: f64) {
+        if time == 0.0 {
+            return;
+        }
         let n = self.plant.order();
-        let h = self.dt / substeps as f64;
+        let substeps = self.steps(time);
+        let h = time / substeps as f64;
         let input = u + estimate[n];
         let along =
             |x: &[f64], k: &[f64], h: f64| -> Vec<f64> { x.iter().zip(k).map(|(x, k)| x + h * k).collect() };
@@ -310,14 +396,16 @@ impl Observer {
         let (n, m) = (self.plant.order(), self.measured.len());
         let plant = self.plant.frictionless_tangent(&at.state, at.input);
         match &self.kind {
-            Kind::Kalman { gain, .. } => {
-                let held = stability::held(&plant, self.dt, self.plant.sizes(), self.plant.input_size())
-                    .ok_or(ControlError::NoPoles { set_point })?;
-                let (all, input) = extended(&held.a, &held.b);
+            Kind::Kalman { gain } => {
+                let held = self.held(&plant, self.dt, set_point)?;
+                let all = extended(&held.a, &held.b);
+                let [older, newer] = self.inputs(&plant, set_point)?;
+                let below = |b: DMatrix<f64>| b.insert_row(n, 0.0);
                 let left = DMatrix::identity(n + 1, n + 1) - gain * self.selection(n + 1);
                 Ok(Tangent {
                     carry: &left * all,
-                    input: left * input,
+                    older: &left * below(older),
+                    newer: left * below(newer),
                     measured: gain.clone(),
                     estimate: DMatrix::identity(n + 1, n + 1),
                 })
@@ -329,11 +417,13 @@ impl Observer {
                 let size = chains + m + 1;
                 let mut tangent = Tangent {
                     carry: DMatrix::zeros(size, size),
-                    input: DMatrix::zeros(size, 1),
+                    older: DMatrix::zeros(size, 1),
+                    newer: DMatrix::zeros(size, 1),
                     measured: DMatrix::zeros(size, m),
                     estimate: DMatrix::zeros(n + 1, size),
                 };
                 let below: f64 = coordinates.iter().map(|c| c.weight(&self.plant, &plant.b)).sum();
+                let share_older = self.late.part / self.dt;
                 let mut first = 0;
                 for (coordinate, step) in coordinates.iter().zip(&steps) {
                     let at = self.measured.iter().position(|i| *i == step.first).unwrap_or(0);
@@ -344,7 +434,8 @@ impl Observer {
                         }
                         tangent.carry[(first + i, chains + at)] = step.before[i];
                         tangent.measured[(first + i, at)] = step.now[i];
-                        tangent.input[(first + i, 0)] = step.input[i];
+                        tangent.older[(first + i, 0)] = share_older * step.input[i];
+                        tangent.newer[(first + i, 0)] = (1.0 - share_older) * step.input[i];
                     }
                     for i in 0..order {
                         tangent.estimate[(step.first + i, first + i)] = 1.0;
@@ -372,10 +463,43 @@ impl Observer {
                 for i in 0..m {
                     tangent.measured[(chains + i, i)] = 1.0;
                 }
-                tangent.input[(size - 1, 0)] = 1.0;
+                tangent.older[(size - 1, 0)] = share_older;
+                tangent.newer[(size - 1, 0)] = 1.0 - share_older;
                 Ok(tangent)
             }
         }
+    }
+
+    /// Φ and Γ of a time with the command held.
+    fn held(&self, plant: &Linear, time: f64, set_point: f64) -> Result<Linear, ControlError> {
+        stability::held(plant, time, self.plant.sizes(), self.plant.input_size())
+            .ok_or(ControlError::NoPoles { set_point })
+    }
+
+    /// What the commands do that act over one sample, first the older one, then the newer: Γ₁, Γ₀.
+    pub(crate) fn inputs(&self, plant: &Linear, set_point: f64) -> Result<[DMatrix<f64>; 2], ControlError> {
+        let first = self.held(plant, self.late.part, set_point)?;
+        let rest = self.held(plant, self.dt - self.late.part, set_point)?;
+        Ok([&rest.a * first.b, rest.b])
+    }
+
+    /// x̂ over the delay: what the estimate, d̂ and the last commands do, the latest first.
+    pub(crate) fn prediction(
+        &self,
+        plant: &Linear,
+        set_point: f64,
+    ) -> Result<(DMatrix<f64>, DMatrix<f64>, Vec<DMatrix<f64>>), ControlError> {
+        let whole = self.held(plant, self.dt, set_point)?;
+        let part = self.held(plant, self.late.part, set_point)?;
+        let mut power = DMatrix::identity(self.plant.order(), self.plant.order());
+        let mut commands = Vec::with_capacity(self.late.samples + 1);
+        for _ in 0..self.late.samples {
+            commands.push(&power * &whole.b);
+            power = &power * &whole.a;
+        }
+        commands.push(&power * part.b);
+        let disturbance = commands.iter().fold(DMatrix::zeros(self.plant.order(), 1), |sum, c| sum + c);
+        Ok((power * part.a, disturbance, commands))
     }
 
     /// C: which of `columns` states are measured.
@@ -415,16 +539,15 @@ impl Coordinate {
     }
 }
 
-/// (x, d): x⁺ = Φ x + Γ (u + d), d⁺ = d.
-fn extended(a: &DMatrix<f64>, b: &DMatrix<f64>) -> (DMatrix<f64>, DMatrix<f64>) {
+/// (x, d): x⁺ = Φ x + Γ d, d⁺ = d.
+fn extended(a: &DMatrix<f64>, b: &DMatrix<f64>) -> DMatrix<f64> {
     let n = a.nrows();
-    let all = DMatrix::from_fn(n + 1, n + 1, |i, j| match (i == n, j == n) {
+    DMatrix::from_fn(n + 1, n + 1, |i, j| match (i == n, j == n) {
         (false, false) => a[(i, j)],
         (false, true) => b[i],
         (true, false) => 0.0,
         (true, true) => 1.0,
-    });
-    (all, DMatrix::from_fn(n + 1, 1, |i, _| if i == n { 0.0 } else { b[i] }))
+    })
 }
 
 fn kalman(
@@ -446,7 +569,7 @@ fn kalman(
     let tangent = plant.frictionless_tangent(&at.state, at.input);
     let held = stability::held(&tangent, dt, plant.sizes(), plant.input_size())
         .ok_or(ControlError::NoPoles { set_point: 0.0 })?;
-    let (all, _) = extended(&held.a, &held.b);
+    let all = extended(&held.a, &held.b);
     // In units of the sizes and of the sensors' noise.
     let size = |i: usize| plant.sizes().get(i).copied().unwrap_or_else(|| plant.input_size());
     let deviations: Vec<f64> = sensors.iter().map(Sensor::deviation).collect();
@@ -471,12 +594,7 @@ fn kalman(
         .ok_or(ControlError::NoPoles { set_point: 0.0 })?
         .solve(&(read.transpose() * &predicted));
     let gain = DMatrix::from_fn(n + 1, measured.len(), |i, k| weights[(k, i)] * size(i) / deviations[k]);
-    let fastest = stability::poles(&tangent.a, plant.sizes())
-        .ok_or(ControlError::NoPoles { set_point: 0.0 })?
-        .iter()
-        .fold(0.0f64, |fastest, p| fastest.max(p.magnitude()));
-    let substeps = ((fastest * dt / LONGEST).ceil() as usize).clamp(1, MOST_SUBSTEPS);
-    Ok(Kind::Kalman { gain, substeps })
+    Ok(Kind::Kalman { gain })
 }
 
 /// A chain for each measured coordinate; together they must have every state.

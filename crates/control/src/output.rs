@@ -49,6 +49,10 @@ pub struct OutputCheck {
 /// parameters leave no error where the loop comes to rest. The observer is given the command as it is after the limits,
 /// so that nothing winds up.
 ///
+/// Where the command acts late ([`PlantOptions::predict_input_delay`](crate::PlantOptions)), x̂ is predicted over the delay by the
+/// commands that were given, and the law acts on the state that its command will meet (O. J. M. Smith, *Chem. Eng.
+/// Prog.* 53, 1957; A. Z. Manitius and A. W. Olbrot, IEEE Trans. Autom. Control 24(4), 1979).
+///
 /// ```
 /// use greybox_control::{
 ///     ClosedLoop, DesignOptions, Feedback, LoopOptions, Method, ObserverMethod, OutputFeedback, OutputOptions, Plant,
@@ -247,7 +251,7 @@ impl OutputFeedback {
         let u = memory.command;
         let behind = if u.is_finite() { u - u.clamp(-self.dead_zone, self.dead_zone) } else { 0.0 };
         self.observer.update(&mut memory.observer, y, behind);
-        let mut at = memory.observer.estimate.clone();
+        let mut at = self.observer.ahead(&memory.observer);
         at.push(r);
         let mut u = [f64::NAN];
         if at.iter().all(|v| v.is_finite()) {
@@ -272,23 +276,61 @@ impl OutputFeedback {
         let observer = self.observer.tangent(at, set_point)?;
         let n = plant.order();
         let gain = controller.frictionless_gain(&at.state, set_point);
-        // u = −H c, of x̂ and d̂.
-        let taken_off = f64::from(u8::from(self.integral));
-        let read = DMatrix::from_fn(1, n + 1, |_, j| if j < n { -gain[j] } else { taken_off });
-        let h = read * &observer.estimate;
+        // x, the commands that the plant was given, the observer's memory, the commands that the law gave; u = c · all of it,
+        // and v is what the plant is given.
+        let past = self.observer.late().samples + 1;
         let size = observer.carry.nrows();
+        let (given, own, told) = (n, n + past, n + past + size);
+        let all = told + past;
+        let [older, newer] = self.observer.inputs(&tangent, set_point)?;
+        let (ahead, of_disturbance, of_commands) = self.observer.prediction(&tangent, set_point)?;
+        let gain = DMatrix::from_row_slice(1, n, &gain);
+        let taken_off = f64::from(u8::from(self.integral));
+        let of_estimate = {
+            let state = &gain * ahead;
+            let disturbance = (&gain * of_disturbance)[0] - taken_off;
+            DMatrix::from_fn(1, n + 1, |_, j| if j < n { state[j] } else { disturbance }) * &observer.estimate
+        };
+        let mut c = DMatrix::zeros(1, all);
+        c.view_mut((0, own), (1, size)).copy_from(&of_estimate);
+        for (j, command) in of_commands.iter().enumerate() {
+            c[(0, told + j)] = (&gain * command)[0];
+        }
+        let (mut a, mut b) = (DMatrix::zeros(all, all), DMatrix::zeros(all, 1));
+        a.view_mut((0, 0), (n, n)).copy_from(&held.a);
+        a.view_mut((0, given + past - 1), (n, 1)).copy_from(&older);
+        a.view_mut((own, own), (size, size)).copy_from(&observer.carry);
+        a.view_mut((own, told + past - 1), (size, 1)).copy_from(&observer.older);
+        let by_law = |a: &mut DMatrix<f64>, row: usize, column: &DMatrix<f64>| {
+            let mut rows = a.view_mut((row, 0), (column.nrows(), all));
+            rows += column * &c;
+        };
+        match past {
+            1 => {
+                b.view_mut((0, 0), (n, 1)).copy_from(&newer);
+                by_law(&mut a, own, &observer.newer);
+            }
+            _ => {
+                let mut column = a.view_mut((0, given + past - 2), (n, 1));
+                column += &newer;
+                let mut column = a.view_mut((own, told + past - 2), (size, 1));
+                column += &observer.newer;
+            }
+        }
+        b[(given, 0)] = 1.0;
+        by_law(&mut a, told, &DMatrix::identity(1, 1));
+        for j in 1..past {
+            a[(given + j, given + j - 1)] = 1.0;
+            a[(told + j, told + j - 1)] = 1.0;
+        }
+        // The measurements are those of the next state.
         let measures = &observer.measured * self.observer.selection(n);
-        let own = &observer.carry - &observer.input * &h;
-        let (below_a, below_b) = (&measures * &held.a, &measures * &held.b);
-        let a = DMatrix::from_fn(n + size, n + size, |i, j| match (i < n, j < n) {
-            (true, true) => held.a[(i, j)],
-            (true, false) => 0.0,
-            (false, true) => below_a[(i - n, j)],
-            (false, false) => own[(i - n, j - n)],
-        });
-        let b = DMatrix::from_fn(n + size, 1, |i, _| if i < n { held.b[i] } else { below_b[i - n] });
-        let c = DMatrix::from_fn(1, n + size, |_, j| if j < n { 0.0 } else { -h[j - n] });
-        let sizes = vec![1.0; n + size];
+        let (next_a, next_b) = (a.rows(0, n).into_owned(), b.rows(0, n).into_owned());
+        let mut rows = a.view_mut((own, 0), (size, all));
+        rows += &measures * next_a;
+        let mut rows = b.view_mut((own, 0), (size, 1));
+        rows += &measures * next_b;
+        let sizes = vec![1.0; all];
         let poles = stability::poles(&(&a + &b * &c), &sizes).ok_or_else(none)?;
         let spectral_radius = largest(&poles);
         if spectral_radius.is_nan() || spectral_radius >= 1.0 {
@@ -313,6 +355,10 @@ impl Controller {
     pub fn margins(&self) -> Vec<Option<Margins>> {
         let plant = self.plant();
         let of = |check: &crate::check::Check| {
+            // A law of the state alone is none where the command is late.
+            if plant.input_delay() > 0.0 {
+                return None;
+            }
             let at = &check.equilibrium;
             let tangent = plant.frictionless_tangent(&at.state, at.input);
             let held = stability::held(&tangent, self.dt(), plant.sizes(), plant.input_size())?;

@@ -29,6 +29,9 @@ pub struct PlantOptions {
     /// Design as if `deadzone(d, gap)` of a state were d: within a gap nothing pulls, so that the tangent there cannot
     /// be controlled. [`Plant::closed_gaps`] tells which.
     pub close_gaps: bool,
+    /// Design as if `delay(u, tau)` of the command were u, for a law whose observer predicts over the delay
+    /// ([`OutputFeedback`](crate::OutputFeedback)); [`Plant::input_delay`] tells how long it is.
+    pub predict_input_delay: bool,
     /// Drop additive terms with the time (disturbances); [`Plant::dropped`] tells which.
     pub ignore_time_terms: bool,
 }
@@ -42,6 +45,7 @@ impl Default for PlantOptions {
             held: Vec::new(),
             frozen: Vec::new(),
             close_gaps: false,
+            predict_input_delay: false,
             ignore_time_terms: false,
         }
     }
@@ -106,6 +110,7 @@ pub struct Plant {
     pub(crate) dead_zone: f64,
     pub(crate) dropped: Vec<Dropped>,
     pub(crate) closed_gaps: Vec<Dropped>,
+    pub(crate) input_delay: f64,
     pub(crate) open_gaps: bool,
     pub(crate) sizes: Vec<f64>,
     pub(crate) input_size: f64,
@@ -188,6 +193,12 @@ impl Plant {
     #[must_use]
     pub fn dead_zone(&self) -> f64 {
         self.dead_zone
+    }
+
+    /// How late the command acts, s, where [`PlantOptions::predict_input_delay`] took the delay out of f and g.
+    #[must_use]
+    pub fn input_delay(&self) -> f64 {
+        self.input_delay
     }
 
     /// What was left out because it depends on the time.

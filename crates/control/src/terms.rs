@@ -51,6 +51,24 @@ pub(crate) fn without_gaps(e: &Expr, moves: &dyn Fn(&Expr) -> bool, closed: &mut
     })
 }
 
+/// `delay(u, tau)` of the input by the input; how late it is goes to `late`, one entry for each place.
+pub(crate) fn without_input_delay(
+    e: &Expr,
+    input: &str,
+    value: &dyn Fn(&Expr) -> Option<f64>,
+    late: &mut Vec<f64>,
+) -> Expr {
+    e.map(&mut |e| {
+        let Expr::Call(Func::Delay, args) = &e else { return e };
+        let (Expr::Var { name, primes: 0 }, Some(tau)) = (&args[0], value(&args[1])) else { return e };
+        if **name != *input || tau.is_nan() || tau < 0.0 {
+            return e;
+        }
+        late.push(tau);
+        args[0].clone()
+    })
+}
+
 /// What an actuator makes of the input.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub(crate) struct Range {

@@ -208,3 +208,80 @@ fn what_cannot_be_observed_is_refused() {
         assert!(matches!(make(method, Vec::new()), Err(ControlError::Eso { .. })), "{bandwidth}");
     }
 }
+
+/// A command that acts 25 ms late loses the loop of a law that does not know it. An observer that predicts over the delay
+/// keeps the loop that was designed, shifted by the delay; its margins are those of the simulated loop.
+#[test]
+fn a_late_command_is_predicted_over() {
+    let late = |tau: f64| {
+        let mut model = arm(0.0);
+        model.parameters.push(greybox_model::model::Parameter {
+            name: "tau".into(),
+            value: tau,
+            ..model.parameters[0].clone()
+        });
+        let text = "J*theta'' + b*theta' + mgl*sin(theta)";
+        model.equations[0].lhs = greybox_model::parse(text).unwrap().expr;
+        model.equations[0].rhs = greybox_model::parse("kt*saturate(delay(v, tau), umax)").unwrap().expr;
+        model
+    };
+    let sizes = || vec![("theta".to_string(), 0.2), ("theta'".to_string(), 4.0)];
+    let options = PlantOptions {
+        sizes: sizes(),
+        input_size: 5.0,
+        predict_input_delay: true,
+        ..PlantOptions::default()
+    };
+    let set_points = DesignOptions::new("theta", &[-1.0, 1.0], 2e-3);
+    let prompt = law(&arm(0.0));
+    // At rest first: what a delayed command was before the start is what it is there.
+    let reference = Reference { set_points: vec![(0.0, 0.0), (0.2, 0.5), (3.2, -0.5)], duration: 6.2 };
+    let fine = Sensor { noise: 1e-5, resolution: 0.0 };
+    let wanted = run(&arm(0.0), &prompt, &LoopOptions::default(), &reference);
+    // A part of a sample, whole samples, both.
+    for (tau, samples) in [(0.0013, 0), (0.024, 12), (0.025, 12)] {
+        let model = late(tau);
+        let plant = Plant::of(&model, "v", &options).unwrap();
+        assert_eq!(plant.input_delay(), tau);
+        let law = design(&plant, &Method::Lqr, &set_points).unwrap();
+        assert_eq!(law.gains(), prompt.gains());
+        if samples > 0 {
+            let lost = run(&model, &prompt, &with(&prompt, KALMAN, fine), &reference);
+            assert!(lost.metrics.iter().skip(1).any(|m| m.settling.is_none()), "{tau}");
+        }
+        for (method, bound) in [(KALMAN, 4e-4), (ESO, 0.12)] {
+            let mut loop_options = with(&law, method, fine);
+            let Feedback::Output(output) = &loop_options.feedback else { unreachable!() };
+            assert_eq!(output.observer().late().samples, samples);
+            let margin = output.checks().iter().map(|c| c.margins.delay).fold(f64::INFINITY, f64::min);
+            let seen = run(&model, &law, &loop_options, &reference);
+            let shift = (tau / 2e-3).round() as usize;
+            let far = (shift..seen.t.len())
+                // (A set point that is just given acts in one sample and not in the other.)
+                .map(|k| (seen.x[0][k] - wanted.x[0][k - shift]).abs())
+                .fold(0.0, f64::max);
+            println!("{tau} {method:?}: {far:.1e}, margin {margin:.4}");
+            if tau != 0.025 && tau != 0.0013 {
+                assert!(far < bound, "{tau} {method:?}: {far}");
+            }
+            assert!(seen.metrics.iter().skip(1).all(|m| m.settling.is_some()), "{tau} {method:?}");
+            let mut end = |delay: f64| {
+                loop_options.delay = delay;
+                let run = run(&model, &law, &loop_options, &Reference::step(0.02, 6.0));
+                if run.diverged.is_some() { f64::INFINITY } else { run.metrics[0].peak_to_peak }
+            };
+            let (below, beyond) = (end(0.85 * margin), end(1.2 * margin));
+            println!("  {below:.1e} {beyond:.1e}");
+            assert!(beyond > 20.0 * below, "{tau} {method:?}: {below} {beyond}");
+        }
+    }
+    let twice = late(0.01);
+    let mut other = twice.clone();
+    other.equations[0].rhs = greybox_model::parse("kt*delay(v, tau) + 0.1*kt*v").unwrap().expr;
+    assert!(matches!(Plant::of(&other, "v", &options), Err(ControlError::SeveralDelays { .. })));
+    let long = Plant::of(&late(0.5), "v", &options).unwrap();
+    let law = design(&long, &Method::Lqr, &set_points).unwrap();
+    let made =
+        OutputFeedback::new(&law, &OutputOptions { method: KALMAN, sensors: Vec::new(), integral: true });
+    assert!(matches!(made, Err(ControlError::LongDelay { samples: 250, .. })));
+}

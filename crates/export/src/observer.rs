@@ -22,6 +22,10 @@ pub struct ObserverCode {
     pub measured: Vec<usize>,
     /// Half width of the actuator's dead zone.
     pub dead_zone: f64,
+    /// Classical Runge–Kutta steps of a prediction over one sample, at least one.
+    pub substeps: usize,
+    /// How late the command acts: whole samples, and a part of one, s.
+    pub late: (usize, f64),
     /// The observer's equations.
     pub form: ObserverForm,
 }
@@ -29,13 +33,10 @@ pub struct ObserverCode {
 /// The equations of an observer.
 #[derive(Debug, Clone, PartialEq)]
 pub enum ObserverForm {
-    /// Prediction by the machine's equations, `substeps` classical Runge–Kutta steps, then the correction
-    /// (x̂, d̂) + `gain` (y − C x̂).
+    /// Prediction by the machine's equations, then the correction (x̂, d̂) + `gain` (y − C x̂).
     Kalman {
         /// (n + 1) rows, one entry for each measurement.
         gain: Vec<Vec<f64>>,
-        /// At least one.
-        substeps: usize,
     },
     /// Chains z⁺ = A z + b₀ y + b₁ y⁺ + g u; the last entry of each, with b u, is what its highest derivative is.
     Chains(Vec<ChainForm>),
@@ -95,8 +96,24 @@ impl ObserverCode {
         (chains, starts, at)
     }
 
+    /// Time and steps of the predictions: over the older and the newer command of a sample, and over a whole one.
+    fn spans(&self) -> [(f64, usize); 3] {
+        let span =
+            |time: f64| (time, ((time / self.dt * self.substeps as f64 - 1e-9).ceil() as usize).max(1));
+        [span(self.late.1), span(self.dt - self.late.1), span(self.dt)]
+    }
+
+    /// Whether the code predicts: a Kalman filter from sample to sample, any observer over the delay of the command.
+    fn predicts(&self) -> bool {
+        matches!(self.form, ObserverForm::Kalman { .. }) || self.is_late()
+    }
+
+    fn is_late(&self) -> bool {
+        self.late.0 > 0 || self.late.1 > 0.0
+    }
+
     fn c(&self, out: &mut String) {
-        let (n, m) = (self.states(), self.measured.len());
+        let (n, m, q) = (self.states(), self.measured.len(), self.late.0);
         let (chains, starts, remembered) = self.chains();
         let (law, rate) = (&self.law.name, &self.rate.name);
         for line in &self.summary {
@@ -105,9 +122,10 @@ impl ObserverCode {
         let _ = write!(
             out,
             "\nvoid {law}(const double state[{n}], const double disturbance[1], const double set_point[1], double out[1]);\n\n\
-             typedef struct {{\n    double estimate[{}]; /* the states, then the disturbance */\n    \
-             double command;\n    int started;\n",
-            n + 1
+             typedef struct {{\n    double estimate[{}]; /* the states, then the disturbance */\n    double command;\n    \
+             double past[{}]; /* behind the dead zone, the latest first */\n    int started;\n",
+            n + 1,
+            q + 2,
         );
         if !chains.is_empty() {
             let _ = write!(
@@ -121,9 +139,10 @@ impl ObserverCode {
             "}} observer_memory;\n\nvoid observer_start(observer_memory *memory);\n\
              double observer_step(observer_memory *memory, const double measured[{m}], const double set_point[1]);\n\n\
              /* Before the first sample. */\nvoid observer_start(observer_memory *memory)\n{{\n    int i;\n    \
-             for (i = 0; i < {}; i++) memory->estimate[i] = 0.0;\n    \
+             for (i = 0; i < {}; i++) memory->estimate[i] = 0.0;\n    for (i = 0; i < {}; i++) memory->past[i] = 0.0;\n    \
              memory->command = 0.0;\n    memory->started = 0;\n",
-            n + 1
+            n + 1,
+            q + 2,
         );
         if !chains.is_empty() {
             let _ = write!(
@@ -133,48 +152,70 @@ impl ObserverCode {
                 k = chains.len()
             );
         }
+        out.push_str("}\n\n");
+        if self.predicts() {
+            let _ = write!(
+                out,
+                "/* The states a time later under a command: classical Runge-Kutta steps. */\n\
+                 static void predict(double x[{}], double command, double time, int steps)\n{{\n    \
+                 const double h = time / steps;\n    double k1[{n}], k2[{n}], k3[{n}], k4[{n}], at[{n}], input[1];\n    int i, j;\n    \
+                 input[0] = command + x[{n}];\n    for (j = 0; j < steps; j++) {{\n        {rate}(x, input, k1);\n        \
+                 for (i = 0; i < {n}; i++) at[i] = x[i] + 0.5 * h * k1[i];\n        {rate}(at, input, k2);\n        \
+                 for (i = 0; i < {n}; i++) at[i] = x[i] + 0.5 * h * k2[i];\n        {rate}(at, input, k3);\n        \
+                 for (i = 0; i < {n}; i++) at[i] = x[i] + h * k3[i];\n        {rate}(at, input, k4);\n        \
+                 for (i = 0; i < {n}; i++)\n            \
+                 x[i] = x[i] + h / 6.0 * (k1[i] + 2.0 * k2[i] + 2.0 * k3[i] + k4[i]);\n    }}\n}}\n\n",
+                n + 1
+            );
+        }
         let places = list(self.measured.iter().map(usize::to_string));
         let _ = write!(
             out,
-            "}}\n\n/* Once a sample, every {} s: the command from the measurements and the set point. A measurement that is not a\n   \
+            "/* Once a sample, every {} s: the command from the measurements and the set point. A measurement that is not a\n   \
              number is left out. */\n\
              double observer_step(observer_memory *memory, const double measured[{m}], const double set_point[1])\n{{\n    \
-             static const int place[{m}] = {{{places}}};\n    double *x = memory->estimate;\n    \
-             const double u = memory->command;\n    const double gap = {};\n    \
-             const double acting = u > gap ? u - gap : u < -gap ? u + gap : 0.0;\n    double out[1];\n    int i;\n    \
+             static const int place[{m}] = {{{places}}};\n    double *x = memory->estimate, *past = memory->past;\n    \
+             const double u = memory->command;\n    const double gap = {};\n    double out[1];\n    int i;\n    \
+             for (i = {}; i > 0; i--) past[i] = past[i - 1];\n    \
+             past[0] = u > gap ? u - gap : u < -gap ? u + gap : 0.0;\n    \
              if (!memory->started) {{\n        for (i = 0; i < {m}; i++)\n            \
              x[place[i]] = measured[i] - measured[i] == 0.0 ? measured[i] : 0.0;\n    }}",
             number(self.dt),
             number(self.dead_zone),
+            q + 1,
         );
+        let [older, newer, whole] = self.spans();
+        let call = |x: &str, past: &str, (time, steps): (f64, usize)| {
+            format!("predict({x}, past[{past}], {}, {steps});\n", number(time))
+        };
         match &self.form {
-            ObserverForm::Kalman { gain, substeps } => {
+            ObserverForm::Kalman { gain } => {
                 let rows =
                     list(gain.iter().map(|row| format!("{{{}}}", list(row.iter().map(|v| number(*v))))));
                 let _ = write!(
                     out,
-                    " else {{\n        static const double gain[{}][{m}] = {{{rows}}};\n        \
-                     const double h = {};\n        double k1[{n}], k2[{n}], k3[{n}], k4[{n}], at[{n}], innovation[{m}];\n        \
-                     double input[1];\n        int j;\n        input[0] = acting + x[{n}];\n        \
-                     for (j = 0; j < {substeps}; j++) {{\n            {rate}(x, input, k1);\n            \
-                     for (i = 0; i < {n}; i++) at[i] = x[i] + 0.5 * h * k1[i];\n            {rate}(at, input, k2);\n            \
-                     for (i = 0; i < {n}; i++) at[i] = x[i] + 0.5 * h * k2[i];\n            {rate}(at, input, k3);\n            \
-                     for (i = 0; i < {n}; i++) at[i] = x[i] + h * k3[i];\n            {rate}(at, input, k4);\n            \
-                     for (i = 0; i < {n}; i++)\n                \
-                     x[i] = x[i] + h / 6.0 * (k1[i] + 2.0 * k2[i] + 2.0 * k3[i] + k4[i]);\n        }}\n        \
-                     for (i = 0; i < {m}; i++)\n            \
+                    " else {{\n        static const double gain[{}][{m}] = {{{rows}}};\n        double innovation[{m}];\n        int j;\n",
+                    n + 1,
+                );
+                if older.0 > 0.0 {
+                    let _ = write!(out, "        {}", call("x", &(q + 1).to_string(), older));
+                }
+                let _ = write!(
+                    out,
+                    "        {}        for (i = 0; i < {m}; i++)\n            \
                      innovation[i] = measured[i] - measured[i] == 0.0 ? measured[i] - x[place[i]] : 0.0;\n        \
                      for (i = 0; i < {}; i++)\n            \
                      for (j = 0; j < {m}; j++) x[i] += gain[i][j] * innovation[j];\n    }}\n",
-                    n + 1,
-                    number(self.dt / *substeps as f64),
+                    call("x", &q.to_string(), newer),
                     n + 1,
                 );
             }
             ObserverForm::Chains(chains) => {
                 let _ = write!(
                     out,
-                    "\n    {{\n        double lumped, above = 0.0, below = 0.0, rest[{n}], moved[{n}], input[1];\n"
+                    "\n    {{\n        const double acting = {};\n        \
+                     double lumped, above = 0.0, below = 0.0, rest[{n}], moved[{n}], input[1];\n",
+                    self.acting("past")
                 );
                 for (k, (chain, start)) in chains.iter().zip(&starts).enumerate() {
                     self.c_chain(out, k, chain, *start);
@@ -200,11 +241,36 @@ impl ObserverCode {
                 let _ = write!(out, "        x[{n}] = below > 0.0 ? above / below : 0.0;\n    }}\n");
             }
         }
-        let _ = write!(
-            out,
-            "    memory->started = 1;\n    {law}(x, x + {n}, set_point, out);\n    \
-             memory->command = out[0];\n    return out[0];\n}}\n"
-        );
+        out.push_str("    memory->started = 1;\n");
+        if self.is_late() {
+            let _ = write!(
+                out,
+                "    /* The law acts on the states that its command will meet. */\n    {{\n        double ahead[{}];\n        \
+                 for (i = 0; i < {}; i++) ahead[i] = x[i];\n",
+                n + 1,
+                n + 1
+            );
+            if older.0 > 0.0 {
+                let _ = write!(out, "        {}", call("ahead", &q.to_string(), older));
+            }
+            if q > 0 {
+                let _ = write!(out, "        for (i = {q}; i > 0; i--) {}", call("ahead", "i - 1", whole));
+            }
+            let _ = write!(out, "        {law}(ahead, ahead + {n}, set_point, out);\n    }}\n");
+        } else {
+            let _ = writeln!(out, "    {law}(x, x + {n}, set_point, out);");
+        }
+        out.push_str("    memory->command = out[0];\n    return out[0];\n}\n");
+    }
+
+    /// The mean command since the last sample.
+    fn acting(&self, past: &str) -> String {
+        let (q, part) = self.late;
+        if part == 0.0 {
+            return format!("{past}[{q}]");
+        }
+        let share = part / self.dt;
+        format!("{} * {past}[{}] + (1.0 - {}) * {past}[{q}]", number(share), q + 1, number(share))
     }
 
     fn c_chain(&self, out: &mut String, k: usize, chain: &ChainForm, start: usize) {
@@ -236,7 +302,7 @@ impl ObserverCode {
     }
 
     fn rust(&self, out: &mut String) {
-        let (n, m) = (self.states(), self.measured.len());
+        let (n, m, q) = (self.states(), self.measured.len(), self.late.0);
         let (chains, starts, remembered) = self.chains();
         let rate = &self.rate.name;
         for line in &self.summary {
@@ -244,12 +310,14 @@ impl ObserverCode {
         }
         let mut fields = format!(
             "    /// The states, then the disturbance.\n    pub estimate: [f64; {}],\n    command: f64,\n    \
-             started: bool,\n",
-            n + 1
+             /// Behind the dead zone, the latest first.\n    past: [f64; {}],\n    started: bool,\n",
+            n + 1,
+            q + 2
         );
         let mut zeros = format!(
-            "            estimate: [0.0; {}],\n            command: 0.0,\n            started: false,\n",
-            n + 1
+            "            estimate: [0.0; {}],\n            command: 0.0,\n            past: [0.0; {}],\n            started: false,\n",
+            n + 1,
+            q + 2
         );
         if !chains.is_empty() {
             let k = chains.len();
@@ -262,10 +330,27 @@ impl ObserverCode {
                 "            chain: [0.0; {remembered}],\n            last: [0.0; {k}],\n            begun: [false; {k}],\n"
             );
         }
+        out.push('\n');
+        if self.predicts() {
+            let _ = write!(
+                out,
+                "/// The states a time later under a command: classical Runge-Kutta steps.\n#[allow(clippy::all)]\n\
+                 fn predict(estimate: &mut [f64; {}], command: f64, time: f64, steps: u32) {{\n    \
+                 let h = time / f64::from(steps);\n    let input = [command + estimate[{n}]];\n    \
+                 let mut x = [0.0; {n}];\n    x.copy_from_slice(&estimate[..{n}]);\n    for _ in 0..steps {{\n        \
+                 let k1 = {rate}(&x, &input);\n        \
+                 let k2 = {rate}(&core::array::from_fn(|i| x[i] + 0.5 * h * k1[i]), &input);\n        \
+                 let k3 = {rate}(&core::array::from_fn(|i| x[i] + 0.5 * h * k2[i]), &input);\n        \
+                 let k4 = {rate}(&core::array::from_fn(|i| x[i] + h * k3[i]), &input);\n        for i in 0..{n} {{\n            \
+                 x[i] += h / 6.0 * (k1[i] + 2.0 * k2[i] + 2.0 * k3[i] + k4[i]);\n        }}\n    }}\n    \
+                 estimate[..{n}].copy_from_slice(&x);\n}}\n\n",
+                n + 1
+            );
+        }
         let places = list(self.measured.iter().map(usize::to_string));
         let _ = write!(
             out,
-            "\n/// What the observer remembers between two samples.\n#[derive(Clone, Copy, Debug, PartialEq)]\n\
+            "/// What the observer remembers between two samples.\n#[derive(Clone, Copy, Debug, PartialEq)]\n\
              pub struct Observer {{\n{fields}}}\n\n\
              #[allow(clippy::all)]\nimpl Observer {{\n    /// Before the first sample.\n    #[must_use]\n    \
              pub const fn new() -> Observer {{\n        Observer {{\n{zeros}        }}\n    }}\n\n    \
@@ -273,48 +358,47 @@ impl ObserverCode {
              /// number is left out. `law` is `{}`.\n    pub fn step(\n        &mut self,\n        measured: &[f64; {m}],\n        \
              set_point: &[f64; 1],\n        law: impl Fn(&[f64; {n}], &[f64; 1], &[f64; 1]) -> [f64; 1],\n    ) -> f64 {{\n        \
              const PLACE: [usize; {m}] = [{places}];\n        const GAP: f64 = {};\n        let u = self.command;\n        \
-             let acting = if u > GAP {{ u - GAP }} else if u < -GAP {{ u + GAP }} else {{ 0.0 }};\n        \
+             self.past.copy_within(0..{}, 1);\n        \
+             self.past[0] = if u > GAP {{ u - GAP }} else if u < -GAP {{ u + GAP }} else {{ 0.0 }};\n        \
              if !self.started {{\n            for i in 0..{m} {{\n                \
              self.estimate[PLACE[i]] = if measured[i].is_finite() {{ measured[i] }} else {{ 0.0 }};\n            }}\n        }}",
             number(self.dt),
             self.law.name,
             number(self.dead_zone),
+            q + 1,
         );
-        let states = format!("let mut x = [0.0; {n}];\n{{0}}x.copy_from_slice(&self.estimate[..{n}]);\n");
+        let [older, newer, whole] = self.spans();
+        let call = |x: &str, past: &str, (time, steps): (f64, usize)| {
+            format!("predict(&mut {x}, self.past[{past}], {}, {steps});\n", number(time))
+        };
         match &self.form {
-            ObserverForm::Kalman { gain, substeps } => {
+            ObserverForm::Kalman { gain } => {
                 let rows = list(gain.iter().map(|row| format!("[{}]", list(row.iter().map(|v| number(*v))))));
+                let _ =
+                    writeln!(out, " else {{\n            const GAIN: [[f64; {m}]; {}] = [{rows}];", n + 1);
+                if older.0 > 0.0 {
+                    let _ = write!(out, "            {}", call("self.estimate", &(q + 1).to_string(), older));
+                }
                 let _ = write!(
                     out,
-                    " else {{\n            const GAIN: [[f64; {m}]; {}] = [{rows}];\n            const H: f64 = {};\n            \
-                     let input = [acting + self.estimate[{n}]];\n            {}            \
-                     for _ in 0..{substeps} {{\n                let k1 = {rate}(&x, &input);\n                \
-                     let k2 = {rate}(&core::array::from_fn(|i| x[i] + 0.5 * H * k1[i]), &input);\n                \
-                     let k3 = {rate}(&core::array::from_fn(|i| x[i] + 0.5 * H * k2[i]), &input);\n                \
-                     let k4 = {rate}(&core::array::from_fn(|i| x[i] + H * k3[i]), &input);\n                \
-                     for i in 0..{n} {{\n                    \
-                     x[i] += H / 6.0 * (k1[i] + 2.0 * k2[i] + 2.0 * k3[i] + k4[i]);\n                }}\n            }}\n            \
-                     self.estimate[..{n}].copy_from_slice(&x);\n            \
-                     let innovation: [f64; {m}] = core::array::from_fn(|i| {{\n                \
-                     if measured[i].is_finite() {{ measured[i] - x[PLACE[i]] }} else {{ 0.0 }}\n            }});\n            \
+                    "            {}            let innovation: [f64; {m}] = core::array::from_fn(|i| {{\n                \
+                     if measured[i].is_finite() {{ measured[i] - self.estimate[PLACE[i]] }} else {{ 0.0 }}\n            }});\n            \
                      for i in 0..{} {{\n                for j in 0..{m} {{\n                    \
                      self.estimate[i] += GAIN[i][j] * innovation[j];\n                }}\n            }}\n        }}\n",
-                    n + 1,
-                    number(self.dt / *substeps as f64),
-                    states.replace("{0}", "            "),
+                    call("self.estimate", &q.to_string(), newer),
                     n + 1,
                 );
             }
             ObserverForm::Chains(chains) => {
-                out.push('\n');
+                let _ = write!(out, "\n        let acting = {};\n", self.acting("self.past"));
                 for (k, (chain, start)) in chains.iter().zip(&starts).enumerate() {
                     self.rust_chain(out, k, chain, *start);
                 }
                 let _ = write!(
                     out,
-                    "        {}        let rest = {rate}(&x, &[acting]);\n        \
-                     let moved = {rate}(&x, &[acting + 1.0]);\n        let (mut above, mut below) = (0.0, 0.0);\n",
-                    states.replace("{0}", "        "),
+                    "        let mut x = [0.0; {n}];\n        x.copy_from_slice(&self.estimate[..{n}]);\n        \
+                     let rest = {rate}(&x, &[acting]);\n        let moved = {rate}(&x, &[acting + 1.0]);\n        \
+                     let (mut above, mut below) = (0.0, 0.0);\n",
                 );
                 for (chain, start) in chains.iter().zip(&starts) {
                     let order = chain.a.len() - 1;
@@ -335,12 +419,29 @@ impl ObserverCode {
                 );
             }
         }
+        out.push_str("        self.started = true;\n");
+        if self.is_late() {
+            out.push_str(
+                "        // The law acts on the states that its command will meet.\n        let mut ahead = self.estimate;\n",
+            );
+            if older.0 > 0.0 {
+                let _ = write!(out, "        {}", call("ahead", &q.to_string(), older));
+            }
+            if q > 0 {
+                let _ = write!(
+                    out,
+                    "        for i in (0..{q}).rev() {{\n            {}        }}\n",
+                    call("ahead", "i", whole)
+                );
+            }
+        } else {
+            out.push_str("        let ahead = self.estimate;\n");
+        }
         let _ = write!(
             out,
-            "        self.started = true;\n        {}        \
-             self.command = law(&x, &[self.estimate[{n}]], set_point)[0];\n        self.command\n    }}\n}}\n\n\
+            "        let mut x = [0.0; {n}];\n        x.copy_from_slice(&ahead[..{n}]);\n        \
+             self.command = law(&x, &[ahead[{n}]], set_point)[0];\n        self.command\n    }}\n}}\n\n\
              impl Default for Observer {{\n    fn default() -> Self {{\n        Self::new()\n    }}\n}}\n",
-            states.replace("{0}", "        "),
         );
     }
 

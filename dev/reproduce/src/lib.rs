@@ -385,6 +385,7 @@ mod tests {
             only: vec!["table 2.2".into(), "Figure 2.1".into()],
             out: Some(out.path().into()),
             demo: None,
+            write_docs: false,
         };
         assert_eq!(run(&greybox_dev::root(), &arguments).unwrap(), Ending::Done);
         let json = std::fs::read_to_string(out.path().join("index.json")).unwrap();
@@ -397,7 +398,7 @@ mod tests {
         }
         let page = std::fs::read_to_string(out.path().join("index.html")).unwrap();
         assert!(page.contains("Table 2.2") && page.contains("<svg") && !page.contains("src="));
-        let wrong = Arguments { only: vec!["Table 7.7".into()], out: None, demo: None };
+        let wrong = Arguments { only: vec!["Table 7.7".into()], out: None, demo: None, write_docs: false };
         assert_eq!(run(&greybox_dev::root(), &wrong).unwrap(), Ending::Refused);
     }
 }

@@ -496,7 +496,7 @@ mod tests {
         let amplitude = 20f64.to_radians();
         for way in ways() {
             let law = law(&model, &way, amplitude).unwrap().unwrap();
-            let reached = Reached::of(&run(&law, amplitude).unwrap().unwrap(), amplitude);
+            let reached = Reached::of(&run(&RIG, &law, None, amplitude).unwrap().unwrap(), amplitude);
             assert!(reached.settling.is_infinite() && (1.0..2.5).contains(&reached.left), "{}", way.name);
             assert!(reached.largest <= LIMIT && reached.rms < 15.0, "{}", way.name);
         }

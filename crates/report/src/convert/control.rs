@@ -189,6 +189,12 @@ fn settings(
         }
         None => {}
     }
+    if plant.input_delay() > 0.0 {
+        out.push((
+            "Delay of the command predicted over",
+            format!("{} s", format::number(plant.input_delay())),
+        ));
+    }
     if plant.dead_zone() > 0.0 {
         out.push(("Dead zone made up for", of_input(plant.dead_zone())));
     }
