@@ -64,8 +64,8 @@ pub enum ControlError {
     /// A delay.
     #[error(
         "equation \"{equation}\": the plant remembers its past in `{expression}`, and a feedback of the state is no \
-         law for that: a delay of the command is predicted over by an observer (output feedback, `predict_input_delay`); leave any other \
-         out of the model for the design, and simulate the law on the model with it"
+         law for that: leave the delay out of the model for the design, and simulate the law on the model with it; an \
+         observer predicts over a delay of the command (output feedback, `predict_input_delay`)"
     )]
     Delay {
         /// Name of the equation.

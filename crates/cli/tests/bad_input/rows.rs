@@ -945,6 +945,20 @@ fn designs() -> Vec<Row> {
         all("an odd degree", "greybox control model.toml --method hjb --degree 3 --out out"),
         all("a pole that is unstable", "greybox control model.toml --method smc --lambda -10 --out out"),
         all("a set point at infinity", "greybox control model.toml --to inf --out out"),
+        all("an observer's number without an observer", "greybox control model.toml --noise x=1 --out out"),
+        all(
+            "a sensor of what is not measured",
+            "greybox control model.toml --feedback output --noise y=0.1 --out out",
+        ),
+        all(
+            "a disturbance of zero",
+            "greybox control model.toml --feedback output --disturbance 0 --out out",
+        ),
+        all(
+            "a bandwidth below zero",
+            "greybox control model.toml --feedback output --observer eso --bandwidth -3 --out out",
+        ),
+        all("a loop that is early", "greybox control model.toml --delay -0.1 --out out"),
         all("a report that is missing", "greybox control model.toml --report report.json --out out"),
     ]
 }
