@@ -1,11 +1,16 @@
 //! State and disturbance from the measured states.
 
-use greybox_eso::{Design, EsoError, Fal, Observer as Chain, Scheme};
+mod chains;
+mod tangent;
+
 use greybox_hjb::{Linear, dare};
 use nalgebra::{DMatrix, DVector};
 use rand_distr::{Distribution, StandardNormal};
 use rand_pcg::Pcg64Mcg;
 
+pub use self::chains::EsoStep;
+use self::chains::{AnyChain, Chains};
+pub(crate) use self::tangent::{Prediction, Tangent};
 use crate::equilibrium::Equilibrium;
 use crate::error::{ControlError, listed};
 use crate::plant::Plant;
@@ -118,80 +123,7 @@ enum Kind {
         /// L, (states and d) × measured.
         gain: DMatrix<f64>,
     },
-    Eso(Vec<Coordinate>),
-}
-
-/// A measured coordinate with its chain of derivatives.
-#[derive(Debug, Clone)]
-struct Coordinate {
-    /// Index of the first of its states; the others follow.
-    first: usize,
-    /// Number of its states.
-    order: usize,
-    /// Gain of the command in the highest derivative, at the design point.
-    input: f64,
-    chain: AnyChain,
-}
-
-/// Observers of the orders that occur.
-#[derive(Debug, Clone)]
-enum AnyChain {
-    Two(Chain<2>),
-    Three(Chain<3>),
-    Four(Chain<4>),
-}
-
-impl AnyChain {
-    fn new(order: usize, bandwidth: f64, dt: f64, input: f64) -> Result<Option<AnyChain>, EsoError> {
-        fn chain<const N: usize>(bandwidth: f64, dt: f64, input: f64) -> Result<Chain<N>, EsoError> {
-            let design = Design::from_bandwidth(bandwidth, [Fal::LINEAR; N])?;
-            Chain::new(design, dt, Scheme::Trapezoidal)?.with_extended_state(input)
-        }
-        Ok(match order {
-            1 => Some(AnyChain::Two(chain(bandwidth, dt, input)?)),
-            2 => Some(AnyChain::Three(chain(bandwidth, dt, input)?)),
-            3 => Some(AnyChain::Four(chain(bandwidth, dt, input)?)),
-            _ => None,
-        })
-    }
-
-    fn update(&mut self, y: f64, u: f64) -> Vec<f64> {
-        match self {
-            AnyChain::Two(chain) => chain.update(y, u).to_vec(),
-            AnyChain::Three(chain) => chain.update(y, u).to_vec(),
-            AnyChain::Four(chain) => chain.update(y, u).to_vec(),
-        }
-    }
-
-    fn start_at(&mut self, z: &[f64], y: f64) {
-        fn start<const N: usize>(chain: &mut Chain<N>, z: &[f64], y: f64) {
-            chain.start_at(std::array::from_fn(|i| z.get(i).copied().unwrap_or(0.0)), y);
-        }
-        match self {
-            AnyChain::Two(chain) => start(chain, z, y),
-            AnyChain::Three(chain) => start(chain, z, y),
-            AnyChain::Four(chain) => start(chain, z, y),
-        }
-    }
-}
-
-/// One step of an extended-state observer in matrices, (z⁺ = A z + b₀ y + b₁ y⁺ + g u).
-#[derive(Debug, Clone, PartialEq)]
-pub struct EsoStep {
-    /// Index of the coordinate's first state.
-    pub first: usize,
-    /// A, row by row; its size is the coordinate's order and one.
-    pub a: Vec<Vec<f64>>,
-    /// b₀, of the measurement of the last sample.
-    pub before: Vec<f64>,
-    /// b₁, of the measurement now.
-    pub now: Vec<f64>,
-    /// g, of the command since the last sample.
-    pub input: Vec<f64>,
-    /// b, the command's gain in the coordinate's highest derivative.
-    pub gain: f64,
-    /// Weight of this coordinate in d̂: one over the square of the size of its last state.
-    pub weight: f64,
+    Eso(Chains),
 }
 
 /// An observer in numbers, for code that runs it elsewhere.
@@ -217,15 +149,6 @@ pub struct Memory {
     started: bool,
 }
 
-/// An observer's tangent: c⁺ = M c + Γ₁ u₁ + Γ₀ u₀ + N y⁺, with x̂ and d̂ = E c. Over a sample first u₁ acts, then u₀.
-pub(crate) struct Tangent {
-    pub(crate) carry: DMatrix<f64>,
-    pub(crate) older: DMatrix<f64>,
-    pub(crate) newer: DMatrix<f64>,
-    pub(crate) measured: DMatrix<f64>,
-    pub(crate) estimate: DMatrix<f64>,
-}
-
 impl Observer {
     /// The observer of a plant sampled every `dt` s, designed at `at`; `sensors` are those of the measured states, in
     /// the order of the plant's.
@@ -249,7 +172,9 @@ impl Observer {
         let substeps = ((fastest * dt / LONGEST).ceil() as usize).clamp(1, MOST_SUBSTEPS);
         let kind = match *method {
             ObserverMethod::Kalman { disturbance } => kalman(plant, at, dt, disturbance, &measured, sensors)?,
-            ObserverMethod::Eso { bandwidth } => Kind::Eso(chains(plant, at, dt, bandwidth, &measured)?),
+            ObserverMethod::Eso { bandwidth } => {
+                Kind::Eso(Chains::design(plant, at, dt, bandwidth, &measured)?)
+            }
         };
         Ok(Observer { plant: plant.clone(), dt, measured, kind, substeps, late })
     }
@@ -279,14 +204,14 @@ impl Observer {
             Kind::Kalman { gain } => {
                 Form::Kalman { gain: gain.row_iter().map(|row| row.iter().copied().collect()).collect() }
             }
-            Kind::Eso(coordinates) => Form::Eso(coordinates.iter().map(|c| c.step(&self.plant)).collect()),
+            Kind::Eso(chains) => Form::Eso(chains.steps(&self.plant)),
         }
     }
 
     pub(crate) fn start(&self) -> Memory {
         let chains = match &self.kind {
             Kind::Kalman { .. } => Vec::new(),
-            Kind::Eso(coordinates) => coordinates.iter().map(|c| c.chain.clone()).collect(),
+            Kind::Eso(chains) => chains.start(),
         };
         let past = vec![0.0; self.late.samples + 2];
         Memory { estimate: vec![0.0; self.plant.order() + 1], chains, past, started: false }
@@ -316,11 +241,12 @@ impl Observer {
                     memory.estimate.iter_mut().zip(correction.iter()).for_each(|(x, c)| *x += c);
                 }
             }
-            Kind::Eso(coordinates) => {
+            Kind::Eso(chains) => {
                 let Lateness { samples, part } = self.late;
                 let share = part / self.dt;
                 let acted = share * memory.past[samples + 1] + (1.0 - share) * memory.past[samples];
-                self.follow(memory, coordinates, y, acted);
+                let memory = (memory.estimate.as_mut_slice(), memory.chains.as_mut_slice());
+                chains.follow(&self.plant, &self.measured, memory, y, acted);
             }
         }
         memory.started = true;
@@ -366,34 +292,9 @@ impl Observer {
         }
     }
 
-    /// x̂ from the chains, and d̂ by least squares over what f does not explain of their lumped disturbances.
-    fn follow(&self, memory: &mut Memory, coordinates: &[Coordinate], y: &[f64], u: f64) {
-        let n = self.plant.order();
-        let mut lumped = Vec::with_capacity(coordinates.len());
-        for (coordinate, chain) in coordinates.iter().zip(&mut memory.chains) {
-            let at = self.measured.iter().position(|i| *i == coordinate.first);
-            let y = at.and_then(|at| y.get(at)).copied().unwrap_or(f64::NAN);
-            let z = chain.update(y, u);
-            memory.estimate[coordinate.first..][..coordinate.order].copy_from_slice(&z[..coordinate.order]);
-            lumped.push(z[coordinate.order] + coordinate.input * u);
-        }
-        let x = &memory.estimate[..n];
-        let rest = self.plant.frictionless_rate(x, u);
-        let mut g = vec![0.0; n];
-        self.plant.frictionless_input(x, &mut g);
-        let (mut above, mut below) = (0.0, 0.0);
-        for (coordinate, lumped) in coordinates.iter().zip(lumped) {
-            let row = coordinate.first + coordinate.order - 1;
-            let weight = g[row] / (self.plant.sizes()[row] * self.plant.sizes()[row]);
-            above += weight * (lumped - rest[row]);
-            below += weight * g[row];
-        }
-        memory.estimate[n] = if below > 0.0 { above / below } else { 0.0 };
-    }
-
     /// The tangent at a state of rest.
     pub(crate) fn tangent(&self, at: &Equilibrium, set_point: f64) -> Result<Tangent, ControlError> {
-        let (n, m) = (self.plant.order(), self.measured.len());
+        let n = self.plant.order();
         let plant = self.plant.frictionless_tangent(&at.state, at.input);
         match &self.kind {
             Kind::Kalman { gain } => {
@@ -410,62 +311,8 @@ impl Observer {
                     estimate: DMatrix::identity(n + 1, n + 1),
                 })
             }
-            Kind::Eso(coordinates) => {
-                // c: the chains one after the other, the last measurements, the last command.
-                let steps: Vec<EsoStep> = coordinates.iter().map(|c| c.step(&self.plant)).collect();
-                let chains: usize = steps.iter().map(|s| s.a.len()).sum();
-                let size = chains + m + 1;
-                let mut tangent = Tangent {
-                    carry: DMatrix::zeros(size, size),
-                    older: DMatrix::zeros(size, 1),
-                    newer: DMatrix::zeros(size, 1),
-                    measured: DMatrix::zeros(size, m),
-                    estimate: DMatrix::zeros(n + 1, size),
-                };
-                let below: f64 = coordinates.iter().map(|c| c.weight(&self.plant, &plant.b)).sum();
-                let share_older = self.late.part / self.dt;
-                let mut first = 0;
-                for (coordinate, step) in coordinates.iter().zip(&steps) {
-                    let at = self.measured.iter().position(|i| *i == step.first).unwrap_or(0);
-                    let order = coordinate.order;
-                    for i in 0..=order {
-                        for j in 0..=order {
-                            tangent.carry[(first + i, first + j)] = step.a[i][j];
-                        }
-                        tangent.carry[(first + i, chains + at)] = step.before[i];
-                        tangent.measured[(first + i, at)] = step.now[i];
-                        tangent.older[(first + i, 0)] = share_older * step.input[i];
-                        tangent.newer[(first + i, 0)] = (1.0 - share_older) * step.input[i];
-                    }
-                    for i in 0..order {
-                        tangent.estimate[(step.first + i, first + i)] = 1.0;
-                    }
-                    let row = step.first + order - 1;
-                    let share = coordinate.weight(&self.plant, &plant.b) / (plant.b[row] * below);
-                    if below > 0.0 && plant.b[row] != 0.0 {
-                        tangent.estimate[(n, first + order)] += share;
-                        tangent.estimate[(n, size - 1)] += share * (coordinate.input - plant.b[row]);
-                    }
-                    first += order + 1;
-                }
-                // What f explains, once the states stand in their rows.
-                for coordinate in coordinates {
-                    let row = coordinate.first + coordinate.order - 1;
-                    if below > 0.0 && plant.b[row] != 0.0 {
-                        let share = coordinate.weight(&self.plant, &plant.b) / (plant.b[row] * below);
-                        for c in 0..size {
-                            let explained: f64 =
-                                (0..n).map(|j| plant.a[(row, j)] * tangent.estimate[(j, c)]).sum();
-                            tangent.estimate[(n, c)] -= share * explained;
-                        }
-                    }
-                }
-                for i in 0..m {
-                    tangent.measured[(chains + i, i)] = 1.0;
-                }
-                tangent.older[(size - 1, 0)] = share_older;
-                tangent.newer[(size - 1, 0)] = 1.0 - share_older;
-                Ok(tangent)
+            Kind::Eso(chains) => {
+                Ok(chains.tangent(&self.plant, &plant, &self.measured, self.late.part / self.dt))
             }
         }
     }
@@ -484,11 +331,7 @@ impl Observer {
     }
 
     /// x̂ over the delay: what the estimate, d̂ and the last commands do, the latest first.
-    pub(crate) fn prediction(
-        &self,
-        plant: &Linear,
-        set_point: f64,
-    ) -> Result<(DMatrix<f64>, DMatrix<f64>, Vec<DMatrix<f64>>), ControlError> {
+    pub(crate) fn prediction(&self, plant: &Linear, set_point: f64) -> Result<Prediction, ControlError> {
         let whole = self.held(plant, self.dt, set_point)?;
         let part = self.held(plant, self.late.part, set_point)?;
         let mut power = DMatrix::identity(self.plant.order(), self.plant.order());
@@ -499,43 +342,13 @@ impl Observer {
         }
         commands.push(&power * part.b);
         let disturbance = commands.iter().fold(DMatrix::zeros(self.plant.order(), 1), |sum, c| sum + c);
-        Ok((power * part.a, disturbance, commands))
+        Ok(Prediction { state: power * part.a, disturbance, commands })
     }
 
     /// C: which of `columns` states are measured.
     pub(crate) fn selection(&self, columns: usize) -> DMatrix<f64> {
         let entry = |i: usize, j: usize| f64::from(u8::from(self.measured[i] == j));
         DMatrix::from_fn(self.measured.len(), columns, entry)
-    }
-}
-
-impl Coordinate {
-    /// (g / size)².
-    fn weight(&self, plant: &Plant, g: &DMatrix<f64>) -> f64 {
-        let row = self.first + self.order - 1;
-        (g[row] / plant.sizes()[row]).powi(2)
-    }
-
-    /// The matrices of a step, by unit answers of the observer, which is linear.
-    fn step(&self, plant: &Plant) -> EsoStep {
-        let n = self.order + 1;
-        let answer = |z: &[f64], before: f64, now: f64, u: f64| {
-            let mut chain = self.chain.clone();
-            chain.start_at(z, before);
-            chain.update(now, u)
-        };
-        let unit = |j: usize| -> Vec<f64> { (0..n).map(|i| f64::from(u8::from(i == j))).collect() };
-        let zero = vec![0.0; n];
-        let columns: Vec<Vec<f64>> = (0..n).map(|j| answer(&unit(j), 0.0, 0.0, 0.0)).collect();
-        EsoStep {
-            first: self.first,
-            a: (0..n).map(|i| columns.iter().map(|c| c[i]).collect()).collect(),
-            before: answer(&zero, 1.0, 0.0, 0.0),
-            now: answer(&zero, 0.0, 1.0, 0.0),
-            input: answer(&zero, 0.0, 0.0, 1.0),
-            gain: self.input,
-            weight: plant.sizes()[self.first + self.order - 1].powi(-2),
-        }
     }
 }
 
@@ -595,37 +408,4 @@ fn kalman(
         .solve(&(read.transpose() * &predicted));
     let gain = DMatrix::from_fn(n + 1, measured.len(), |i, k| weights[(k, i)] * size(i) / deviations[k]);
     Ok(Kind::Kalman { gain })
-}
-
-/// A chain for each measured coordinate; together they must have every state.
-fn chains(
-    plant: &Plant,
-    at: &Equilibrium,
-    dt: f64,
-    bandwidth: f64,
-    measured: &[usize],
-) -> Result<Vec<Coordinate>, ControlError> {
-    let symbols = plant.symbols();
-    let tangent = plant.frictionless_tangent(&at.state, at.input);
-    let mut coordinates = Vec::new();
-    for (first, (name, primes)) in symbols.iter().enumerate() {
-        if *primes > 0 {
-            continue;
-        }
-        let order = symbols.iter().filter(|(n, _)| n == name).count();
-        let is_chain = symbols[first..]
-            .iter()
-            .take(order)
-            .enumerate()
-            .all(|(k, (n, p))| n == name && usize::from(*p) == k);
-        if !(measured.contains(&first) && is_chain) {
-            return Err(ControlError::Unmeasured { name: name.clone() });
-        }
-        let input = tangent.b[first + order - 1];
-        let chain = AnyChain::new(order, bandwidth, dt, input)
-            .map_err(|source| ControlError::Eso { source })?
-            .ok_or_else(|| ControlError::EsoOrder { name: name.clone(), order })?;
-        coordinates.push(Coordinate { first, order, input, chain });
-    }
-    Ok(coordinates)
 }

@@ -7,9 +7,10 @@ use crate::check::largest;
 use crate::compiled::Compiled;
 use crate::controller::Controller;
 use crate::design::{free_name, limited};
+use crate::equilibrium::Equilibrium;
 use crate::error::{ControlError, listed};
 use crate::margins::{CutLoop, Margins};
-use crate::observer::{Memory, Observer, ObserverMethod, Sensor};
+use crate::observer::{Memory, Observer, ObserverMethod, Prediction, Sensor, Tangent};
 use crate::stability;
 
 /// Noise of a sensor of which nothing is stated, over the size of its state.
@@ -266,79 +267,93 @@ impl OutputFeedback {
         &self,
         controller: &Controller,
         set_point: f64,
-        at: &crate::equilibrium::Equilibrium,
+        at: &Equilibrium,
     ) -> Result<OutputCheck, ControlError> {
-        let plant = controller.plant();
-        let none = || ControlError::NoPoles { set_point };
-        let tangent = plant.frictionless_tangent(&at.state, at.input);
-        let held =
-            stability::held(&tangent, controller.dt(), plant.sizes(), plant.input_size()).ok_or_else(none)?;
-        let observer = self.observer.tangent(at, set_point)?;
-        let n = plant.order();
-        let gain = controller.frictionless_gain(&at.state, set_point);
-        // x, the commands that the plant was given, the observer's memory, the commands that the law gave; u = c · all of it,
-        // and v is what the plant is given.
-        let past = self.observer.late().samples + 1;
-        let size = observer.carry.nrows();
-        let (given, own, told) = (n, n + past, n + past + size);
-        let all = told + past;
-        let [older, newer] = self.observer.inputs(&tangent, set_point)?;
-        let (ahead, of_disturbance, of_commands) = self.observer.prediction(&tangent, set_point)?;
-        let gain = DMatrix::from_row_slice(1, n, &gain);
-        let taken_off = f64::from(u8::from(self.integral));
-        let of_estimate = {
-            let state = &gain * ahead;
-            let disturbance = (&gain * of_disturbance)[0] - taken_off;
-            DMatrix::from_fn(1, n + 1, |_, j| if j < n { state[j] } else { disturbance }) * &observer.estimate
-        };
-        let mut c = DMatrix::zeros(1, all);
-        c.view_mut((0, own), (1, size)).copy_from(&of_estimate);
-        for (j, command) in of_commands.iter().enumerate() {
-            c[(0, told + j)] = (&gain * command)[0];
-        }
-        let (mut a, mut b) = (DMatrix::zeros(all, all), DMatrix::zeros(all, 1));
-        a.view_mut((0, 0), (n, n)).copy_from(&held.a);
-        a.view_mut((0, given + past - 1), (n, 1)).copy_from(&older);
-        a.view_mut((own, own), (size, size)).copy_from(&observer.carry);
-        a.view_mut((own, told + past - 1), (size, 1)).copy_from(&observer.older);
-        let by_law = |a: &mut DMatrix<f64>, row: usize, column: &DMatrix<f64>| {
-            let mut rows = a.view_mut((row, 0), (column.nrows(), all));
-            rows += column * &c;
-        };
-        match past {
-            1 => {
-                b.view_mut((0, 0), (n, 1)).copy_from(&newer);
-                by_law(&mut a, own, &observer.newer);
-            }
-            _ => {
-                let mut column = a.view_mut((0, given + past - 2), (n, 1));
-                column += &newer;
-                let mut column = a.view_mut((own, told + past - 2), (size, 1));
-                column += &observer.newer;
-            }
-        }
-        b[(given, 0)] = 1.0;
-        by_law(&mut a, told, &DMatrix::identity(1, 1));
-        for j in 1..past {
-            a[(given + j, given + j - 1)] = 1.0;
-            a[(told + j, told + j - 1)] = 1.0;
-        }
-        // The measurements are those of the next state.
-        let measures = &observer.measured * self.observer.selection(n);
-        let (next_a, next_b) = (a.rows(0, n).into_owned(), b.rows(0, n).into_owned());
-        let mut rows = a.view_mut((own, 0), (size, all));
-        rows += &measures * next_a;
-        let mut rows = b.view_mut((own, 0), (size, 1));
-        rows += &measures * next_b;
-        let sizes = vec![1.0; all];
-        let poles = stability::poles(&(&a + &b * &c), &sizes).ok_or_else(none)?;
+        let cut = self.cut_at_the_command(controller, set_point, at)?;
+        let sizes = vec![1.0; cut.a.nrows()];
+        let poles = stability::poles(&(&cut.a + &cut.b * &cut.c), &sizes)
+            .ok_or(ControlError::NoPoles { set_point })?;
         let spectral_radius = largest(&poles);
         if spectral_radius.is_nan() || spectral_radius >= 1.0 {
             let dt = controller.dt();
             return Err(ControlError::UnstableOutput { set_point, dt, radius: spectral_radius });
         }
-        let margins = CutLoop { a, b, c }.margins(controller.dt());
-        Ok(OutputCheck { set_point, spectral_radius, margins })
+        Ok(OutputCheck { set_point, spectral_radius, margins: cut.margins(controller.dt()) })
+    }
+
+    /// u = c z of z = (x̂ and d̂ as the observer remembers them, the last commands that the law gave).
+    fn law_of_memory(
+        &self,
+        gain: &DMatrix<f64>,
+        observer: &Tangent,
+        ahead: &Prediction,
+    ) -> (DMatrix<f64>, Vec<f64>) {
+        let n = gain.ncols();
+        let taken_off = f64::from(u8::from(self.integral));
+        let state = gain * &ahead.state;
+        let disturbance = (gain * &ahead.disturbance)[0] - taken_off;
+        let of_estimate = DMatrix::from_fn(1, n + 1, |_, j| if j < n { state[j] } else { disturbance });
+        (of_estimate * &observer.estimate, ahead.commands.iter().map(|c| (gain * c)[0]).collect())
+    }
+
+    /// Plant, observer and law as one linear system at a state of rest. Its state is x, the commands that the plant was
+    /// given and that still act or will, the observer's memory, and the same commands as the law gave them.
+    fn cut_at_the_command(
+        &self,
+        controller: &Controller,
+        set_point: f64,
+        at: &Equilibrium,
+    ) -> Result<CutLoop, ControlError> {
+        let plant = controller.plant();
+        let tangent = plant.frictionless_tangent(&at.state, at.input);
+        let held = stability::held(&tangent, controller.dt(), plant.sizes(), plant.input_size())
+            .ok_or(ControlError::NoPoles { set_point })?;
+        let observer = self.observer.tangent(at, set_point)?;
+        let [older, newer] = self.observer.inputs(&tangent, set_point)?;
+        let ahead = self.observer.prediction(&tangent, set_point)?;
+        let gain =
+            DMatrix::from_row_slice(1, plant.order(), &controller.frictionless_gain(&at.state, set_point));
+        let (of_memory, of_commands) = self.law_of_memory(&gain, &observer, &ahead);
+
+        let (n, past, size) = (plant.order(), self.observer.late().samples + 1, observer.carry.nrows());
+        let (given, own, made) = (n, n + past, n + past + size);
+        let all = made + past;
+        let mut c = DMatrix::zeros(1, all);
+        c.view_mut((0, own), (1, size)).copy_from(&of_memory);
+        for (j, of_command) in of_commands.iter().enumerate() {
+            c[(0, made + j)] = *of_command;
+        }
+        let (mut a, mut b) = (DMatrix::zeros(all, all), DMatrix::zeros(all, 1));
+        let mut add = |row: usize, column: usize, part: &DMatrix<f64>| {
+            let mut view = a.view_mut((row, column), part.shape());
+            view += part;
+        };
+        add(0, 0, &held.a);
+        add(0, given + past - 1, &older);
+        add(own, own, &observer.carry);
+        add(own, made + past - 1, &observer.older);
+        // The newer command of a sample is the one that is just made, unless it is late by a sample or more.
+        if past == 1 {
+            b.view_mut((0, 0), (n, 1)).copy_from(&newer);
+            add(own, 0, &(&observer.newer * &c));
+        } else {
+            add(0, given + past - 2, &newer);
+            add(own, made + past - 2, &observer.newer);
+        }
+        b[(given, 0)] = 1.0;
+        add(made, 0, &c);
+        for j in 1..past {
+            a[(given + j, given + j - 1)] = 1.0;
+            a[(made + j, made + j - 1)] = 1.0;
+        }
+        // What is measured is the next state.
+        let measures = &observer.measured * self.observer.selection(n);
+        let (next_a, next_b) = (&measures * a.rows(0, n), &measures * b.rows(0, n));
+        let mut view = a.view_mut((own, 0), (size, all));
+        view += next_a;
+        let mut view = b.view_mut((own, 0), (size, 1));
+        view += next_b;
+        Ok(CutLoop { a, b, c })
     }
 }
 
