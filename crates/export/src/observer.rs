@@ -8,6 +8,32 @@ use crate::language::{Language, number};
 
 /// A law that is given what sensors measure, and the observer between them. The machine's equations are ẋ = `rate`, its
 /// disturbance d adds to the command.
+///
+/// ```
+/// use greybox_export::{Function, Group, Language, Member, ObserverCode, ObserverForm};
+/// use greybox_model::parse;
+/// let group = |name: &str, member: &str| Group { name: name.into(), members: vec![Member::new(member, 0, "")] };
+/// let function = |name: &str, arguments: Vec<Group>, output: &str| -> Result<Function, Box<dyn std::error::Error>> {
+///     let outputs = vec![(String::new(), parse(output)?.expr)];
+///     Ok(Function { name: name.into(), summary: vec![], arguments, constants: vec![], outputs })
+/// };
+/// // A tank, x' = u − x + d; its level is measured every 10 ms.
+/// let state = || group("state", "x");
+/// let code = ObserverCode {
+///     summary: vec!["Level of a tank.".into()],
+///     rate: function("plant_rate", vec![state(), group("command", "u")], "u - x")?,
+///     law: function("control_law", vec![state(), group("disturbance", "d"), group("set_point", "r")], "r - 2*(x - r) - d")?,
+///     dt: 0.01,
+///     measured: vec![0],
+///     dead_zone: 0.0,
+///     substeps: 1,
+///     late: (0, 0.0),
+///     form: ObserverForm::Kalman { gain: vec![vec![0.4], vec![3.0]] },
+/// };
+/// assert!(code.code(Language::C99)?.contains("double observer_step(observer_memory *memory, const double measured[1]"));
+/// assert!(code.code(Language::Rust)?.contains("pub struct Observer"));
+/// # Ok::<(), Box<dyn std::error::Error>>(())
+/// ```
 #[derive(Debug, Clone, PartialEq)]
 pub struct ObserverCode {
     /// Lines of the comment at the top.
