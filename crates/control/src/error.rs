@@ -336,6 +336,14 @@ pub enum ControlError {
         /// Why.
         source: EsoError,
     },
+    /// A coordinate that an extended-state observer cannot follow.
+    #[error(
+        "an extended-state observer follows measured coordinates, and `{name}` is not measured: use the Kalman filter"
+    )]
+    EsoUnmeasured {
+        /// The coordinate.
+        name: String,
+    },
     /// A coordinate of too high an order for an extended-state observer.
     #[error(
         "the coordinate `{name}` has {order} states, and an extended-state observer is made for 1 to 3: use the Kalman filter"

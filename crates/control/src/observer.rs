@@ -11,6 +11,7 @@ use rand_pcg::Pcg64Mcg;
 pub use self::chains::EsoStep;
 use self::chains::{AnyChain, Chains};
 pub(crate) use self::tangent::{Prediction, Tangent};
+use crate::check::Check;
 use crate::equilibrium::Equilibrium;
 use crate::error::{ControlError, listed};
 use crate::plant::Plant;
@@ -109,12 +110,6 @@ impl Lateness {
         }
         Ok(late)
     }
-
-    /// Whether the command acts at once.
-    #[must_use]
-    pub fn is_none(&self) -> bool {
-        self.samples == 0 && self.part == 0.0
-    }
 }
 
 #[derive(Debug, Clone)]
@@ -150,11 +145,11 @@ pub struct Memory {
 }
 
 impl Observer {
-    /// The observer of a plant sampled every `dt` s, designed at `at`; `sensors` are those of the measured states, in
-    /// the order of the plant's.
+    /// The observer of a plant sampled every `dt` s, designed at the equilibrium of `point`; `sensors` are those of the
+    /// measured states, in the order of the plant's.
     pub(crate) fn new(
         plant: &Plant,
-        at: &Equilibrium,
+        point: &Check,
         dt: f64,
         method: &ObserverMethod,
         sensors: &[Sensor],
@@ -164,14 +159,17 @@ impl Observer {
             return Err(ControlError::NothingMeasured { known: listed(plant.state_names()) });
         }
         let late = Lateness::new(plant.input_delay(), dt)?;
+        let at = &point.equilibrium;
         let tangent = plant.frictionless_tangent(&at.state, at.input);
         let fastest = stability::poles(&tangent.a, plant.sizes())
-            .ok_or(ControlError::NoPoles { set_point: 0.0 })?
+            .ok_or(ControlError::NoPoles { set_point: point.set_point })?
             .iter()
             .fold(0.0f64, |fastest, p| fastest.max(p.magnitude()));
         let substeps = ((fastest * dt / LONGEST).ceil() as usize).clamp(1, MOST_SUBSTEPS);
         let kind = match *method {
-            ObserverMethod::Kalman { disturbance } => kalman(plant, at, dt, disturbance, &measured, sensors)?,
+            ObserverMethod::Kalman { disturbance } => {
+                kalman(plant, point, dt, disturbance, &measured, sensors)?
+            }
             ObserverMethod::Eso { bandwidth } => {
                 Kind::Eso(Chains::design(plant, at, dt, bandwidth, &measured)?)
             }
@@ -217,7 +215,8 @@ impl Observer {
         Memory { estimate: vec![0.0; self.plant.order() + 1], chains, past, started: false }
     }
 
-    /// The estimate at a sample from its measurements `y` and the last command `u` (behind the dead zone). The first sample finds the machine at rest. A measurement that is not a number is left out.
+    /// The estimate at a sample from its measurements `y` and the last command `u` (behind the dead zone). The first
+    /// sample finds the machine at rest. A measurement that is not a number is left out.
     pub(crate) fn update(&self, memory: &mut Memory, y: &[f64], u: f64) {
         memory.past.rotate_right(1);
         memory.past[0] = u;
@@ -365,7 +364,7 @@ fn extended(a: &DMatrix<f64>, b: &DMatrix<f64>) -> DMatrix<f64> {
 
 fn kalman(
     plant: &Plant,
-    at: &Equilibrium,
+    point: &Check,
     dt: f64,
     disturbance: f64,
     measured: &[usize],
@@ -378,23 +377,17 @@ fn kalman(
             wanted: "a positive finite number",
         });
     }
-    let n = plant.order();
+    let (n, at) = (plant.order(), &point.equilibrium);
+    let none = || ControlError::NoPoles { set_point: point.set_point };
     let tangent = plant.frictionless_tangent(&at.state, at.input);
-    let held = stability::held(&tangent, dt, plant.sizes(), plant.input_size())
-        .ok_or(ControlError::NoPoles { set_point: 0.0 })?;
+    let held = stability::held(&tangent, dt, plant.sizes(), plant.input_size()).ok_or_else(none)?;
     let all = extended(&held.a, &held.b);
     // In units of the sizes and of the sensors' noise.
     let size = |i: usize| plant.sizes().get(i).copied().unwrap_or_else(|| plant.input_size());
     let deviations: Vec<f64> = sensors.iter().map(Sensor::deviation).collect();
     let transposed = DMatrix::from_fn(n + 1, n + 1, |i, j| all[(j, i)] * size(i) / size(j));
-    let read =
-        DMatrix::from_fn(
-            n + 1,
-            measured.len(),
-            |i, k| {
-                if measured[k] == i { size(i) / deviations[k] } else { 0.0 }
-            },
-        );
+    let seen = |i: usize, k: usize| if measured[k] == i { size(i) / deviations[k] } else { 0.0 };
+    let read = DMatrix::from_fn(n + 1, measured.len(), seen);
     let mut walk = DMatrix::zeros(n + 1, n + 1);
     walk[(n, n)] = (disturbance / plant.input_size()).powi(2) * dt;
     let unit = DMatrix::identity(measured.len(), measured.len());
@@ -402,10 +395,7 @@ fn kalman(
         .map_err(|source| ControlError::Observer { source })?
         .solution;
     let innovation = read.transpose() * &predicted * &read + unit;
-    let weights = innovation
-        .cholesky()
-        .ok_or(ControlError::NoPoles { set_point: 0.0 })?
-        .solve(&(read.transpose() * &predicted));
+    let weights = innovation.cholesky().ok_or_else(none)?.solve(&(read.transpose() * &predicted));
     let gain = DMatrix::from_fn(n + 1, measured.len(), |i, k| weights[(k, i)] * size(i) / deviations[k]);
     Ok(Kind::Kalman { gain })
 }

@@ -126,9 +126,9 @@ impl OutputFeedback {
     /// An observer for a controller, checked with it at each of its set points.
     ///
     /// # Errors
-    /// [`ControlError::NothingMeasured`], [`ControlError::Unmeasured`] and [`ControlError::EsoOrder`] for states that the
+    /// [`ControlError::NothingMeasured`], [`ControlError::EsoUnmeasured`] and [`ControlError::EsoOrder`] for states that the
     /// observer does not reach, [`ControlError::Observer`] where the measured states do not determine the others,
-    /// [`ControlError::Eso`], [`ControlError::Option`], [`ControlError::UnknownState`],
+    /// [`ControlError::Eso`], [`ControlError::Option`], [`ControlError::NotMeasured`], [`ControlError::LongDelay`],
     /// [`ControlError::UnstableOutput`].
     pub fn new(controller: &Controller, options: &OutputOptions) -> Result<OutputFeedback, ControlError> {
         let plant = controller.plant();
@@ -165,8 +165,8 @@ impl OutputFeedback {
             }
             sensors[at] = *sensor;
         }
-        let at = &controller.design_point().equilibrium;
-        let observer = Observer::new(plant, at, controller.dt(), &options.method, &sensors)?;
+        let point = controller.design_point();
+        let observer = Observer::new(plant, point, controller.dt(), &options.method, &sensors)?;
         let disturbance = free_name(plant, "d", &[controller.reference()]);
         let (low, high) = controller.limits();
         let law = match options.integral {

@@ -285,3 +285,56 @@ fn a_late_command_is_predicted_over() {
         OutputFeedback::new(&law, &OutputOptions { method: KALMAN, sensors: Vec::new(), integral: true });
     assert!(matches!(made, Err(ControlError::LongDelay { samples: 250, .. })));
 }
+
+/// A motor's current that no sensor has: the Kalman filter has it from the angle, the extended-state observer cannot. And
+/// where only the current is measured, nothing tells the angle.
+#[test]
+fn what_no_sensor_has_is_estimated_or_refused() {
+    let motor = |measured: &str| {
+        let flag = |name: &str| if name == measured { "" } else { ", measured = false" };
+        let text = format!(
+            r#"
+[inputs]
+v = {{ unit = "V" }}
+[states]
+theta = {{ unit = "rad"{} }}
+i = {{ unit = "A"{} }}
+[parameters]
+J = {{ value = 0.02, unit = "kg m^2" }}
+b = {{ value = 0.05, unit = "N m s/rad" }}
+k = {{ value = 0.4, unit = "N m/A" }}
+ke = {{ value = 0.4, unit = "V s/rad" }}
+L = {{ value = 0.01, unit = "H" }}
+R = {{ value = 1.0, unit = "ohm" }}
+[equations]
+arm = "J*theta'' + b*theta' = k*i"
+coil = "L*i' + R*i + ke*theta' = v"
+"#,
+            flag("theta"),
+            flag("i")
+        );
+        Model::from_toml(&text, "motor.toml").unwrap()
+    };
+    let sizes = [("theta", 0.2), ("theta'", 4.0), ("i", 2.0)].map(|(n, s)| (n.to_owned(), s)).to_vec();
+    let law = |model: &Model| {
+        let options = PlantOptions { sizes: sizes.clone(), input_size: 5.0, ..PlantOptions::default() };
+        let plant = Plant::of(model, "v", &options).unwrap();
+        design(&plant, &Method::Lqr, &DesignOptions::new("theta", &[-1.0, 1.0], 2e-3)).unwrap()
+    };
+    let model = motor("theta");
+    let law_of_angle = law(&model);
+    let reference = Reference::square(0.5, 2.0, 3);
+    let full = run(&model, &law_of_angle, &LoopOptions::default(), &reference);
+    let fine = Sensor { noise: 1e-6, resolution: 0.0 };
+    let seen = run(&model, &law_of_angle, &with(&law_of_angle, KALMAN, fine), &reference);
+    let far = full.x[2].iter().zip(&seen.x[2]).map(|(a, b)| (a - b).abs()).fold(0.0, f64::max);
+    let largest = full.x[2].iter().fold(0.0f64, |m, i| m.max(i.abs()));
+    println!("current {far:.1e} of {largest:.1}");
+    assert!(far < 8e-3 * largest, "{far}");
+    let made = |law: &Controller, method| {
+        OutputFeedback::new(law, &OutputOptions { method, sensors: Vec::new(), integral: true })
+    };
+    let refused = made(&law_of_angle, ESO).unwrap_err();
+    assert!(matches!(&refused, ControlError::EsoUnmeasured { name } if name == "i"), "{refused}");
+    assert!(matches!(made(&law(&motor("i")), KALMAN), Err(ControlError::Observer { .. })));
+}

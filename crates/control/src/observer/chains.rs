@@ -111,7 +111,7 @@ impl Chains {
                 .enumerate()
                 .all(|(k, (n, p))| n == name && usize::from(*p) == k);
             if !(measured.contains(&first) && is_chain) {
-                return Err(ControlError::Unmeasured { name: name.clone() });
+                return Err(ControlError::EsoUnmeasured { name: name.clone() });
             }
             let input = tangent.b[first + order - 1];
             let chain = AnyChain::new(order, bandwidth, dt, input)

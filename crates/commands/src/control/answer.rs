@@ -1,0 +1,209 @@
+//! What was designed, for machines and in words.
+
+use std::fmt::Write as _;
+
+use greybox_control::{
+    Controller, Margins, Method, Metrics, ObserverMethod, OutputFeedback, Plant, Pole, observer,
+};
+use greybox_report::{ControlPage, format, sentence};
+use serde_json::{Value, json};
+
+use super::designed::Designed;
+
+pub(super) fn observer_in_words(output: &OutputFeedback) -> String {
+    match output.method() {
+        ObserverMethod::Kalman { disturbance } => format!(
+            "Kalman filter, disturbance of {} of the command in a second",
+            format::number(*disturbance)
+        ),
+        ObserverMethod::Eso { bandwidth } => {
+            format!("Extended-state observer, bandwidth {} 1/s", format::number(*bandwidth))
+        }
+    }
+}
+
+pub(super) fn report(page: &ControlPage, designed: &Designed<'_>) -> Value {
+    let Designed { controller, output, run, family, .. } = *designed;
+    let plant = controller.plant();
+    let (low, high) = controller.limits();
+    let limit = |v: f64| if v.is_finite() { json!(v) } else { Value::Null };
+    let margins = |m: &Margins| {
+        json!({
+            "gain": limit(m.gain), "lower_gain": m.lower_gain, "phase": m.phase, "delay": limit(m.delay),
+            "sensitivity": m.sensitivity,
+        })
+    };
+    let full = controller.margins();
+    let checks: Vec<Value> = controller
+        .checks()
+        .iter()
+        .enumerate()
+        .map(|(k, c)| {
+            let poles = |poles: &[Pole]| poles.iter().map(|p| [p.re, p.im]).collect::<Vec<_>>();
+            json!({
+                "set_point": c.set_point, "state": c.equilibrium.state, "command": c.equilibrium.input,
+                "poles": poles(&c.poles), "held_poles": poles(&c.held_poles), "spectral_radius": c.spectral_radius,
+                "margins": full.get(k).and_then(Option::as_ref).map(margins),
+                "with_observer": output.and_then(|o| o.checks().get(k)).map(|c| json!({
+                    "spectral_radius": c.spectral_radius, "margins": margins(&c.margins),
+                })),
+            })
+        })
+        .collect();
+    let spread = |s: &greybox_control::Spread| json!({ "median": limit(s.median), "worst": limit(s.worst) });
+    json!({
+        "greybox": page.producer,
+        "model": page.model.file,
+        "verdict": page.verdict.name(),
+        "summary": sentence::control::summary(page),
+        "method": controller.method().name(),
+        "input": plant.input_name(),
+        "states": plant.state_names(),
+        "tracked": plant.state_names().get(controller.tracked()),
+        "dt": controller.dt(),
+        "limits": [limit(low), limit(high)],
+        "gains": controller.gains(),
+        "law": match output {
+            Some(output) => vec![output.law().to_string()],
+            None => controller.law().iter().map(ToString::to_string).collect(),
+        },
+        "delay": page.delay,
+        "input_delay": plant.input_delay(),
+        "observer": output.map(|o| observer_report(plant, o)),
+        "checks": checks,
+        "left_out": plant.dropped().iter().map(|d| json!({
+            "equation": d.equation, "term": d.term.to_string(),
+        })).collect::<Vec<_>>(),
+        "closed_loop": {
+            "diverged": run.diverged.is_some(),
+            "set_points": run.metrics.iter().map(metrics).collect::<Vec<_>>(),
+        },
+        "family": family.map(|f| json!({
+            "members": f.members, "diverged": f.diverged, "settled": f.settled,
+            "settling": spread(&f.settling), "overshoot": spread(&f.overshoot),
+            "final_error": spread(&f.final_error), "largest_command": spread(&f.largest_command),
+        })),
+    })
+}
+
+fn observer_report(plant: &Plant, output: &OutputFeedback) -> Value {
+    let names = plant.state_names();
+    let sensors = output.observer().measured().iter().zip(output.sensors());
+    let (kind, setting) = match output.method() {
+        ObserverMethod::Kalman { disturbance } => ("kalman", json!({ "disturbance": disturbance })),
+        ObserverMethod::Eso { bandwidth } => ("eso", json!({ "bandwidth": bandwidth })),
+    };
+    let gain = match output.observer().form() {
+        observer::Form::Kalman { gain, .. } => json!(gain),
+        observer::Form::Eso(_) => Value::Null,
+    };
+    json!({
+        "kind": kind, "setting": setting, "integral": output.integral(), "gain": gain,
+        "sensors": sensors.map(|(&i, s)| json!({
+            "state": names[i], "noise": s.noise, "resolution": s.resolution,
+        })).collect::<Vec<_>>(),
+    })
+}
+
+fn metrics(m: &Metrics) -> Value {
+    json!({
+        "set_point": m.set_point, "settling": m.settling, "overshoot": m.overshoot,
+        "final_error": m.final_error, "peak_to_peak": m.peak_to_peak, "rms_error": m.rms_error, "largest_command": m.largest_command,
+        "saturated": m.saturated, "effort": m.effort,
+    })
+}
+
+/// The worst margins over the set points, of the loop as it is fed back.
+fn worst_margins(controller: &Controller, output: Option<&OutputFeedback>) -> Option<Margins> {
+    let all: Vec<Margins> = match output {
+        Some(output) => output.checks().iter().map(|c| c.margins).collect(),
+        None => controller.margins().into_iter().flatten().collect(),
+    };
+    all.into_iter().reduce(Margins::worse)
+}
+
+pub(super) fn in_words(designed: &Designed<'_>) -> String {
+    let Designed { file, controller, output, run, family, .. } = *designed;
+    let plant = controller.plant();
+    let tracked = plant.state_names().get(controller.tracked()).cloned().unwrap_or_default();
+    let mut text = format!(
+        "{} of {} for {tracked}, commanded by {} every {} s\n",
+        match controller.method() {
+            Method::Lqr => "Linear-quadratic regulator",
+            Method::Hjb { .. } => "Optimal law",
+            Method::Smc { .. } => "Sliding-mode law",
+        },
+        file,
+        plant.input_name(),
+        format::number(controller.dt()),
+    );
+    for (name, gain) in plant.state_names().iter().zip(controller.gains()) {
+        let _ = writeln!(text, "  gain of {name}: {}", format::number(*gain));
+    }
+    if let Some(output) = output {
+        let sensors = output.observer().measured().iter().zip(output.sensors()).map(|(&i, s)| {
+            let name = plant.state_names().get(i).cloned().unwrap_or_default();
+            match (s.noise, s.resolution) {
+                (noise, 0.0) => format!("{name} (noise {})", format::number(noise)),
+                (0.0, resolution) => format!("{name} (in steps of {})", format::number(resolution)),
+                (noise, resolution) => {
+                    format!(
+                        "{name} (noise {}, in steps of {})",
+                        format::number(noise),
+                        format::number(resolution)
+                    )
+                }
+            }
+        });
+        let sensors: Vec<String> = sensors.collect();
+        if plant.input_delay() > 0.0 {
+            let _ = writeln!(
+                text,
+                "  predicts over the delay of the command, {} s",
+                format::number(plant.input_delay())
+            );
+        }
+        let integral = if output.integral() { "" } else { "; no integral action" };
+        let _ = writeln!(text, "  {}; measured: {}{integral}", observer_in_words(output), sensors.join(", "));
+    }
+    let worst = worst_margins(controller, output);
+    if let Some(m) = worst {
+        let _ = writeln!(
+            text,
+            "  margins: gain × {} to {}, phase {}°, delay {} s",
+            format::number(m.lower_gain),
+            format::number(m.gain),
+            format::number(m.phase.to_degrees()),
+            format::number(m.delay),
+        );
+    }
+    for dropped in plant.dropped() {
+        let _ = writeln!(text, "  left out of {}: {}", dropped.equation, dropped.term);
+    }
+    for m in run.metrics.iter().skip(1) {
+        let settling =
+            m.settling.map_or("does not settle".into(), |s| format!("settles in {} s", format::number(s)));
+        let _ = writeln!(
+            text,
+            "  to {}: {settling}, overshoot {}, ends {} off (peak to peak {}), command up to {}",
+            format::number(m.set_point),
+            format::percent(m.overshoot),
+            format::number(m.final_error.abs()),
+            format::number(m.peak_to_peak),
+            format::number(m.largest_command),
+        );
+    }
+    if let Some(at) = run.diverged {
+        let t = run.t.get(at).copied().unwrap_or_default();
+        let _ =
+            writeln!(text, "  warning: the simulated loop leaves every bound after {} s", format::number(t));
+    }
+    if let Some(f) = family {
+        let _ = writeln!(
+            text,
+            "  on {} perturbed plants: {} settle, {} diverge",
+            f.members, f.settled, f.diverged
+        );
+    }
+    text
+}

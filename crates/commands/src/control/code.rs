@@ -1,0 +1,191 @@
+//! The law and its observer as code, with numbers that the code must reproduce.
+
+use std::fmt::Write as _;
+
+use greybox_control::{OutputFeedback, Plant, Run, observer};
+use greybox_export::{ChainForm, Constant, Function, Group, Member, ObserverCode, ObserverForm};
+use greybox_model::Model;
+use greybox_recording::write_csv;
+
+use super::answer::observer_in_words;
+use super::designed::Designed;
+use crate::failure::Failure;
+
+/// Samples of the simulated loop that the observer's code must reproduce.
+const OBSERVED: usize = 2000;
+/// States at which the exported code must agree, for each set point.
+const VECTORS: usize = 32;
+
+/// A state with its unit.
+fn state_member(model: &Model, name: &str, primes: u8) -> Member {
+    let unit = model.state(name).map_or("", |i| model.states[i].unit.text.as_str());
+    // Rates have no unit text of their own.
+    let unit = match (unit, primes) {
+        ("", _) => String::new(),
+        (unit, 0) => format!("SI of {unit}"),
+        (unit, 1) => format!("SI of {unit} per s"),
+        (unit, n) => format!("SI of {unit} per s^{n}"),
+    };
+    Member::new(name, primes, &unit)
+}
+
+/// The parameters as constants.
+fn constants(model: &Model, plant: &Plant) -> Vec<Constant> {
+    let parameter = |(name, value): &(String, f64)| {
+        let unit = model.parameter(name).and_then(|i| model.parameters[i].unit.as_ref());
+        Constant::new(name, *value, unit.map_or("", |u| u.text.as_str()))
+    };
+    plant.parameters().iter().map(parameter).collect()
+}
+
+/// The observer and the equations that it predicts with.
+pub(super) fn observer_code(
+    designed: &Designed<'_>,
+    output: &OutputFeedback,
+    law: &Function,
+) -> ObserverCode {
+    let Designed { model, file, controller, .. } = *designed;
+    let plant = controller.plant();
+    let (f, g) = plant.frictionless();
+    let input = greybox_model::Expr::var(plant.input_name());
+    let rates = f.iter().zip(g).zip(plant.state_names());
+    let state = plant.symbols().iter().map(|(name, primes)| state_member(model, name, *primes));
+    let rate = Function {
+        name: "plant_rate".into(),
+        summary: vec![
+            format!("Equations of motion of {}, friction dropped, for the observer.", model.name),
+            format!("Made by greybox {} from {file}.", env!("CARGO_PKG_VERSION")),
+        ],
+        arguments: vec![
+            Group { name: "state".into(), members: state.collect() },
+            Group { name: "command".into(), members: vec![Member::new(plant.input_name(), 0, "SI")] },
+        ],
+        constants: constants(model, plant),
+        outputs: rates
+            .map(|((f, g), name)| {
+                (format!("rate of {name}"), (f.clone() + g.clone() * input.clone()).simplify())
+            })
+            .collect(),
+    };
+    let form = match output.observer().form() {
+        observer::Form::Kalman { gain } => ObserverForm::Kalman { gain },
+        observer::Form::Eso(chains) => ObserverForm::Chains(
+            chains
+                .into_iter()
+                .map(|c| ChainForm {
+                    first: c.first,
+                    a: c.a,
+                    before: c.before,
+                    now: c.now,
+                    input: c.input,
+                    gain: c.gain,
+                    weight: c.weight,
+                })
+                .collect(),
+        ),
+    };
+    ObserverCode {
+        summary: vec![format!(
+            "{}. Call observer_step once a sample; it calls {} of the law's file.",
+            observer_in_words(output),
+            law.name
+        )],
+        rate,
+        law: law.clone(),
+        dt: controller.dt(),
+        measured: output.observer().measured().to_vec(),
+        dead_zone: plant.dead_zone(),
+        substeps: output.observer().substeps(),
+        late: (output.observer().late().samples, output.observer().late().part),
+        form,
+    }
+}
+
+/// What the sensors said in the simulated loop, and the command that the observer's code must give.
+pub(super) fn observed(designed: &Designed<'_>, output: &OutputFeedback) -> Result<Vec<u8>, Failure> {
+    let Designed { controller, run, .. } = *designed;
+    let names = controller.plant().state_names();
+    let count = run.t.len().min(OBSERVED);
+    let mut columns: Vec<(&str, &[f64])> = Vec::new();
+    for (&i, y) in output.observer().measured().iter().zip(&run.y) {
+        columns.push((names[i].as_str(), &y[..count]));
+    }
+    columns.extend([("set_point", &run.r[..count]), ("command", &run.u[..count])]);
+    let mut csv = Vec::new();
+    write_csv(&mut csv, &run.t[..count], &columns)?;
+    Ok(csv)
+}
+
+/// The law as a function of the state, the disturbance where an observer estimates it, and the set point.
+pub(super) fn function(designed: &Designed<'_>) -> Function {
+    let Designed { model, file, controller, output, .. } = *designed;
+    let plant = controller.plant();
+    let member = |(name, primes): &(String, u8)| state_member(model, name, *primes);
+    let law = match output {
+        Some(output) => output.law().clone(),
+        None => controller.law().first().cloned().unwrap_or(greybox_model::Expr::Num(0.0)),
+    };
+    let (low, high) = controller.limits();
+    let disturbance = output.map(|o| Group {
+        name: "disturbance".into(),
+        members: vec![Member::new(o.disturbance(), 0, "units of the command")],
+    });
+    let set_point =
+        Group { name: "set_point".into(), members: vec![member(&(controller.reference().to_owned(), 0))] };
+    let state = Group { name: "state".into(), members: plant.symbols().iter().map(member).collect() };
+    Function {
+        name: "control_law".into(),
+        summary: vec![
+            format!("{} law of {} for {}", controller.method().name(), plant.input_name(), model.name),
+            format!("Made by greybox {} from {file}.", env!("CARGO_PKG_VERSION")),
+            format!("Call it every {} s and hold the command; range {low} to {high}.", controller.dt()),
+        ],
+        arguments: [Some(state), disturbance, Some(set_point)].into_iter().flatten().collect(),
+        constants: constants(model, plant),
+        outputs: vec![(format!("{}, SI", plant.input_name()), law)],
+    }
+}
+
+/// States around the set points, with the command that the code must give.
+pub(super) fn vectors(
+    designed: &Designed<'_>,
+    function: &Function,
+    to: f64,
+) -> Result<String, greybox_export::ExportError> {
+    let Designed { controller, output, .. } = *designed;
+    let plant = controller.plant();
+    let mut points = Vec::new();
+    for check in controller.checks() {
+        for k in 0..VECTORS {
+            // Evenly spread whatever the number of states: a Kronecker sequence of square roots of primes.
+            let roots = [2f64, 3.0, 5.0, 7.0, 11.0, 13.0, 17.0, 19.0, 23.0, 29.0, 31.0, 37.0];
+            let spread = |i: usize| 2.0 * (k as f64 * roots[i % roots.len()].sqrt()).fract() - 1.0;
+            let state = check.equilibrium.state.iter().zip(plant.sizes()).enumerate();
+            let mut point: Vec<f64> = state.map(|(i, (x, size))| x + size * spread(i)).collect();
+            if output.is_some() {
+                point.push(plant.input_size() * spread(plant.order()));
+            }
+            point.push(if k % 2 == 0 { check.set_point } else { 0.5 * to });
+            points.push(point);
+        }
+    }
+    let mut names = plant.state_names();
+    names.extend(output.map(|o| o.disturbance().to_owned()));
+    names.extend([controller.reference().to_owned(), plant.input_name().to_owned()]);
+    let mut text = names.join(",") + "\n";
+    for vector in function.vectors(&points)? {
+        let numbers: Vec<String> =
+            vector.arguments.iter().chain(&vector.outputs).map(|v| format!("{v:?}")).collect();
+        let _ = writeln!(text, "{}", numbers.join(","));
+    }
+    Ok(text)
+}
+
+/// The closed loop as a table.
+pub(super) fn series(run: &Run) -> Result<Vec<u8>, Failure> {
+    let mut columns: Vec<(&str, &[f64])> = vec![("set_point", &run.r), ("command", &run.u)];
+    columns.extend(run.states.iter().zip(&run.x).map(|(name, x)| (name.as_str(), x.as_slice())));
+    let mut csv = Vec::new();
+    write_csv(&mut csv, &run.t, &columns)?;
+    Ok(csv)
+}

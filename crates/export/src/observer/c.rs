@@ -1,0 +1,255 @@
+//! An observer in C99.
+
+use super::fill::{fill, list};
+use super::{ChainForm, ObserverCode, ObserverForm};
+use crate::language::number;
+
+const MEMORY: &str = "
+void @LAW@(const double state[@N@], const double disturbance[1], const double set_point[1], double out[1]);
+
+typedef struct {
+    double estimate[@N1@]; /* the states, then the disturbance */
+    double command;
+    double past[@PAST@]; /* behind the dead zone, the latest first */
+    int started;
+@CHAINS@} observer_memory;
+
+void observer_start(observer_memory *memory);
+double observer_step(observer_memory *memory, const double measured[@M@], const double set_point[1]);
+
+/* Before the first sample. */
+void observer_start(observer_memory *memory)
+{
+    int i;
+    for (i = 0; i < @N1@; i++) memory->estimate[i] = 0.0;
+    for (i = 0; i < @PAST@; i++) memory->past[i] = 0.0;
+    memory->command = 0.0;
+    memory->started = 0;
+@START@}
+
+";
+
+const CHAINS: &str = "    double chain[@SIZE@];
+    double last[@K@];
+    int begun[@K@];
+";
+
+const START: &str = "    for (i = 0; i < @SIZE@; i++) memory->chain[i] = 0.0;
+    for (i = 0; i < @K@; i++) { memory->last[i] = 0.0; memory->begun[i] = 0; }
+";
+
+const PREDICT: &str = "/* The states a time later under a command: classical Runge-Kutta steps. */
+static void predict(double x[@N1@], double command, double time, int steps)
+{
+    const double h = time / steps;
+    double k1[@N@], k2[@N@], k3[@N@], k4[@N@], at[@N@], input[1];
+    int i, j;
+    input[0] = command + x[@N@];
+    for (j = 0; j < steps; j++) {
+        @RATE@(x, input, k1);
+        for (i = 0; i < @N@; i++) at[i] = x[i] + 0.5 * h * k1[i];
+        @RATE@(at, input, k2);
+        for (i = 0; i < @N@; i++) at[i] = x[i] + 0.5 * h * k2[i];
+        @RATE@(at, input, k3);
+        for (i = 0; i < @N@; i++) at[i] = x[i] + h * k3[i];
+        @RATE@(at, input, k4);
+        for (i = 0; i < @N@; i++)
+            x[i] = x[i] + h / 6.0 * (k1[i] + 2.0 * k2[i] + 2.0 * k3[i] + k4[i]);
+    }
+}
+
+";
+
+const STEP: &str = "/* Once a sample, every @DT@ s: the command from the measurements and the set point. A measurement that is not a
+   number is left out. */
+double observer_step(observer_memory *memory, const double measured[@M@], const double set_point[1])
+{
+    static const int place[@M@] = {@PLACES@};
+    double *x = memory->estimate, *past = memory->past;
+    const double u = memory->command;
+    const double gap = @GAP@;
+    double out[1];
+    int i;
+    for (i = @OLDEST@; i > 0; i--) past[i] = past[i - 1];
+    past[0] = u > gap ? u - gap : u < -gap ? u + gap : 0.0;
+    if (!memory->started) {
+        for (i = 0; i < @M@; i++)
+            x[place[i]] = measured[i] - measured[i] == 0.0 ? measured[i] : 0.0;
+    }@ESTIMATE@    memory->started = 1;
+@LAW@    memory->command = out[0];
+    return out[0];
+}
+";
+
+const KALMAN: &str = " else {
+        static const double gain[@N1@][@M@] = {@GAIN@};
+        double innovation[@M@];
+        int j;
+@PREDICTIONS@        for (i = 0; i < @M@; i++)
+            innovation[i] = measured[i] - measured[i] == 0.0 ? measured[i] - x[place[i]] : 0.0;
+        for (i = 0; i < @N1@; i++)
+            for (j = 0; j < @M@; j++) x[i] += gain[i][j] * innovation[j];
+    }
+";
+
+const ESO: &str = "
+    {
+        const double acting = @ACTING@;
+        double lumped, above = 0.0, below = 0.0, rest[@N@], moved[@N@], input[1];
+@CHAINS@        input[0] = acting;
+        @RATE@(x, input, rest);
+        input[0] = acting + 1.0;
+        @RATE@(x, input, moved);
+@DISTURBANCES@        x[@N@] = below > 0.0 ? above / below : 0.0;
+    }
+";
+
+const CHAIN: &str = "        {
+            static const double a[@SIZE@][@SIZE@] = {@A@};
+            static const double before[@SIZE@] = @BEFORE@, now[@SIZE@] = @NOW@, g[@SIZE@] = @INPUT@;
+            double *z = memory->chain + @START@;
+            double next[@SIZE@], y = measured[@AT@];
+            const int known = y - y == 0.0;
+            int j;
+            if (memory->begun[@K@]) {
+                for (i = 0; i < @SIZE@; i++) {
+                    next[i] = before[i] * memory->last[@K@] + g[i] * acting;
+                    for (j = 0; j < @SIZE@; j++) next[i] += a[i][j] * z[j];
+                }
+                /* Without a measurement, the one that is expected. */
+                if (!known) y = next[0] / (1.0 - now[0]);
+                for (i = 0; i < @SIZE@; i++) z[i] = next[i] + now[i] * y;
+                memory->last[@K@] = y;
+            } else if (known) {
+                z[0] = y;
+                memory->last[@K@] = y;
+                memory->begun[@K@] = 1;
+            }
+            for (i = 0; i < @ORDER@; i++) x[@FIRST@ + i] = z[i];
+        }
+";
+
+const DISTURBANCE: &str = "        lumped = memory->chain[@LAST@] + @GAIN@ * acting;
+        above += @WEIGHT@ * (moved[@ROW@] - rest[@ROW@]) * (lumped - rest[@ROW@]);
+        below += @WEIGHT@ * (moved[@ROW@] - rest[@ROW@]) * (moved[@ROW@] - rest[@ROW@]);
+";
+
+const AHEAD: &str = "    /* The law acts on the states that its command will meet. */
+    {
+        double ahead[@N1@];
+        for (i = 0; i < @N1@; i++) ahead[i] = x[i];
+@PREDICTIONS@        @LAW@(ahead, ahead + @N@, set_point, out);
+    }
+";
+
+/// What follows the machine's equations in the observer's file.
+pub(super) fn write(code: &ObserverCode) -> String {
+    let (n, m, late) = (code.states(), code.measured.len(), code.late.0);
+    let (n1, past, (law, rate)) = (n + 1, late + 2, (&code.law.name, &code.rate.name));
+    let (k, size) = (code.chains().len(), code.chains().iter().map(|c| c.a.len()).sum::<usize>());
+    let chained = |text: &str| match k {
+        0 => String::new(),
+        k => fill(text, &[("SIZE", &size), ("K", &k)]),
+    };
+    let mut out: String =
+        code.summary.iter().map(|l| format!("/* {} */\n", crate::language::comment(l))).collect();
+    out.push_str(&fill(
+        MEMORY,
+        &[
+            ("LAW", law),
+            ("N", &n),
+            ("N1", &n1),
+            ("M", &m),
+            ("PAST", &past),
+            ("CHAINS", &chained(CHAINS)),
+            ("START", &chained(START)),
+        ],
+    ));
+    if code.predicts() {
+        out.push_str(&fill(PREDICT, &[("N", &n), ("N1", &n1), ("RATE", rate)]));
+    }
+    let estimate = match &code.form {
+        ObserverForm::Kalman { gain } => fill(
+            KALMAN,
+            &[
+                ("N1", &n1),
+                ("M", &m),
+                ("GAIN", &list(gain.iter().map(|row| braces(row)))),
+                ("PREDICTIONS", &code.over_a_sample(&predict("x"))),
+            ],
+        ),
+        ObserverForm::Chains(chains) => eso(code, chains),
+    };
+    let call = if code.is_late() {
+        let predictions = code.over_the_delay(&predict("ahead"), "i - 1", &|call| {
+            format!("        for (i = {late}; i > 0; i--) {}", call.trim_start())
+        });
+        fill(AHEAD, &[("N", &n), ("N1", &n1), ("LAW", law), ("PREDICTIONS", &predictions)])
+    } else {
+        format!("    {law}(x, x + {n}, set_point, out);\n")
+    };
+    out.push_str(&fill(
+        STEP,
+        &[
+            ("DT", &number(code.dt)),
+            ("M", &m),
+            ("PLACES", &list(code.measured.iter().map(usize::to_string))),
+            ("GAP", &number(code.dead_zone)),
+            ("OLDEST", &(late + 1)),
+            ("ESTIMATE", &estimate),
+            ("LAW", &call),
+        ],
+    ));
+    out
+}
+
+/// A call that predicts `x` over a time under a command of the past.
+fn predict(x: &str) -> impl Fn(&str, (f64, usize)) -> String {
+    move |past, (time, steps)| format!("        predict({x}, past[{past}], {}, {steps});\n", number(time))
+}
+
+fn braces(row: &[f64]) -> String {
+    format!("{{{}}}", list(row.iter().map(|v| number(*v))))
+}
+
+fn eso(code: &ObserverCode, chains: &[ChainForm]) -> String {
+    let starts = code.starts();
+    let step = |(k, (chain, start)): (usize, (&ChainForm, &usize))| {
+        fill(
+            CHAIN,
+            &[
+                ("SIZE", &chain.a.len()),
+                ("ORDER", &(chain.a.len() - 1)),
+                ("A", &list(chain.a.iter().map(|row| braces(row)))),
+                ("BEFORE", &braces(&chain.before)),
+                ("NOW", &braces(&chain.now)),
+                ("INPUT", &braces(&chain.input)),
+                ("START", start),
+                ("AT", &code.measurement(chain)),
+                ("K", &k),
+                ("FIRST", &chain.first),
+            ],
+        )
+    };
+    let disturbance = |(chain, start): (&ChainForm, &usize)| {
+        fill(
+            DISTURBANCE,
+            &[
+                ("LAST", &(start + chain.a.len() - 1)),
+                ("GAIN", &number(chain.gain)),
+                ("WEIGHT", &number(chain.weight)),
+                ("ROW", &(chain.first + chain.a.len() - 2)),
+            ],
+        )
+    };
+    fill(
+        ESO,
+        &[
+            ("ACTING", &code.acting("past")),
+            ("N", &code.states()),
+            ("RATE", &code.rate.name),
+            ("CHAINS", &chains.iter().zip(&starts).enumerate().map(step).collect::<String>()),
+            ("DISTURBANCES", &chains.iter().zip(&starts).map(disturbance).collect::<String>()),
+        ],
+    )
+}

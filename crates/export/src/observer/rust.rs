@@ -1,0 +1,269 @@
+//! An observer in Rust without the standard library.
+
+use super::fill::{fill, list};
+use super::{ChainForm, ObserverCode, ObserverForm};
+use crate::language::number;
+
+const PREDICT: &str = "/// The states a time later under a command: classical Runge-Kutta steps.
+#[allow(clippy::all)]
+fn predict(estimate: &mut [f64; @N1@], command: f64, time: f64, steps: u32) {
+    let h = time / f64::from(steps);
+    let input = [command + estimate[@N@]];
+    let mut x = [0.0; @N@];
+    x.copy_from_slice(&estimate[..@N@]);
+    for _ in 0..steps {
+        let k1 = @RATE@(&x, &input);
+        let k2 = @RATE@(&core::array::from_fn(|i| x[i] + 0.5 * h * k1[i]), &input);
+        let k3 = @RATE@(&core::array::from_fn(|i| x[i] + 0.5 * h * k2[i]), &input);
+        let k4 = @RATE@(&core::array::from_fn(|i| x[i] + h * k3[i]), &input);
+        for i in 0..@N@ {
+            x[i] += h / 6.0 * (k1[i] + 2.0 * k2[i] + 2.0 * k3[i] + k4[i]);
+        }
+    }
+    estimate[..@N@].copy_from_slice(&x);
+}
+
+";
+
+const OBSERVER: &str = "/// What the observer remembers between two samples.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct Observer {
+    /// The states, then the disturbance.
+    pub estimate: [f64; @N1@],
+    command: f64,
+    /// Behind the dead zone, the latest first.
+    past: [f64; @PAST@],
+    started: bool,
+@FIELDS@}
+
+#[allow(clippy::all)]
+impl Observer {
+    /// Before the first sample.
+    #[must_use]
+    pub const fn new() -> Observer {
+        Observer {
+            estimate: [0.0; @N1@],
+            command: 0.0,
+            past: [0.0; @PAST@],
+            started: false,
+@ZEROS@        }
+    }
+
+    /// Once a sample, every @DT@ s: the command from the measurements and the set point. A measurement that is not a
+    /// number is left out. `law` is `@LAW@`.
+    pub fn step(
+        &mut self,
+        measured: &[f64; @M@],
+        set_point: &[f64; 1],
+        law: impl Fn(&[f64; @N@], &[f64; 1], &[f64; 1]) -> [f64; 1],
+    ) -> f64 {
+        const PLACE: [usize; @M@] = [@PLACES@];
+        const GAP: f64 = @GAP@;
+        let u = self.command;
+        self.past.copy_within(0..@OLDEST@, 1);
+        self.past[0] = if u > GAP { u - GAP } else if u < -GAP { u + GAP } else { 0.0 };
+        if !self.started {
+            for i in 0..@M@ {
+                self.estimate[PLACE[i]] = if measured[i].is_finite() { measured[i] } else { 0.0 };
+            }
+        }@ESTIMATE@        self.started = true;
+@AHEAD@        let mut x = [0.0; @N@];
+        x.copy_from_slice(&ahead[..@N@]);
+        self.command = law(&x, &[ahead[@N@]], set_point)[0];
+        self.command
+    }
+}
+
+impl Default for Observer {
+    fn default() -> Self {
+        Self::new()
+    }
+}
+";
+
+const FIELDS: &str = "    chain: [f64; @SIZE@],
+    last: [f64; @K@],
+    begun: [bool; @K@],
+";
+
+const ZEROS: &str = "            chain: [0.0; @SIZE@],
+            last: [0.0; @K@],
+            begun: [false; @K@],
+";
+
+const KALMAN: &str = " else {
+            const GAIN: [[f64; @M@]; @N1@] = [@GAIN@];
+@PREDICTIONS@            let innovation: [f64; @M@] = core::array::from_fn(|i| {
+                if measured[i].is_finite() { measured[i] - self.estimate[PLACE[i]] } else { 0.0 }
+            });
+            for i in 0..@N1@ {
+                for j in 0..@M@ {
+                    self.estimate[i] += GAIN[i][j] * innovation[j];
+                }
+            }
+        }
+";
+
+const ESO: &str = "
+        let acting = @ACTING@;
+@CHAINS@        let mut x = [0.0; @N@];
+        x.copy_from_slice(&self.estimate[..@N@]);
+        let rest = @RATE@(&x, &[acting]);
+        let moved = @RATE@(&x, &[acting + 1.0]);
+        let (mut above, mut below) = (0.0, 0.0);
+@DISTURBANCES@        self.estimate[@N@] = if below > 0.0 { above / below } else { 0.0 };
+";
+
+const CHAIN: &str = "        {
+            const A: [[f64; @SIZE@]; @SIZE@] = [@A@];
+            const BEFORE: [f64; @SIZE@] = @BEFORE@;
+            const NOW: [f64; @SIZE@] = @NOW@;
+            const G: [f64; @SIZE@] = @INPUT@;
+            let z = &mut self.chain[@START@..@END@];
+            let mut y = measured[@AT@];
+            let known = y.is_finite();
+            if self.begun[@K@] {
+                let mut next = [0.0; @SIZE@];
+                for i in 0..@SIZE@ {
+                    next[i] = BEFORE[i] * self.last[@K@] + G[i] * acting;
+                    for j in 0..@SIZE@ {
+                        next[i] += A[i][j] * z[j];
+                    }
+                }
+                // Without a measurement, the one that is expected.
+                if !known {
+                    y = next[0] / (1.0 - NOW[0]);
+                }
+                for i in 0..@SIZE@ {
+                    z[i] = next[i] + NOW[i] * y;
+                }
+                self.last[@K@] = y;
+            } else if known {
+                z[0] = y;
+                self.last[@K@] = y;
+                self.begun[@K@] = true;
+            }
+            for i in 0..@ORDER@ {
+                self.estimate[@FIRST@ + i] = z[i];
+            }
+        }
+";
+
+const DISTURBANCE: &str = "        let lumped = self.chain[@LAST@] + @GAIN@ * acting;
+        above += @WEIGHT@ * (moved[@ROW@] - rest[@ROW@]) * (lumped - rest[@ROW@]);
+        below += @WEIGHT@ * (moved[@ROW@] - rest[@ROW@]) * (moved[@ROW@] - rest[@ROW@]);
+";
+
+const AHEAD: &str = "        // The law acts on the states that its command will meet.
+        let mut ahead = self.estimate;
+";
+
+/// What follows the machine's equations in the observer's file.
+pub(super) fn write(code: &ObserverCode) -> String {
+    let (n, m, late) = (code.states(), code.measured.len(), code.late.0);
+    let n1 = n + 1;
+    let (k, size) = (code.chains().len(), code.chains().iter().map(|c| c.a.len()).sum::<usize>());
+    let chained = |text: &str| match k {
+        0 => String::new(),
+        k => fill(text, &[("SIZE", &size), ("K", &k)]),
+    };
+    let mut out: String =
+        code.summary.iter().map(|l| format!("// {}\n", crate::language::comment(l))).collect();
+    out.push('\n');
+    if code.predicts() {
+        out.push_str(&fill(PREDICT, &[("N", &n), ("N1", &n1), ("RATE", &code.rate.name)]));
+    }
+    let estimate = match &code.form {
+        ObserverForm::Kalman { gain } => fill(
+            KALMAN,
+            &[
+                ("N1", &n1),
+                ("M", &m),
+                ("GAIN", &list(gain.iter().map(|row| brackets(row)))),
+                ("PREDICTIONS", &code.over_a_sample(&predict("            ", "self.estimate"))),
+            ],
+        ),
+        ObserverForm::Chains(chains) => eso(code, chains),
+    };
+    let ahead = if code.is_late() {
+        let predictions = code.over_the_delay(&predict("        ", "ahead"), "i", &|call| {
+            format!("        for i in (0..{late}).rev() {{\n    {call}        }}\n")
+        });
+        format!("{AHEAD}{predictions}")
+    } else {
+        "        let ahead = self.estimate;\n".to_owned()
+    };
+    out.push_str(&fill(
+        OBSERVER,
+        &[
+            ("N", &n),
+            ("N1", &n1),
+            ("M", &m),
+            ("PAST", &(late + 2)),
+            ("FIELDS", &chained(FIELDS)),
+            ("ZEROS", &chained(ZEROS)),
+            ("DT", &number(code.dt)),
+            ("LAW", &code.law.name),
+            ("PLACES", &list(code.measured.iter().map(usize::to_string))),
+            ("GAP", &number(code.dead_zone)),
+            ("OLDEST", &(late + 1)),
+            ("ESTIMATE", &estimate),
+            ("AHEAD", &ahead),
+        ],
+    ));
+    out
+}
+
+/// A call that predicts `x` over a time under a command of the past.
+fn predict(indent: &'static str, x: &'static str) -> impl Fn(&str, (f64, usize)) -> String {
+    move |past, (time, steps)| {
+        format!("{indent}predict(&mut {x}, self.past[{past}], {}, {steps});\n", number(time))
+    }
+}
+
+fn brackets(row: &[f64]) -> String {
+    format!("[{}]", list(row.iter().map(|v| number(*v))))
+}
+
+fn eso(code: &ObserverCode, chains: &[ChainForm]) -> String {
+    let starts = code.starts();
+    let step = |(k, (chain, start)): (usize, (&ChainForm, &usize))| {
+        fill(
+            CHAIN,
+            &[
+                ("SIZE", &chain.a.len()),
+                ("ORDER", &(chain.a.len() - 1)),
+                ("A", &list(chain.a.iter().map(|row| brackets(row)))),
+                ("BEFORE", &brackets(&chain.before)),
+                ("NOW", &brackets(&chain.now)),
+                ("INPUT", &brackets(&chain.input)),
+                ("START", start),
+                ("END", &(start + chain.a.len())),
+                ("AT", &code.measurement(chain)),
+                ("K", &k),
+                ("FIRST", &chain.first),
+            ],
+        )
+    };
+    let disturbance = |(chain, start): (&ChainForm, &usize)| {
+        fill(
+            DISTURBANCE,
+            &[
+                ("LAST", &(start + chain.a.len() - 1)),
+                ("GAIN", &number(chain.gain)),
+                ("WEIGHT", &number(chain.weight)),
+                ("ROW", &(chain.first + chain.a.len() - 2)),
+            ],
+        )
+    };
+    fill(
+        ESO,
+        &[
+            ("ACTING", &code.acting("self.past")),
+            ("N", &code.states()),
+            ("RATE", &code.rate.name),
+            ("CHAINS", &chains.iter().zip(&starts).enumerate().map(step).collect::<String>()),
+            ("DISTURBANCES", &chains.iter().zip(&starts).map(disturbance).collect::<String>()),
+        ],
+    )
+}
