@@ -33,7 +33,7 @@ pub use feedforward::FeedForward;
 pub use greybox_smc::check::Pole;
 pub use margins::Margins;
 pub use metrics::{Metrics, Verdict};
-pub use observer::{Lateness, Observer, ObserverMethod, Sensor};
+pub use observer::{InputDelay, Observer, ObserverMethod, Sensor};
 pub use output::{OutputCheck, OutputFeedback, OutputMemory, OutputOptions, UNSTATED_NOISE};
 pub use plant::{Dropped, Plant, PlantOptions};
 pub use run::{Reference, Run};

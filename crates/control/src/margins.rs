@@ -41,13 +41,13 @@ impl Margins {
 
 /// The loop as a linear system: x⁺ = A x + b v, u = c x; with v = u it is closed.
 #[derive(Debug, Clone, PartialEq)]
-pub(crate) struct CutLoop {
+pub(crate) struct OpenLoop {
     pub(crate) a: DMatrix<f64>,
     pub(crate) b: DMatrix<f64>,
     pub(crate) c: DMatrix<f64>,
 }
 
-impl CutLoop {
+impl OpenLoop {
     /// L = −c (z I − A)⁻¹ b.
     fn response(&self, z: Complex<f64>) -> Option<Complex<f64>> {
         let n = self.a.nrows();
@@ -138,8 +138,8 @@ mod tests {
     #[test]
     fn an_integrator_has_the_margins_of_the_book() {
         let (dt, k): (f64, f64) = (0.01, 20.0);
-        let cut = CutLoop { a: dmatrix![1.0], b: dmatrix![dt], c: dmatrix![-k] };
-        let m = cut.margins(dt);
+        let open = OpenLoop { a: dmatrix![1.0], b: dmatrix![dt], c: dmatrix![-k] };
+        let m = open.margins(dt);
         // |L| = 1 at 2 sin(θ/2) = k dt; the phase there is −π/2 − θ/2.
         let theta = 2.0 * (0.5 * k * dt).asin();
         let phase = 0.5 * std::f64::consts::PI - 0.5 * theta;

@@ -21,8 +21,8 @@ use crate::stability;
 const LONGEST: f64 = 0.5;
 /// Most steps of the prediction between two samples.
 const MOST_SUBSTEPS: usize = 64;
-/// Most samples by which a command may be late.
-const MOST_LATE: usize = 40;
+/// Longest delay of the command, samples.
+const MOST_DELAYED: usize = 40;
 /// A share of a sample that is rounding.
 const WHOLE: f64 = 1e-9;
 
@@ -84,31 +84,29 @@ pub struct Observer {
     kind: Kind,
     /// Runge–Kutta steps of a prediction over one sample.
     substeps: usize,
-    late: Lateness,
+    input_delay: InputDelay,
 }
 
-/// How late the command acts: whole samples, and a part of one, s.
+/// The delay of the command in samples.
 #[derive(Debug, Clone, Copy, PartialEq)]
-pub struct Lateness {
+pub struct InputDelay {
     /// Whole samples.
     pub samples: usize,
-    /// What is left, below one sample, s.
-    pub part: f64,
+    /// What is left, less than one sample, s.
+    pub remainder: f64,
 }
 
-impl Lateness {
-    fn new(delay: f64, dt: f64) -> Result<Lateness, ControlError> {
+impl InputDelay {
+    fn new(delay: f64, dt: f64) -> Result<InputDelay, ControlError> {
         let all = delay / dt;
         let whole = (all + WHOLE).floor();
-        let late = Lateness {
-            samples: whole as usize,
-            part: if all - whole < WHOLE { 0.0 } else { delay - whole * dt },
-        };
-        let samples = late.samples + usize::from(late.part > 0.0);
-        if samples > MOST_LATE {
-            return Err(ControlError::LongDelay { samples, most: MOST_LATE });
+        let remainder = if all - whole < WHOLE { 0.0 } else { delay - whole * dt };
+        let found = InputDelay { samples: whole as usize, remainder };
+        let samples = found.samples + usize::from(remainder > 0.0);
+        if samples > MOST_DELAYED {
+            return Err(ControlError::LongDelay { samples, most: MOST_DELAYED });
         }
-        Ok(late)
+        Ok(found)
     }
 }
 
@@ -158,7 +156,7 @@ impl Observer {
         if measured.is_empty() {
             return Err(ControlError::NothingMeasured { known: listed(plant.state_names()) });
         }
-        let late = Lateness::new(plant.input_delay(), dt)?;
+        let input_delay = InputDelay::new(plant.input_delay(), dt)?;
         let at = &point.equilibrium;
         let tangent = plant.frictionless_tangent(&at.state, at.input);
         let fastest = stability::poles(&tangent.a, plant.sizes())
@@ -174,7 +172,7 @@ impl Observer {
                 Kind::Eso(Chains::design(plant, at, dt, bandwidth, &measured)?)
             }
         };
-        Ok(Observer { plant: plant.clone(), dt, measured, kind, substeps, late })
+        Ok(Observer { plant: plant.clone(), dt, measured, kind, substeps, input_delay })
     }
 
     /// Indices of the measured states.
@@ -189,10 +187,10 @@ impl Observer {
         self.substeps
     }
 
-    /// How late the command acts.
+    /// The delay of the command.
     #[must_use]
-    pub fn late(&self) -> Lateness {
-        self.late
+    pub fn input_delay(&self) -> InputDelay {
+        self.input_delay
     }
 
     /// The observer in numbers.
@@ -211,7 +209,7 @@ impl Observer {
             Kind::Kalman { .. } => Vec::new(),
             Kind::Eso(chains) => chains.start(),
         };
-        let past = vec![0.0; self.late.samples + 2];
+        let past = vec![0.0; self.input_delay.samples + 2];
         Memory { estimate: vec![0.0; self.plant.order() + 1], chains, past, started: false }
     }
 
@@ -228,9 +226,9 @@ impl Observer {
         match &self.kind {
             Kind::Kalman { gain } => {
                 if memory.started {
-                    let Lateness { samples, part } = self.late;
-                    self.predict(&mut memory.estimate, memory.past[samples + 1], part);
-                    self.predict(&mut memory.estimate, memory.past[samples], self.dt - part);
+                    let InputDelay { samples, remainder } = self.input_delay;
+                    self.predict(&mut memory.estimate, memory.past[samples + 1], remainder);
+                    self.predict(&mut memory.estimate, memory.past[samples], self.dt - remainder);
                     let innovation = |(&i, y): (&usize, &f64)| match y.is_finite() {
                         true => y - memory.estimate[i],
                         false => 0.0,
@@ -241,8 +239,8 @@ impl Observer {
                 }
             }
             Kind::Eso(chains) => {
-                let Lateness { samples, part } = self.late;
-                let share = part / self.dt;
+                let InputDelay { samples, remainder } = self.input_delay;
+                let share = remainder / self.dt;
                 let acted = share * memory.past[samples + 1] + (1.0 - share) * memory.past[samples];
                 let memory = (memory.estimate.as_mut_slice(), memory.chains.as_mut_slice());
                 chains.follow(&self.plant, &self.measured, memory, y, acted);
@@ -253,9 +251,9 @@ impl Observer {
 
     /// x̂ and d̂ when the next command will act: over the delay by the commands that were given.
     pub(crate) fn ahead(&self, memory: &Memory) -> Vec<f64> {
-        let Lateness { samples, part } = self.late;
+        let InputDelay { samples, remainder } = self.input_delay;
         let mut estimate = memory.estimate.clone();
-        self.predict(&mut estimate, memory.past[samples], part);
+        self.predict(&mut estimate, memory.past[samples], remainder);
         for k in (0..samples).rev() {
             self.predict(&mut estimate, memory.past[k], self.dt);
         }
@@ -311,7 +309,7 @@ impl Observer {
                 })
             }
             Kind::Eso(chains) => {
-                Ok(chains.tangent(&self.plant, &plant, &self.measured, self.late.part / self.dt))
+                Ok(chains.tangent(&self.plant, &plant, &self.measured, self.input_delay.remainder / self.dt))
             }
         }
     }
@@ -324,18 +322,18 @@ impl Observer {
 
     /// What the commands do that act over one sample, first the older one, then the newer: Γ₁, Γ₀.
     pub(crate) fn inputs(&self, plant: &Linear, set_point: f64) -> Result<[DMatrix<f64>; 2], ControlError> {
-        let first = self.held(plant, self.late.part, set_point)?;
-        let rest = self.held(plant, self.dt - self.late.part, set_point)?;
+        let first = self.held(plant, self.input_delay.remainder, set_point)?;
+        let rest = self.held(plant, self.dt - self.input_delay.remainder, set_point)?;
         Ok([&rest.a * first.b, rest.b])
     }
 
     /// x̂ over the delay: what the estimate, d̂ and the last commands do, the latest first.
     pub(crate) fn prediction(&self, plant: &Linear, set_point: f64) -> Result<Prediction, ControlError> {
         let whole = self.held(plant, self.dt, set_point)?;
-        let part = self.held(plant, self.late.part, set_point)?;
+        let part = self.held(plant, self.input_delay.remainder, set_point)?;
         let mut power = DMatrix::identity(self.plant.order(), self.plant.order());
-        let mut commands = Vec::with_capacity(self.late.samples + 1);
-        for _ in 0..self.late.samples {
+        let mut commands = Vec::with_capacity(self.input_delay.samples + 1);
+        for _ in 0..self.input_delay.samples {
             commands.push(&power * &whole.b);
             power = &power * &whole.a;
         }

@@ -9,7 +9,7 @@ use crate::controller::Controller;
 use crate::design::{free_name, limited};
 use crate::equilibrium::Equilibrium;
 use crate::error::{ControlError, listed};
-use crate::margins::{CutLoop, Margins};
+use crate::margins::{Margins, OpenLoop};
 use crate::observer::{Memory, Observer, ObserverMethod, Prediction, Sensor, Tangent};
 use crate::stability;
 
@@ -269,16 +269,16 @@ impl OutputFeedback {
         set_point: f64,
         at: &Equilibrium,
     ) -> Result<OutputCheck, ControlError> {
-        let cut = self.cut_at_the_command(controller, set_point, at)?;
-        let sizes = vec![1.0; cut.a.nrows()];
-        let poles = stability::poles(&(&cut.a + &cut.b * &cut.c), &sizes)
+        let open = self.open_loop(controller, set_point, at)?;
+        let sizes = vec![1.0; open.a.nrows()];
+        let poles = stability::poles(&(&open.a + &open.b * &open.c), &sizes)
             .ok_or(ControlError::NoPoles { set_point })?;
         let spectral_radius = largest(&poles);
         if spectral_radius.is_nan() || spectral_radius >= 1.0 {
             let dt = controller.dt();
             return Err(ControlError::UnstableOutput { set_point, dt, radius: spectral_radius });
         }
-        Ok(OutputCheck { set_point, spectral_radius, margins: cut.margins(controller.dt()) })
+        Ok(OutputCheck { set_point, spectral_radius, margins: open.margins(controller.dt()) })
     }
 
     /// u = c z of z = (x̂ and d̂ as the observer remembers them, the last commands that the law gave).
@@ -298,12 +298,12 @@ impl OutputFeedback {
 
     /// Plant, observer and law as one linear system at a state of rest. Its state is x, the commands that the plant was
     /// given and that still act or will, the observer's memory, and the same commands as the law gave them.
-    fn cut_at_the_command(
+    fn open_loop(
         &self,
         controller: &Controller,
         set_point: f64,
         at: &Equilibrium,
-    ) -> Result<CutLoop, ControlError> {
+    ) -> Result<OpenLoop, ControlError> {
         let plant = controller.plant();
         let tangent = plant.frictionless_tangent(&at.state, at.input);
         let held = stability::held(&tangent, controller.dt(), plant.sizes(), plant.input_size())
@@ -315,7 +315,8 @@ impl OutputFeedback {
             DMatrix::from_row_slice(1, plant.order(), &controller.frictionless_gain(&at.state, set_point));
         let (of_memory, of_commands) = self.law_of_memory(&gain, &observer, &ahead);
 
-        let (n, past, size) = (plant.order(), self.observer.late().samples + 1, observer.carry.nrows());
+        let (n, past, size) =
+            (plant.order(), self.observer.input_delay().samples + 1, observer.carry.nrows());
         let (given, own, made) = (n, n + past, n + past + size);
         let all = made + past;
         let mut c = DMatrix::zeros(1, all);
@@ -353,7 +354,7 @@ impl OutputFeedback {
         view += next_a;
         let mut view = b.view_mut((own, 0), (size, 1));
         view += next_b;
-        Ok(CutLoop { a, b, c })
+        Ok(OpenLoop { a, b, c })
     }
 }
 
@@ -379,7 +380,7 @@ impl Controller {
             let held = stability::held(&tangent, self.dt(), plant.sizes(), plant.input_size())?;
             let gain = self.frictionless_gain(&at.state, check.set_point);
             let c = DMatrix::from_row_slice(1, plant.order(), &gain);
-            Some(CutLoop { a: held.a, b: held.b, c }.margins(self.dt()))
+            Some(OpenLoop { a: held.a, b: held.b, c }.margins(self.dt()))
         };
         self.checks().iter().map(of).collect()
     }

@@ -252,7 +252,7 @@ fn a_late_command_is_predicted_over() {
         for (method, bound) in [(KALMAN, 4e-4), (ESO, 0.12)] {
             let mut loop_options = with(&law, method, fine);
             let Feedback::Output(output) = &loop_options.feedback else { unreachable!() };
-            assert_eq!(output.observer().late().samples, samples);
+            assert_eq!(output.observer().input_delay().samples, samples);
             let margin = output.checks().iter().map(|c| c.margins.delay).fold(f64::INFINITY, f64::min);
             let seen = run(&model, &law, &loop_options, &reference);
             let shift = (tau / 2e-3).round() as usize;

@@ -29,7 +29,7 @@ use crate::language::{Language, number};
 ///     measured: vec![0],
 ///     dead_zone: 0.0,
 ///     substeps: 1,
-///     late: (0, 0.0),
+///     input_delay: (0, 0.0),
 ///     form: ObserverForm::Kalman { gain: vec![vec![0.4], vec![3.0]] },
 /// };
 /// assert!(code.code(Language::C99)?.contains("double observer_step(observer_memory *memory, const double measured[1]"));
@@ -52,8 +52,8 @@ pub struct ObserverCode {
     pub dead_zone: f64,
     /// Classical Runge–Kutta steps of a prediction over one sample, at least one.
     pub substeps: usize,
-    /// How late the command acts: whole samples, and a part of one, s.
-    pub late: (usize, f64),
+    /// The delay of the command: whole samples, and what is left, less than one, s.
+    pub input_delay: (usize, f64),
     /// The observer's equations.
     pub form: ObserverForm,
 }
@@ -133,18 +133,18 @@ impl ObserverCode {
 
     /// Whether the code predicts: a Kalman filter from sample to sample, any observer over the delay of the command.
     fn predicts(&self) -> bool {
-        matches!(self.form, ObserverForm::Kalman { .. }) || self.is_late()
+        matches!(self.form, ObserverForm::Kalman { .. }) || self.is_delayed()
     }
 
-    fn is_late(&self) -> bool {
-        self.late.0 > 0 || self.late.1 > 0.0
+    fn is_delayed(&self) -> bool {
+        self.input_delay.0 > 0 || self.input_delay.1 > 0.0
     }
 
     /// The predictions from the last sample to this one: first under the older command, where a part of a sample is late.
     fn over_a_sample(&self, predict: &dyn Fn(&str, (f64, usize)) -> String) -> String {
-        let (samples, part) = self.late;
-        let older = (part > 0.0).then(|| predict(&(samples + 1).to_string(), self.span(part)));
-        older.unwrap_or_default() + &predict(&samples.to_string(), self.span(self.dt - part))
+        let (samples, remainder) = self.input_delay;
+        let older = (remainder > 0.0).then(|| predict(&(samples + 1).to_string(), self.span(remainder)));
+        older.unwrap_or_default() + &predict(&samples.to_string(), self.span(self.dt - remainder))
     }
 
     /// The predictions over the delay; `repeated` makes a loop, from the oldest command to the
@@ -155,19 +155,19 @@ impl ObserverCode {
         index: &str,
         repeated: &dyn Fn(&str) -> String,
     ) -> String {
-        let (samples, part) = self.late;
-        let older = (part > 0.0).then(|| predict(&samples.to_string(), self.span(part)));
+        let (samples, remainder) = self.input_delay;
+        let older = (remainder > 0.0).then(|| predict(&samples.to_string(), self.span(remainder)));
         let whole = (samples > 0).then(|| repeated(&predict(index, self.span(self.dt))));
         older.unwrap_or_default() + &whole.unwrap_or_default()
     }
 
     /// The mean command since the last sample.
     fn acting(&self, past: &str) -> String {
-        let (samples, part) = self.late;
-        if part == 0.0 {
+        let (samples, remainder) = self.input_delay;
+        if remainder == 0.0 {
             return format!("{past}[{samples}]");
         }
-        let share = number(part / self.dt);
+        let share = number(remainder / self.dt);
         format!("{share} * {past}[{}] + (1.0 - {share}) * {past}[{samples}]", samples + 1)
     }
 }

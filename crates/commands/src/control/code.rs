@@ -84,6 +84,7 @@ pub(super) fn observer_code(
                 .collect(),
         ),
     };
+    let delay = output.observer().input_delay();
     ObserverCode {
         summary: vec![format!(
             "{}. Call observer_step once a sample; it calls {} of the law's file.",
@@ -96,7 +97,7 @@ pub(super) fn observer_code(
         measured: output.observer().measured().to_vec(),
         dead_zone: plant.dead_zone(),
         substeps: output.observer().substeps(),
-        late: (output.observer().late().samples, output.observer().late().part),
+        input_delay: (delay.samples, delay.remainder),
         form,
     }
 }

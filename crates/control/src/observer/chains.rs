@@ -151,14 +151,14 @@ impl Chains {
             lumped.push(z[coordinate.order] + coordinate.input * u);
         }
         let x = &estimate[..n];
-        let rest = plant.frictionless_rate(x, u);
+        let modelled = plant.frictionless_rate(x, u);
         let mut g = vec![0.0; n];
         plant.frictionless_input(x, &mut g);
         let (mut above, mut below) = (0.0, 0.0);
         for (coordinate, lumped) in self.coordinates.iter().zip(lumped) {
             let row = coordinate.first + coordinate.order - 1;
             let weight = g[row] / (plant.sizes()[row] * plant.sizes()[row]);
-            above += weight * (lumped - rest[row]);
+            above += weight * (lumped - modelled[row]);
             below += weight * g[row];
         }
         estimate[n] = if below > 0.0 { above / below } else { 0.0 };

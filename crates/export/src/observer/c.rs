@@ -144,8 +144,8 @@ const AHEAD: &str = "    /* The law acts on the states that its command will mee
 
 /// What follows the machine's equations in the observer's file.
 pub(super) fn write(code: &ObserverCode) -> String {
-    let (n, m, late) = (code.states(), code.measured.len(), code.late.0);
-    let (n1, past, (law, rate)) = (n + 1, late + 2, (&code.law.name, &code.rate.name));
+    let (n, m, delay) = (code.states(), code.measured.len(), code.input_delay.0);
+    let (n1, past, (law, rate)) = (n + 1, delay + 2, (&code.law.name, &code.rate.name));
     let (k, size) = (code.chains().len(), code.chains().iter().map(|c| c.a.len()).sum::<usize>());
     let chained = |text: &str| match k {
         0 => String::new(),
@@ -180,9 +180,9 @@ pub(super) fn write(code: &ObserverCode) -> String {
         ),
         ObserverForm::Chains(chains) => eso(code, chains),
     };
-    let call = if code.is_late() {
+    let call = if code.is_delayed() {
         let predictions = code.over_the_delay(&predict("ahead"), "i - 1", &|call| {
-            format!("        for (i = {late}; i > 0; i--) {}", call.trim_start())
+            format!("        for (i = {delay}; i > 0; i--) {}", call.trim_start())
         });
         fill(AHEAD, &[("N", &n), ("N1", &n1), ("LAW", law), ("PREDICTIONS", &predictions)])
     } else {
@@ -195,7 +195,7 @@ pub(super) fn write(code: &ObserverCode) -> String {
             ("M", &m),
             ("PLACES", &list(code.measured.iter().map(usize::to_string))),
             ("GAP", &number(code.dead_zone)),
-            ("OLDEST", &(late + 1)),
+            ("OLDEST", &(delay + 1)),
             ("ESTIMATE", &estimate),
             ("LAW", &call),
         ],

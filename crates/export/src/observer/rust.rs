@@ -160,7 +160,7 @@ const AHEAD: &str = "        // The law acts on the states that its command will
 
 /// What follows the machine's equations in the observer's file.
 pub(super) fn write(code: &ObserverCode) -> String {
-    let (n, m, late) = (code.states(), code.measured.len(), code.late.0);
+    let (n, m, delay) = (code.states(), code.measured.len(), code.input_delay.0);
     let n1 = n + 1;
     let (k, size) = (code.chains().len(), code.chains().iter().map(|c| c.a.len()).sum::<usize>());
     let chained = |text: &str| match k {
@@ -185,9 +185,9 @@ pub(super) fn write(code: &ObserverCode) -> String {
         ),
         ObserverForm::Chains(chains) => eso(code, chains),
     };
-    let ahead = if code.is_late() {
+    let ahead = if code.is_delayed() {
         let predictions = code.over_the_delay(&predict("        ", "ahead"), "i", &|call| {
-            format!("        for i in (0..{late}).rev() {{\n    {call}        }}\n")
+            format!("        for i in (0..{delay}).rev() {{\n    {call}        }}\n")
         });
         format!("{AHEAD}{predictions}")
     } else {
@@ -199,14 +199,14 @@ pub(super) fn write(code: &ObserverCode) -> String {
             ("N", &n),
             ("N1", &n1),
             ("M", &m),
-            ("PAST", &(late + 2)),
+            ("PAST", &(delay + 2)),
             ("FIELDS", &chained(FIELDS)),
             ("ZEROS", &chained(ZEROS)),
             ("DT", &number(code.dt)),
             ("LAW", &code.law.name),
             ("PLACES", &list(code.measured.iter().map(usize::to_string))),
             ("GAP", &number(code.dead_zone)),
-            ("OLDEST", &(late + 1)),
+            ("OLDEST", &(delay + 1)),
             ("ESTIMATE", &estimate),
             ("AHEAD", &ahead),
         ],
