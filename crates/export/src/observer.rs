@@ -4,6 +4,7 @@ mod c;
 mod fill;
 mod rust;
 
+use self::fill::{fill, list};
 use crate::error::ExportError;
 use crate::function::Function;
 use crate::language::{Language, number};
@@ -169,5 +170,61 @@ impl ObserverCode {
         }
         let share = number(remainder / self.dt);
         format!("{share} * {past}[{}] + (1.0 - {share}) * {past}[{samples}]", samples + 1)
+    }
+}
+
+/// How a language writes extended-state observers.
+struct ChainText {
+    whole: &'static str,
+    chain: &'static str,
+    disturbance: &'static str,
+    /// A list of numbers.
+    row: fn(&[f64]) -> String,
+    /// What the last commands are called.
+    past: &'static str,
+}
+
+impl ChainText {
+    fn write(&self, code: &ObserverCode, chains: &[ChainForm]) -> String {
+        let starts = code.starts();
+        let step = |(k, (chain, start)): (usize, (&ChainForm, &usize))| {
+            fill(
+                self.chain,
+                &[
+                    ("SIZE", &chain.a.len()),
+                    ("ORDER", &(chain.a.len() - 1)),
+                    ("A", &list(chain.a.iter().map(|row| (self.row)(row)))),
+                    ("BEFORE", &(self.row)(&chain.before)),
+                    ("NOW", &(self.row)(&chain.now)),
+                    ("INPUT", &(self.row)(&chain.input)),
+                    ("START", start),
+                    ("END", &(start + chain.a.len())),
+                    ("AT", &code.measurement(chain)),
+                    ("K", &k),
+                    ("FIRST", &chain.first),
+                ],
+            )
+        };
+        let disturbance = |(chain, start): (&ChainForm, &usize)| {
+            fill(
+                self.disturbance,
+                &[
+                    ("LAST", &(start + chain.a.len() - 1)),
+                    ("GAIN", &number(chain.gain)),
+                    ("WEIGHT", &number(chain.weight)),
+                    ("ROW", &(chain.first + chain.a.len() - 2)),
+                ],
+            )
+        };
+        fill(
+            self.whole,
+            &[
+                ("ACTING", &code.acting(self.past)),
+                ("N", &code.states()),
+                ("RATE", &code.rate.name),
+                ("CHAINS", &chains.iter().zip(&starts).enumerate().map(step).collect::<String>()),
+                ("DISTURBANCES", &chains.iter().zip(&starts).map(disturbance).collect::<String>()),
+            ],
+        )
     }
 }

@@ -1,7 +1,7 @@
 //! An observer in C99.
 
 use super::fill::{fill, list};
-use super::{ChainForm, ObserverCode, ObserverForm};
+use super::{ChainText, ObserverCode, ObserverForm};
 use crate::language::number;
 
 const MEMORY: &str = "
@@ -178,7 +178,10 @@ pub(super) fn write(code: &ObserverCode) -> String {
                 ("PREDICTIONS", &code.over_a_sample(&predict("x"))),
             ],
         ),
-        ObserverForm::Chains(chains) => eso(code, chains),
+        ObserverForm::Chains(chains) => {
+            ChainText { whole: ESO, chain: CHAIN, disturbance: DISTURBANCE, row: braces, past: "past" }
+                .write(code, chains)
+        }
     };
     let call = if code.is_delayed() {
         let predictions = code.over_the_delay(&predict("ahead"), "i - 1", &|call| {
@@ -210,46 +213,4 @@ fn predict(x: &str) -> impl Fn(&str, (f64, usize)) -> String {
 
 fn braces(row: &[f64]) -> String {
     format!("{{{}}}", list(row.iter().map(|v| number(*v))))
-}
-
-fn eso(code: &ObserverCode, chains: &[ChainForm]) -> String {
-    let starts = code.starts();
-    let step = |(k, (chain, start)): (usize, (&ChainForm, &usize))| {
-        fill(
-            CHAIN,
-            &[
-                ("SIZE", &chain.a.len()),
-                ("ORDER", &(chain.a.len() - 1)),
-                ("A", &list(chain.a.iter().map(|row| braces(row)))),
-                ("BEFORE", &braces(&chain.before)),
-                ("NOW", &braces(&chain.now)),
-                ("INPUT", &braces(&chain.input)),
-                ("START", start),
-                ("AT", &code.measurement(chain)),
-                ("K", &k),
-                ("FIRST", &chain.first),
-            ],
-        )
-    };
-    let disturbance = |(chain, start): (&ChainForm, &usize)| {
-        fill(
-            DISTURBANCE,
-            &[
-                ("LAST", &(start + chain.a.len() - 1)),
-                ("GAIN", &number(chain.gain)),
-                ("WEIGHT", &number(chain.weight)),
-                ("ROW", &(chain.first + chain.a.len() - 2)),
-            ],
-        )
-    };
-    fill(
-        ESO,
-        &[
-            ("ACTING", &code.acting("past")),
-            ("N", &code.states()),
-            ("RATE", &code.rate.name),
-            ("CHAINS", &chains.iter().zip(&starts).enumerate().map(step).collect::<String>()),
-            ("DISTURBANCES", &chains.iter().zip(&starts).map(disturbance).collect::<String>()),
-        ],
-    )
 }

@@ -1,7 +1,7 @@
 //! An observer in Rust without the standard library.
 
 use super::fill::{fill, list};
-use super::{ChainForm, ObserverCode, ObserverForm};
+use super::{ChainText, ObserverCode, ObserverForm};
 use crate::language::number;
 
 const PREDICT: &str = "/// The states a time later under a command: classical Runge-Kutta steps.
@@ -183,7 +183,10 @@ pub(super) fn write(code: &ObserverCode) -> String {
                 ("PREDICTIONS", &code.over_a_sample(&predict("            ", "self.estimate"))),
             ],
         ),
-        ObserverForm::Chains(chains) => eso(code, chains),
+        ObserverForm::Chains(chains) => {
+            ChainText { whole: ESO, chain: CHAIN, disturbance: DISTURBANCE, row: brackets, past: "self.past" }
+                .write(code, chains)
+        }
     };
     let ahead = if code.is_delayed() {
         let predictions = code.over_the_delay(&predict("        ", "ahead"), "i", &|call| {
@@ -223,47 +226,4 @@ fn predict(indent: &'static str, x: &'static str) -> impl Fn(&str, (f64, usize))
 
 fn brackets(row: &[f64]) -> String {
     format!("[{}]", list(row.iter().map(|v| number(*v))))
-}
-
-fn eso(code: &ObserverCode, chains: &[ChainForm]) -> String {
-    let starts = code.starts();
-    let step = |(k, (chain, start)): (usize, (&ChainForm, &usize))| {
-        fill(
-            CHAIN,
-            &[
-                ("SIZE", &chain.a.len()),
-                ("ORDER", &(chain.a.len() - 1)),
-                ("A", &list(chain.a.iter().map(|row| brackets(row)))),
-                ("BEFORE", &brackets(&chain.before)),
-                ("NOW", &brackets(&chain.now)),
-                ("INPUT", &brackets(&chain.input)),
-                ("START", start),
-                ("END", &(start + chain.a.len())),
-                ("AT", &code.measurement(chain)),
-                ("K", &k),
-                ("FIRST", &chain.first),
-            ],
-        )
-    };
-    let disturbance = |(chain, start): (&ChainForm, &usize)| {
-        fill(
-            DISTURBANCE,
-            &[
-                ("LAST", &(start + chain.a.len() - 1)),
-                ("GAIN", &number(chain.gain)),
-                ("WEIGHT", &number(chain.weight)),
-                ("ROW", &(chain.first + chain.a.len() - 2)),
-            ],
-        )
-    };
-    fill(
-        ESO,
-        &[
-            ("ACTING", &code.acting("self.past")),
-            ("N", &code.states()),
-            ("RATE", &code.rate.name),
-            ("CHAINS", &chains.iter().zip(&starts).enumerate().map(step).collect::<String>()),
-            ("DISTURBANCES", &chains.iter().zip(&starts).map(disturbance).collect::<String>()),
-        ],
-    )
 }
