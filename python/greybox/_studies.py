@@ -101,7 +101,7 @@ def identify(
     order: int | None = None,
     library: Sequence[str] = (),
     terms: Sequence[str] = (),
-    derivatives: int = 2,
+    derivatives: int | Sequence[int] = 2,
     hold: str | None = None,
     delay: str | None = None,
     gain: float | None = None,
@@ -115,24 +115,27 @@ def identify(
     Args:
         train, holdout, units, map, progress: as of :func:`diagnose`.
         states: channels that are the coordinates, one equation each.
-        inputs: channels that drive the machine; the first sets the scale of the equations.
+        inputs: channels that drive the machine; which of them enters which equation is found.
         order: highest order of the library; 6 for one state, 4 for several.
-        library: one of ``tensor``, ``total``, ``separate``, and any of ``constant``, ``friction``, ``trigonometric``.
+        library: one of ``tensor``, ``total``, ``separate``, and any of ``constant``, ``friction``, ``trigonometric``,
+            ``lagrangian`` (kinetic energy and gravity of rigid bodies on joints).
         terms: candidate terms of your own, such as ``"x'*abs(x')"``.
-        derivatives: order of the leading derivative: 2 for mechanics, 1 for first-order systems.
+        derivatives: order of the leading derivative, one for all states or one for each: 2 for mechanics, 1 for
+            first-order systems.
         hold: what the inputs do between samples; found from the recordings where none is given.
         delay: state that is also fed back with an unknown delay, ``gain`` where its gain is known, ``longest`` (s) how
             far to look.
         replicates: resampled data sets behind the inclusion probabilities.
         seed: of every random choice.
     """
+    coordinates = [states] if isinstance(states, str) else list(states)
     wanted = {
-        "states": [states] if isinstance(states, str) else list(states),
+        "states": coordinates,
         "inputs": [inputs] if isinstance(inputs, str) else list(inputs),
         "order": order,
         "library": [library] if isinstance(library, str) else list(library),
         "terms": [terms] if isinstance(terms, str) else list(terms),
-        "derivatives": derivatives,
+        "derivatives": [derivatives] * len(coordinates) if isinstance(derivatives, int) else list(derivatives),
         "hold": hold,
         "delay": delay,
         "gain": gain,

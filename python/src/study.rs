@@ -75,7 +75,7 @@ pub(crate) struct Wanted {
     order: Option<usize>,
     library: Vec<String>,
     terms: Vec<String>,
-    derivatives: usize,
+    derivatives: Vec<usize>,
     hold: Option<String>,
     delay: Option<String>,
     gain: Option<f64>,
@@ -93,8 +93,8 @@ impl Wanted {
             return Err(Failure::input("no replicates leave nothing to count inclusions on")
                 .help("ask for at least one"));
         }
-        if !(1..=2).contains(&self.derivatives) {
-            return Err(Failure::input(format!("`derivatives` is {}", self.derivatives))
+        if let Some(order) = self.derivatives.iter().find(|order| !(1..=2).contains(*order)) {
+            return Err(Failure::input(format!("`derivatives` is {order}"))
                 .help("2 for mechanics, 1 for first-order systems"));
         }
         let usual = greybox_identify::Options::new(&borrowed(&self.states), &borrowed(&self.inputs));
@@ -104,7 +104,7 @@ impl Wanted {
             longest: self.longest,
         });
         Ok(greybox_identify::Options {
-            derivatives: self.derivatives,
+            derivatives: self.derivatives.clone(),
             library: self.parts(usual.library.monomials)?,
             order: self.order.unwrap_or(usual.order),
             hold: self.hold.as_deref().map(hold).transpose()?,
@@ -135,9 +135,13 @@ impl Wanted {
                     library.trigonometric = true;
                     continue;
                 }
+                "lagrangian" => {
+                    library.lagrangian = true;
+                    continue;
+                }
                 other => {
                     return Err(Failure::input(format!("`{other}` is no part of a library")).help(
-                        "choose from `tensor`, `total`, `separate`, `constant`, `friction`, `trigonometric`",
+                        "choose from `tensor`, `total`, `separate`, `constant`, `friction`, `trigonometric`, `lagrangian`",
                     ));
                 }
             };

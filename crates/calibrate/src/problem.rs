@@ -161,6 +161,8 @@ pub struct Work {
     most: u64,
     /// Most of one fit; 0: no limit.
     most_of_fit: u64,
+    /// What it is a part of: all that is done here is done there too, and ends when that does.
+    whole: Option<Arc<Work>>,
 }
 
 impl Work {
@@ -176,9 +178,14 @@ impl Work {
         Work { most_of_fit: most.max(1), ..Work::default() }
     }
 
-    /// Whether it met its limit.
+    /// A part of `whole` with a limit of its own.
+    pub fn part_of(whole: &Arc<Work>, most: u64) -> Work {
+        Work { whole: Some(whole.clone()), ..Work::within(most) }
+    }
+
+    /// Whether it met its limit, or that of the whole.
     pub fn is_spent(&self) -> bool {
-        self.most > 0 && self.done() > self.most
+        (self.most > 0 && self.done() > self.most) || self.whole.as_ref().is_some_and(|w| w.is_spent())
     }
 
     /// So far.
@@ -194,7 +201,7 @@ impl Work {
 
     /// Whether it was given up.
     pub fn is_given_up(&self) -> bool {
-        self.given_up.load(Ordering::Relaxed)
+        self.given_up.load(Ordering::Relaxed) || self.whole.as_ref().is_some_and(|w| w.is_given_up())
     }
 
     /// Whether a fit that did so much has to end.
@@ -210,7 +217,11 @@ impl Work {
     /// Adds evaluations of the right-hand side with so many tangents, and says how much work they were.
     pub(crate) fn add_evaluations(&self, evaluations: usize, lanes: usize, system: &System) -> u64 {
         let work = (evaluations * (1 + lanes) * system.rhs.registers()) as u64;
-        self.done.fetch_add(work, Ordering::Relaxed);
+        let mut at = Some(self);
+        while let Some(work_of) = at {
+            work_of.done.fetch_add(work, Ordering::Relaxed);
+            at = work_of.whole.as_deref();
+        }
         work
     }
 }

@@ -176,7 +176,7 @@ fn every_part_of_the_library_makes_an_equation() {
         let names = ["identify", "train.csv", "--states", "theta", "--inputs", "f", "--order", "1"];
         [&names[..], &["--replicates", "1", "--library", library, "--out", "out"]].concat()
     };
-    for library in ["tensor", "total", "separate", "constant", "friction", "trigonometric"] {
+    for library in ["tensor", "total", "separate", "constant", "friction", "trigonometric", "lagrangian"] {
         let outcome = bench.greybox(&request(library));
         assert_eq!(outcome.code, 0, "{library}: {}", outcome.stderr);
     }
@@ -188,6 +188,89 @@ fn every_part_of_the_library_makes_an_equation() {
     let mut lengths = request("trigonometric");
     lengths[1] = "length.csv";
     bench.refuses(&lengths, &["none of the states (theta) is an angle", "`rad` or `deg`"]);
+}
+
+/// A pendulum that hangs from a cart on a spring, 40 s of it: 1.3 x″ + 0.12 (cos θ θ″ − sin θ θ′²) + 1.5 x′ + 20 x = f,
+/// 0.06 θ″ + 0.12 cos θ x″ + 1.177 sin θ + 0.01 θ′ = 0; x in mm and θ in degrees.
+fn pendulum_on_a_cart() -> String {
+    let (dt, fine) = (0.01, 20);
+    let sample = |row: f64| 2.0 * (0.021 * row).sin() + 2.0 * (0.043 * row + 1.0).sin() + (0.087 * row).cos();
+    let rates = |[x, theta, v, w]: [f64; 4], f: f64| {
+        let (s, c) = theta.sin_cos();
+        let on_cart = f + 0.12 * s * w * w - 1.5 * v - 20.0 * x;
+        let on_pendulum = -1.177 * s - 0.01 * w;
+        let determinant = 1.3 * 0.06 - (0.12 * c).powi(2);
+        let cart = (0.06 * on_cart - 0.12 * c * on_pendulum) / determinant;
+        [v, w, cart, (1.3 * on_pendulum - 0.12 * c * on_cart) / determinant]
+    };
+    let mut noise = Noise(11);
+    let mut state = [0.0; 4];
+    let mut text = "t,f [N],x [mm],theta [deg]\n".to_owned();
+    for row in 0..=4000 {
+        let row = f64::from(row);
+        let shown =
+            [1e3 * (state[0] + 0.002 * noise.normal()), (state[1] + 0.005 * noise.normal()).to_degrees()];
+        writeln!(text, "{:.2},{:.6},{:.4},{:.4}", row * dt, sample(row), shown[0], shown[1]).unwrap();
+        for step in 0..fine {
+            let h = dt / f64::from(fine);
+            let at = (f64::from(step) + 0.5) / f64::from(fine);
+            let f = sample(row) + at * (sample(row + 1.0) - sample(row));
+            let moved = |by: [f64; 4], share: f64| std::array::from_fn(|i| state[i] + share * h * by[i]);
+            let a = rates(state, f);
+            let b = rates(moved(a, 0.5), f);
+            let c = rates(moved(b, 0.5), f);
+            let d = rates(moved(c, 1.0), f);
+            state = std::array::from_fn(|i| state[i] + h / 6.0 * (a[i] + 2.0 * (b[i] + c[i]) + d[i]));
+        }
+    }
+    text
+}
+
+#[test]
+fn the_page_shows_what_is_said_of_a_pendulum_on_a_cart() {
+    let bench = Bench::empty();
+    bench.write("run1.csv", &pendulum_on_a_cart());
+    let page = std::path::Path::new(env!("CARGO_MANIFEST_DIR")).join("../../docs/src/identify.md");
+    let page = std::fs::read_to_string(page).unwrap();
+    let example = page.split("## Several coordinates and inputs").nth(1).unwrap();
+    let command = example.lines().find(|l| l.contains("lagrangian") && l.starts_with("greybox")).unwrap();
+    let arguments: Vec<&str> = command.split_whitespace().skip(1).collect();
+    let outcome = bench.greybox(&arguments);
+    assert_eq!(outcome.code, 0, "{}", outcome.stderr);
+    for line in outcome.stdout.lines().filter(|l| l.starts_with("Equation of")) {
+        assert!(example.lines().any(|l| l == line), "the page has another equation than\n{line}");
+    }
+    let report: Value = serde_json::from_str(&bench.read("found/report.json")).unwrap();
+    let of = |state: &str, expression: &str| {
+        let terms = report["equations"][state]["terms"].as_array().unwrap().clone();
+        terms.into_iter().find(|t| t["expression"] == expression).unwrap_or_else(|| panic!("{report:#}"))
+    };
+    let (cart, pendulum) =
+        (of("x", "(cos(theta)*theta'' - sin(theta)*theta'^2)"), of("theta", "cos(theta)*x''"));
+    assert_eq!(cart["parameter"], pendulum["parameter"]);
+    assert_eq!(cart["unit"], "kg m");
+    let interval: Vec<f64> = cart["ci95"].as_array().unwrap().iter().map(|v| v.as_f64().unwrap()).collect();
+    assert!(interval[0] < 0.12 && 0.12 < interval[1] && interval[1] - interval[0] < 0.01, "{interval:?}");
+    assert_eq!(report["equations"]["theta"]["input"], Value::Null);
+    // What was written runs.
+    let run = bench.json(&["simulate", "found/model.toml", "run1.csv", "--out", "simulated.csv"]);
+    assert!(run["fit"]["x"]["nrmse"].as_f64().unwrap() < 0.05, "{run:#}");
+}
+
+#[test]
+fn every_state_needs_an_order_of_its_own_that_is_one_or_two() {
+    let bench = bench();
+    let train = bench.read("train.csv");
+    let both = train.replacen("x [m]", "x [m],y [m]", 1);
+    let rows = both.lines().enumerate().map(|(i, line)| match i {
+        0 => line.to_owned(),
+        _ => format!("{line},{}", line.rsplit(',').next().unwrap()),
+    });
+    bench.write("both.csv", &rows.collect::<Vec<_>>().join("\n"));
+    let request =
+        ["identify", "both.csv", "--states", "x,y", "--inputs", "f", "--out", "out", "--derivatives"];
+    bench.refuses(&[&request[..], &["2,1,1"]].concat(), &["3 orders of leading derivatives", "x, y"]);
+    bench.refuses(&[&request[..], &["2,3"]].concat(), &["leading derivative is 3"]);
 }
 
 #[test]

@@ -117,18 +117,20 @@ impl Reduced {
     /// that the sizes of the terms found imply,
     ///
     /// ```text
-    /// c = ½ ln n + ½ ln(1 + t²) at the lower quartile of |t|,   within   2 ln q ≤ c ≤ ln n .
+    /// c = ½ ln n + ½ ln(1 + t²) at the lower quartile of |t|,   within   2 ln q ≤ c ≤ ln n + ln q .
     /// ```
     ///
     /// Schwarz's price takes one row's worth of information as prior, whatever the noise. ln(1 + t²) is what a
     /// normal prior as wide as the effects costs a coefficient (the empirical-Bayes g-prior of George & Foster,
     /// Biometrika 87, 2000; a quartile, because sizes spread over decades): where true terms stand a hundred
     /// standard errors clear of the noise, one at three is doubted; where they are barely visible, it is
-    /// believed. The lower limit pays for looking at q candidates (risk inflation, Foster & George, Ann.
-    /// Statist. 22, 1994), the upper is Schwarz's.
+    /// believed. Both limits pay for looking at q candidates: the lower is that of risk inflation (Foster & George,
+    /// Ann. Statist. 22, 1994), the upper the extended Bayesian criterion with γ = ½ (Chen & Chen, Biometrika 95,
+    /// 2008), for a choice is wrong as soon as one of q false terms is chosen.
     pub(crate) fn choose(&self, roles: &Roles) -> Solution {
         let schwarz = self.samples.ln();
-        let least = 2.0 * (roles.optional.len().max(2) as f64).ln();
+        let looked_at = (roles.optional.len().max(2) as f64).ln();
+        let (least, most) = (2.0 * looked_at, schwarz + looked_at);
         let mut solution = self.search(&Price { roles, term: schwarz });
         let mut price = schwarz;
         for _ in 0..4 {
@@ -147,8 +149,8 @@ impl Reduced {
             let (i, w) = (at.floor() as usize, at.fract());
             let quartile = sizes[i] + w * (sizes[(i + 1).min(sizes.len() - 1)] - sizes[i]);
             let implied = (1.0 + quartile.exp()).ln();
-            let middle = (0.5 * (implied + schwarz)).max(least).min(schwarz);
-            if middle >= price - 1e-9 {
+            let middle = (0.5 * (implied + schwarz)).max(least).min(most);
+            if (middle - price).abs() < 1e-9 {
                 break;
             }
             price = middle;

@@ -46,10 +46,20 @@ pub enum IdentifyError {
     },
     /// Sines of states that are no angles.
     #[error(
-        "the library has sines, but none of the states ({states}) is an angle; leave `trigonometric` out, or give the angle's \
-         channel the unit `rad` or `deg`"
+        "the library has sines, but none of the states ({states}) is an angle; leave `trigonometric` and `lagrangian` out, \
+         or give the angle's channel the unit `rad` or `deg`"
     )]
     NoAngle {
+        /// The states.
+        states: String,
+    },
+    /// Not one leading derivative for every state.
+    #[error(
+        "{given} orders of leading derivatives are given for the states {states}: give one for every state"
+    )]
+    Derivatives {
+        /// Number given.
+        given: usize,
         /// The states.
         states: String,
     },

@@ -11,10 +11,10 @@ use greybox_sparse::{folds, select};
 
 use crate::choose::Roles;
 use crate::error::IdentifyError;
-use crate::library::{Setting, derivative, is_of_the_language};
 use crate::options::Options;
 use crate::output_error::{self, Refined, State};
 use crate::precision::{self, Precision};
+use crate::setting::{Setting, derivative, is_of_the_language};
 use crate::structure::{Equation, Extra, Signal, Structure};
 use crate::weak;
 
@@ -199,15 +199,17 @@ pub(crate) fn search(
     options: &Options,
     listener: &dyn ProgressListener,
 ) -> Result<Search, IdentifyError> {
-    let structure = structure(fit_on, options)?;
-    let all = vec![true; structure.terms.len()];
-    let ones: Vec<f64> = structure.terms.iter().map(|t| if t.optional { 0.0 } else { 1.0 }).collect();
-    let extras: Vec<f64> = structure.extras.iter().flat_map(|e| &e.parameters).map(|p| p.1).collect();
-    let whole = structure.model(&all, &ones, &extras)?;
+    let plain = structure(fit_on, options)?;
+    let structures = if options.library.lagrangian { plain.scaled_together() } else { vec![plain] };
+    let plain = &structures[0];
+    let all = vec![true; plain.terms.len()];
+    let ones: Vec<f64> = plain.terms.iter().map(|t| if t.optional { 0.0 } else { 1.0 }).collect();
+    let extras: Vec<f64> = plain.extras.iter().flat_map(|e| &e.parameters).map(|p| p.1).collect();
+    let whole = plain.model(&all, &ones, &extras)?;
     let data = Arc::new(Data::new(&whole, fit_on)?);
     let samples = data.samples();
-    if structure.terms.len() * 4 > samples {
-        return Err(IdentifyError::TooManyTerms { candidates: structure.terms.len(), samples });
+    if plain.terms.len() * 4 > samples {
+        return Err(IdentifyError::TooManyTerms { candidates: plain.terms.len(), samples });
     }
     if let Some(c) = data.spread.iter().position(|s| s.is_nan() || *s <= 0.0) {
         return Err(IdentifyError::Still { name: data.channels[c].name.clone() });
@@ -215,16 +217,26 @@ pub(crate) fn search(
 
     listener.stage("weak form");
     let smoothed_states = SmoothedStates::new(&whole, &data);
-    let first = first_estimates(&structure, &whole, &data, &smoothed_states, options)?;
-
-    listener.stage("output error");
+    let values = weak::evaluate(plain, &whole, &data, &smoothed_states).ok_or(IdentifyError::NoFit)?;
     let work = Arc::new(Work::within(options.work));
     listener.begins(&work);
-    let refined = best_refined(&structure, &data, &first, &work).ok_or(IdentifyError::NoFit)?;
+    let mut proposed: Vec<(Structure, First)> = Vec::new();
+    for structure in structures {
+        let first = first_estimates(&structure, &whole, &data, &values, options)?;
+        proposed.push((structure, first));
+    }
+
+    listener.stage("output error");
+    let best = best_begun(proposed, &data, &work, options.work);
+    let (structure, mut first, refined) = best.ok_or(IdentifyError::NoFit)?;
+    let refined = output_error::refine(&structure, refined, &first.allowed);
     let (structure, refined) = match options.hold {
         None if !work.is_spent() => better_hold(structure, refined),
         _ => (structure, refined),
     };
+    let (structure, refined) =
+        output_error::with_inputs_of_strength_one(structure, refined, &mut first.allowed);
+    let (structure, refined) = output_error::scaled_by_inputs(structure, refined, &mut first.allowed);
     Ok(Search { structure, data, first, refined })
 }
 
@@ -245,8 +257,14 @@ pub(crate) fn structure(recordings: &[Recording], options: &Options) -> Result<S
     if options.states.is_empty() {
         return Err(IdentifyError::NoStates);
     }
-    if !(1..=2).contains(&options.derivatives) {
-        let found = options.derivatives as f64;
+    if options.derivatives.len() != options.states.len() {
+        return Err(IdentifyError::Derivatives {
+            given: options.derivatives.len(),
+            states: options.states.join(", "),
+        });
+    }
+    if let Some(found) = options.derivatives.iter().find(|order| !(1..=2).contains(*order)) {
+        let found = *found as f64;
         return Err(IdentifyError::Range {
             what: "the order of the leading derivative",
             found,
@@ -270,12 +288,12 @@ pub(crate) fn structure(recordings: &[Recording], options: &Options) -> Result<S
     let unit = |name: &str| recordings.iter().flat_map(|r| r.channel(name)).find_map(|c| c.unit.clone());
     let signal = |name: &String| Signal { name: name.clone(), unit: unit(name) };
     let hold = options.hold.unwrap_or(Hold::Linear);
-    let mut library = options.library.clone();
-    for term in &library.terms {
+    for term in &options.library.terms {
         check_term(term, options)?;
     }
-    // Further inputs act like terms with coefficients of their own.
-    library.terms.extend(options.inputs.iter().skip(1).cloned());
+    // The only input drives the only equation, and a delayed feedback acts beside an input that is known to be there.
+    let fixed = options.delay.is_some() || (options.states.len() == 1 && options.inputs.len() == 1);
+    let right = if fixed { options.inputs.first() } else { None };
     let mut taken: Vec<String> = options.states.iter().chain(&options.inputs).cloned().collect();
     taken.extend(["t", "pi", "tau", "kp"].map(String::from));
     // A unit that cannot be read is told where the recordings are laid out.
@@ -283,17 +301,18 @@ pub(crate) fn structure(recordings: &[Recording], options: &Options) -> Result<S
         unit(state).and_then(|text| Unit::parse(&text).ok()).is_none_or(|unit| unit.dimension.is_none())
     };
     let angles: Vec<bool> = options.states.iter().map(may_be_angle).collect();
-    if library.trigonometric && !angles.contains(&true) {
+    if (options.library.trigonometric || options.library.lagrangian) && !angles.contains(&true) {
         return Err(IdentifyError::NoAngle { states: options.states.join(", ") });
     }
     let mut setting = Setting {
         states: &options.states,
-        derivatives: options.derivatives,
+        derivatives: &options.derivatives,
+        inputs: &options.inputs[usize::from(right.is_some())..],
         orders: options.order,
         angles,
         taken,
     };
-    let terms = library.terms(&mut setting);
+    let terms = options.library.terms(&mut setting);
     let mut extras = Vec::new();
     if let Some(delay) = &options.delay {
         if !options.states.contains(&delay.state) {
@@ -337,7 +356,11 @@ pub(crate) fn structure(recordings: &[Recording], options: &Options) -> Result<S
         equations: options
             .states
             .iter()
-            .map(|s| Equation { name: format!("motion_{s}"), input: options.inputs.first().cloned() })
+            .map(|s| Equation {
+                name: format!("motion_{s}"),
+                input: right.cloned(),
+                normalised: right.is_none(),
+            })
             .collect(),
         terms,
         extras,
@@ -365,16 +388,16 @@ fn check_term(term: &str, options: &Options) -> Result<(), IdentifyError> {
     let parsed = greybox_model::parse(term).map_err(|e| wrong(e.to_string()))?;
     let variables = parsed.expr.variables();
     for (name, primes) in &variables {
-        let is_state = options.states.iter().any(|s| **s == **name);
+        let state = options.states.iter().position(|s| **s == **name);
         let is_input = options.inputs.iter().any(|s| **s == **name);
-        if !is_state && !is_input {
+        if state.is_none() && !is_input {
             let known: Vec<String> = options.states.iter().chain(&options.inputs).cloned().collect();
             return Err(wrong(format!(
                 "`{name}` is neither a state nor an input (there are {})",
                 known.join(", ")
             )));
         }
-        let most = if is_state { options.derivatives } else { 1 };
+        let most = state.map_or(1, |s| options.derivatives[s]);
         if usize::from(*primes) >= most {
             let reached = derivative(name, usize::from(*primes));
             return Err(wrong(format!("`{reached}` is a derivative that no term of the library may have")));
@@ -407,13 +430,12 @@ fn first_estimates(
     structure: &Structure,
     model: &Model,
     data: &Data,
-    smoothed_states: &SmoothedStates,
+    values: &weak::Values,
     options: &Options,
 ) -> Result<First, IdentifyError> {
     let period = weak::period(data);
     let longest = data.pieces.iter().map(|p| p.len).max().unwrap_or(0);
     let dt = data.pieces.iter().map(|p| p.dt).fold(f64::INFINITY, f64::min);
-    let values = weak::evaluate(structure, model, data, smoothed_states).ok_or(IdentifyError::NoFit)?;
     let window = |share: f64| (share * period).clamp(16.0 * dt, 0.2 * longest as f64 * dt);
     let everything = vec![true; structure.terms.len()];
     let trials = trials(options);
@@ -421,7 +443,7 @@ fn first_estimates(
         let mut starts: Vec<(f64, State)> = WINDOWS
             .iter()
             .flat_map(|share| trials.iter().map(move |t| (window(*share), *t)))
-            .filter_map(|(window, trial)| estimate(structure, model, data, &values, window, trial, allowed))
+            .filter_map(|(window, trial)| estimate(structure, model, data, values, window, trial, allowed))
             .collect();
         // Without a delay one start per window; with one, the most probable delays.
         if !structure.extras.is_empty() {
@@ -436,7 +458,7 @@ fn first_estimates(
             .first()
             .and_then(|s| trials[0].map(|t| weak::Trial { delay: s.1.extras[1], ..t })),
     };
-    let by_order = order_search(structure, model, data, &values, window(WINDOWS[1]), trial, options);
+    let by_order = order_search(structure, model, data, values, window(WINDOWS[1]), trial, options);
     let chosen = by_order.iter().min_by(|a, b| a.1.total_cmp(&b.1)).map_or(options.order, |o| o.0);
     // One order more than the first estimate asks for: its errors hide weak terms.
     let allowed: Vec<bool> = structure.terms.iter().map(|t| t.order <= chosen + 1).collect();
@@ -453,25 +475,31 @@ fn order_search(
     structure: &Structure,
     model: &Model,
     data: &Data,
-    values: &[Vec<Vec<f64>>],
+    values: &weak::Values,
     window: f64,
     trial: Option<weak::Trial>,
     options: &Options,
 ) -> Vec<(usize, f64)> {
     let mut total: Vec<(usize, f64)> = (1..=options.order).map(|n| (n, 0.0)).collect();
-    for equation in 0..structure.equations.len() {
-        let Some(rows) = weak::rows(structure, model, data, values, equation, window, trial) else {
-            continue;
-        };
+    for group in structure.groups() {
+        let rows = group.iter().map(|&e| weak::rows(structure, model, data, values, e, window, trial));
+        let Some(rows) = rows.collect::<Option<Vec<weak::Rows>>>() else { continue };
         let weak::Regression { target, columns, protected } =
             weak::regression(structure, &rows, trial.and_then(|t| t.gain));
+        let overlap = rows.iter().map(|r| r.overlap).max().unwrap_or(1);
+        let mut pieces = Vec::new();
+        let mut from = 0;
+        for rows in &rows {
+            pieces.extend(rows.pieces.iter().map(|p| from + p.start..from + p.end));
+            from += rows.target.len();
+        }
         let views: Vec<&[f64]> = columns.iter().map(|c| c.1.as_slice()).collect();
         let sizes: Vec<usize> = (1..=options.order)
             .map(|n| columns.iter().filter(|c| c.0.is_none_or(|t| structure.terms[t].order <= n)).count())
             .collect();
         let settings = select::Options {
             folds: 5,
-            gap: rows.overlap,
+            gap: overlap,
             sample_size: select::SampleSize::Effective,
             ..select::Options::normalised()
         };
@@ -480,7 +508,7 @@ fn order_search(
         while last > 0 {
             let found = greybox_sparse::Rows::new(&views[..sizes[last - 1]], &target)
                 .and_then(|table| {
-                    let split = folds::train_test(&rows.pieces, 0.5, rows.overlap)?;
+                    let split = folds::train_test(&pieces, 0.5, overlap)?;
                     select::Problem::new(table, &sizes[..last], &protected, split)
                 })
                 .and_then(|problem| select::search(&problem, &settings));
@@ -515,7 +543,7 @@ fn estimate(
     structure: &Structure,
     model: &Model,
     data: &Data,
-    values: &[Vec<Vec<f64>>],
+    values: &weak::Values,
     window: f64,
     trial: Option<weak::Trial>,
     allowed: &[bool],
@@ -526,8 +554,9 @@ fn estimate(
         extras: structure.extras.iter().flat_map(|e| &e.parameters).map(|p| p.1).collect(),
     };
     let mut badness = 0.0;
-    for equation in 0..structure.equations.len() {
-        let rows = weak::rows(structure, model, data, values, equation, window, trial)?;
+    for group in structure.groups() {
+        let rows = group.iter().map(|&e| weak::rows(structure, model, data, values, e, window, trial));
+        let rows: Vec<weak::Rows> = rows.collect::<Option<_>>()?;
         let gain = trial.and_then(|t| t.gain);
         let (reduced, terms) = weak::reduce(structure, &rows, gain);
         let solution = reduced.choose(&Roles::new(&terms, &structure.terms, allowed));
@@ -550,11 +579,34 @@ fn estimate(
     Some((badness, state))
 }
 
-fn best_refined(structure: &Structure, data: &Arc<Data>, first: &First, work: &Arc<Work>) -> Option<Refined> {
-    let begun: Vec<Refined> =
-        first.starts.iter().filter_map(|s| output_error::begin(structure, data, s.clone(), work)).collect();
-    let best = begun.into_iter().min_by(|a, b| a.score().total_cmp(&b.score()))?;
-    Some(output_error::refine(structure, best, &first.allowed))
+/// A start that costs so many times as much to fit as another has a model that can hardly be simulated.
+const HARD: u64 = 10;
+
+/// The best first fit of all structures' starts; each does at most a part of half of the work.
+fn best_begun(
+    proposed: Vec<(Structure, First)>,
+    data: &Arc<Data>,
+    work: &Arc<Work>,
+    most: u64,
+) -> Option<(Structure, First, Refined)> {
+    let count: usize = proposed.iter().map(|(_, first)| first.starts.len()).sum();
+    let mut most = most / (2 * count.max(1) as u64);
+    let mut best: Option<(usize, Refined)> = None;
+    for (k, (structure, first)) in proposed.iter().enumerate() {
+        for start in &first.starts {
+            let before = work.done();
+            let part = Work::part_of(work, most);
+            let Some(refined) = output_error::begin(structure, data, start.clone(), part) else { continue };
+            most = most.min(HARD * (work.done() - before).max(1));
+            if best.as_ref().is_none_or(|(_, b)| refined.score() < b.score()) {
+                best = Some((k, refined));
+            }
+        }
+    }
+    let (k, mut refined) = best?;
+    refined.setup.work = work.clone();
+    let (structure, first) = proposed.into_iter().nth(k)?;
+    Some((structure, first, refined))
 }
 
 /// The hold of the inputs that fits best, where the difference is beyond chance.
@@ -613,19 +665,16 @@ pub(crate) fn conclude(
         .enumerate()
         .map(|(e, equation)| {
             let of_equation =
-                || (0..structure.terms.len()).filter(move |&i| structure.terms[i].equation == e);
+                || structure.terms.iter().enumerate().filter_map(|(i, t)| Some((i, t, t.part(e)?)));
             let terms = of_equation()
-                .filter(|&i| state.active[i])
-                .map(|i| {
-                    let t = &structure.terms[i];
-                    FoundTerm {
-                        expression: t.expression.clone(),
-                        parameter: t.parameter.clone(),
-                        powers: t.powers.clone(),
-                        value: state.values[i],
-                        ci95: precision.interval(i, state.values[i]),
-                        inclusion: if t.optional { precision.inclusion.get(i).copied() } else { None },
-                    }
+                .filter(|(i, ..)| state.active[*i])
+                .map(|(i, t, part)| FoundTerm {
+                    expression: part.expression.clone(),
+                    parameter: t.parameter.clone(),
+                    powers: t.powers.clone(),
+                    value: state.values[i],
+                    ci95: precision.interval(i, state.values[i]),
+                    inclusion: if t.optional { precision.inclusion.get(i).copied() } else { None },
                 })
                 .collect();
             let mut terms: Vec<FoundTerm> = terms;
@@ -641,11 +690,11 @@ pub(crate) fn conclude(
                 });
             }
             let doubtful = of_equation()
-                .filter(|&i| structure.terms[i].optional)
-                .filter_map(|i| {
+                .filter(|(_, t, _)| t.optional)
+                .filter_map(|(i, _, part)| {
                     let inclusion = *precision.inclusion.get(i)?;
                     (inclusion > DOUBT && inclusion < 1.0 - DOUBT).then(|| DoubtfulTerm {
-                        expression: structure.terms[i].expression.clone(),
+                        expression: part.expression.clone(),
                         chosen: state.active[i],
                         inclusion,
                     })

@@ -2,12 +2,14 @@
 
 mod choose;
 mod correlation;
+mod energy;
 mod error;
 mod identify;
 mod library;
 mod options;
 mod output_error;
 mod precision;
+mod setting;
 mod stream;
 mod structure;
 mod weak;

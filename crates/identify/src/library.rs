@@ -1,6 +1,8 @@
 //! Libraries of candidate terms.
 
-use crate::structure::Term;
+use crate::energy;
+use crate::setting::{Setting, derivative};
+use crate::structure::{Part, Term};
 
 /// Which monomials of the variables (the states and their derivatives below the leading one) a library has.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
@@ -25,20 +27,12 @@ pub struct Library {
     pub friction: bool,
     /// sin q and cos q of every state that may be an angle: in rad, deg, another dimensionless unit, or none stated.
     pub trigonometric: bool,
+    /// What rigid bodies on joints have: terms of the kinetic energy (inertia that couples coordinates and depends on
+    /// angles) and of gravity's potential, each with one coefficient in all the equations that it enters. See
+    /// the crate's page for the formulas.
+    pub lagrangian: bool,
     /// Terms of the user in the model language.
     pub terms: Vec<String>,
-}
-
-/// Where the candidates of one equation come from.
-pub(crate) struct Setting<'a> {
-    pub states: &'a [String],
-    /// Order of the leading derivative.
-    pub derivatives: usize,
-    pub orders: usize,
-    /// Which of the states may be angles.
-    pub angles: Vec<bool>,
-    /// Names already taken.
-    pub taken: Vec<String>,
 }
 
 /// One candidate before it has a name.
@@ -59,35 +53,29 @@ impl Library {
         let mut out = Vec::new();
         for (equation, state) in setting.states.iter().enumerate() {
             let prefix = if several { format!("{state}_") } else { String::new() };
-            let mut name = |base: &str| {
-                let mut name = format!("{prefix}{base}");
-                while setting.taken.contains(&name) || is_of_the_language(&name) {
-                    name.push('_');
-                }
-                setting.taken.push(name.clone());
-                name
-            };
-            let leading = derivative(state, setting.derivatives);
+            let leading = derivative(state, setting.derivatives[equation]);
+            let mut name = |base: &str| setting.name(format!("{prefix}{base}"));
             out.push(Term {
-                equation,
+                parts: vec![Part::new(equation, &leading)],
                 parameter: name("m"),
-                powers: vec![(leading.clone(), 1)],
-                expression: leading,
+                powers: vec![(leading, 1)],
                 order: 1,
                 even: false,
                 optional: false,
             });
             for c in &candidates {
                 out.push(Term {
-                    equation,
+                    parts: vec![Part::new(equation, &c.expression)],
                     parameter: name(&c.base),
-                    expression: c.expression.clone(),
                     powers: c.powers.clone(),
                     order: c.order,
                     even: c.even,
                     optional: true,
                 });
             }
+        }
+        if self.lagrangian {
+            out.extend(energy::terms(setting));
         }
         out
     }
@@ -98,8 +86,9 @@ impl Library {
         let variables: Vec<(String, &str, &String)> = setting
             .states
             .iter()
-            .flat_map(|s| {
-                (0..setting.derivatives).map(move |d| (derivative(s, d), ["k", "c", "j", "s"][d.min(3)], s))
+            .zip(setting.derivatives)
+            .flat_map(|(s, order)| {
+                (0..*order).map(move |d| (derivative(s, d), ["k", "c", "j", "s"][d.min(3)], s))
             })
             .collect();
         let mut out = Vec::new();
@@ -153,8 +142,8 @@ impl Library {
         }
         let own =
             |base: &str, state: &String| if several { format!("{base}_{state}") } else { base.to_string() };
-        for (s, angle) in setting.states.iter().zip(&setting.angles) {
-            if self.friction && setting.derivatives > 1 {
+        for ((s, angle), order) in setting.states.iter().zip(&setting.angles).zip(setting.derivatives) {
+            if self.friction && *order > 1 {
                 out.push(Candidate {
                     expression: format!("sign({s}')"),
                     base: own("fc", s),
@@ -175,6 +164,15 @@ impl Library {
                 }
             }
         }
+        for input in setting.inputs {
+            out.push(Candidate {
+                expression: input.clone(),
+                base: format!("b_{input}"),
+                powers: vec![(input.clone(), 1)],
+                order: 1,
+                even: false,
+            });
+        }
         for (i, term) in self.terms.iter().enumerate() {
             // A name alone needs no parentheses.
             let alone = term.chars().all(|c| c.is_alphanumeric() || c == '_');
@@ -190,26 +188,23 @@ impl Library {
     }
 }
 
-/// Whether the model language has a meaning of its own for a name.
-pub(crate) fn is_of_the_language(name: &str) -> bool {
-    ["t", "pi"].contains(&name) || greybox_model::Func::from_name(name).is_some()
-}
-
-/// `x` with `order` primes.
-pub(crate) fn derivative(state: &str, order: usize) -> String {
-    format!("{state}{}", "'".repeat(order))
-}
-
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::setting::is_of_the_language;
 
     fn expressions(library: &Library, states: &[&str], orders: usize) -> Vec<String> {
         let states: Vec<String> = states.iter().map(|s| (*s).to_string()).collect();
         let angles = vec![true; states.len()];
-        let mut setting =
-            Setting { states: &states, derivatives: 2, orders, angles, taken: vec!["k1".to_string()] };
-        library.terms(&mut setting).into_iter().map(|t| t.expression).collect()
+        let mut setting = Setting {
+            states: &states,
+            derivatives: &vec![2; angles.len()],
+            inputs: &[],
+            orders,
+            angles,
+            taken: vec!["k1".to_string()],
+        };
+        library.terms(&mut setting).into_iter().map(|t| t.parts[0].expression.clone()).collect()
     }
 
     #[test]
@@ -245,7 +240,8 @@ mod tests {
         let states = vec!["x".to_string()];
         let mut setting = Setting {
             states: &states,
-            derivatives: 2,
+            derivatives: &[2],
+            inputs: &[],
             orders: 1,
             angles: vec![true],
             taken: vec!["k1".to_string()],
@@ -262,6 +258,7 @@ mod tests {
             constant: true,
             friction: true,
             trigonometric: true,
+            lagrangian: true,
             terms: vec!["x'*abs(x')".to_string()],
         }
     }
@@ -271,8 +268,14 @@ mod tests {
         for monomials in [Monomials::Tensor, Monomials::TotalDegree, Monomials::Separate] {
             for states in [vec!["x".to_string()], vec!["x".to_string(), "a".to_string()]] {
                 let angles = vec![true; states.len()];
-                let mut setting =
-                    Setting { states: &states, derivatives: 2, orders: 3, angles, taken: states.clone() };
+                let mut setting = Setting {
+                    states: &states,
+                    derivatives: &vec![2; angles.len()],
+                    inputs: &[],
+                    orders: 3,
+                    angles,
+                    taken: states.clone(),
+                };
                 let names: Vec<String> =
                     whole(monomials).terms(&mut setting).into_iter().map(|t| t.parameter).collect();
                 for (k, name) in names.iter().enumerate() {
@@ -288,9 +291,17 @@ mod tests {
     fn a_length_has_no_sine() {
         let states = vec!["x".to_string(), "theta".to_string()];
         let angles = vec![false, true];
-        let mut setting = Setting { states: &states, derivatives: 2, orders: 1, angles, taken: Vec::new() };
+        let mut setting = Setting {
+            states: &states,
+            derivatives: &[2, 2],
+            inputs: &[],
+            orders: 1,
+            angles,
+            taken: Vec::new(),
+        };
         let library = whole(Monomials::Separate);
-        let terms: Vec<String> = library.terms(&mut setting).into_iter().map(|t| t.expression).collect();
+        let terms: Vec<String> =
+            library.terms(&mut setting).into_iter().map(|t| t.parts[0].expression.clone()).collect();
         assert!(terms.contains(&"sin(theta)".to_string()) && !terms.contains(&"sin(x)".to_string()));
     }
 }

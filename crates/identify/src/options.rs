@@ -9,11 +9,12 @@ use crate::library::{Library, Monomials};
 pub struct Options {
     /// Channels that are the coordinates; one equation each.
     pub states: Vec<String>,
-    /// Channels that drive the machine. With one input, every equation has it on the right with factor one; the
-    /// others enter as terms. Without any, the leading coefficients are one.
+    /// Channels that drive the machine. Which of them enters which equation is part of the choice where there are
+    /// several states or inputs. The first that an equation has stands on its right with factor one, the others enter
+    /// as terms. An equation without any is divided by its leading coefficient.
     pub inputs: Vec<String>,
-    /// Order of the leading derivative: 2 for mechanics (q̈), 1 for first-order systems.
-    pub derivatives: usize,
+    /// Order of the leading derivative of every state: 2 for mechanics (q̈), 1 for a current or a temperature.
+    pub derivatives: Vec<usize>,
     /// The candidate terms.
     pub library: Library,
     /// Orders of the library to search, from 1 to this.
@@ -41,7 +42,7 @@ impl Options {
         Options {
             states: states.iter().map(|s| (*s).to_string()).collect(),
             inputs: inputs.iter().map(|s| (*s).to_string()).collect(),
-            derivatives: 2,
+            derivatives: vec![2; states.len()],
             library: Library { monomials, ..Library::default() },
             order: if several { 4 } else { 6 },
             hold: None,

@@ -406,13 +406,8 @@ fn levels(structure: &Structure) -> &'static [usize] {
 }
 
 /// A first fit of `start` on short segments.
-pub(crate) fn begin(
-    structure: &Structure,
-    data: &Arc<Data>,
-    start: State,
-    work: &Arc<Work>,
-) -> Option<Refined> {
-    let setup = Setup { work: work.clone(), ..setup(structure, data, &start, None)? };
+pub(crate) fn begin(structure: &Structure, data: &Arc<Data>, start: State, work: Work) -> Option<Refined> {
+    let setup = Setup { work: Arc::new(work), ..setup(structure, data, &start, None)? };
     let level = setup.level(levels(structure)[0]);
     let scale: Vec<f64> = data.sigma.iter().zip(&data.spread).map(|(s, d)| s.max(1e-6 * d)).collect();
     let point = Point { parameters: setup.values(), starts: setup.starts(&level, &setup.values()) };
@@ -431,6 +426,86 @@ pub(crate) fn refit(structure: &Structure, refined: &Refined) -> Option<Refined>
         p.fit(point, Limits { iterations: 20, tolerance: 1e-7 })
     });
     fit.cost.is_finite().then(|| Refined { setup: next, fit, ..refined.clone() }.after(structure))
+}
+
+/// Every equation divided by the strength of the first input that it has, which then stands on its right with factor
+/// one and is no candidate any more; equations without an input stay divided by their leading coefficient.
+pub(crate) fn scaled_by_inputs(
+    structure: Structure,
+    refined: Refined,
+    allowed: &mut [bool],
+) -> (Structure, Refined) {
+    let mut scaled = structure.clone();
+    let mut state = refined.state.clone();
+    for (e, equation) in
+        scaled.equations.iter_mut().enumerate().filter(|(_, e)| e.input.is_none() && e.normalised)
+    {
+        let of_equation = |i: usize| structure.terms[i].part(e).is_some();
+        let term_of = |name: &str| {
+            (0..structure.terms.len()).find(|&i| state.active[i] && structure.terms[i].is(e, name))
+        };
+        let first =
+            structure.inputs.iter().find_map(|(signal, _)| Some((&signal.name, term_of(&signal.name)?)));
+        let Some((name, term)) = first.filter(|(_, term)| state.values[*term] != 0.0) else { continue };
+        let strength = -state.values[term];
+        (equation.input, equation.normalised) = (Some(name.clone()), false);
+        (state.active[term], allowed[term]) = (false, false);
+        (0..structure.terms.len()).filter(|i| of_equation(*i)).for_each(|i| state.values[i] /= strength);
+        state.values[term] = 0.0;
+    }
+    if scaled.equations == structure.equations {
+        return (structure, refined);
+    }
+    match refit(&scaled, &Refined { state, ..refined.clone() }) {
+        Some(refined) => (scaled, refined),
+        None => (structure, refined),
+    }
+}
+
+/// The fit with a parameter drawn to a value by a prior much narrower than any interval: from the optimum the others
+/// and the starts follow it, where a whole record of a machine that magnifies small differences would be lost at once.
+fn held_at(structure: &Structure, refined: &Refined, parameter: &str, value: f64) -> Refined {
+    const WIDTH: f64 = 1e-7;
+    let mut setup = refined.setup.clone();
+    let index = setup.model.parameter(parameter);
+    for free in setup.free.iter_mut().filter(|f| Some(f.index) == index) {
+        free.prior = Prior::Normal { mean: value, std: WIDTH };
+    }
+    let limits = Limits { iterations: 30, tolerance: 1e-9 };
+    let fit =
+        setup.with_problem(&refined.level, &refined.scale, |p| p.fit(refined.fit.point.clone(), limits));
+    Refined { setup, fit, ..refined.clone() }.after(structure)
+}
+
+/// Among equations with one scale: inputs whose strength may as well be one stand on the right.
+pub(crate) fn with_inputs_of_strength_one(
+    mut structure: Structure,
+    mut refined: Refined,
+    allowed: &mut [bool],
+) -> (Structure, Refined) {
+    for e in 0..structure.equations.len() {
+        let equation = &structure.equations[e];
+        if equation.input.is_some() || equation.normalised {
+            continue;
+        }
+        let acts = |name: &str| {
+            (0..structure.terms.len()).find(|&i| refined.state.active[i] && structure.terms[i].is(e, name))
+        };
+        let first =
+            structure.inputs.iter().find_map(|(signal, _)| Some((signal.name.clone(), acts(&signal.name)?)));
+        let Some((name, term)) = first else { continue };
+        let mut simpler = structure.clone();
+        simpler.equations[e].input = Some(name);
+        let mut held = held_at(&structure, &refined, &structure.terms[term].parameter, -1.0);
+        (held.state.active[term], held.state.values[term]) = (false, 0.0);
+        if let Some(refit) = refit(&simpler, &held)
+            && refit.score() < refined.score()
+        {
+            (structure, refined) = (simpler, refit);
+            allowed[term] = false;
+        }
+    }
+    (structure, refined)
 }
 
 fn fit_at(refined: &Refined, structure: &Structure, to: Segmentation, limits: Limits) -> Refined {

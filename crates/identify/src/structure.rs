@@ -2,13 +2,45 @@
 
 use greybox_model::{Hold, Model, ModelError};
 
-/// A candidate term of one equation.
+/// What the weak form integrates: ∫ w s⁽ᵈ⁾ dτ, derivative d of a signal s.
 #[derive(Debug, Clone, PartialEq)]
-pub(crate) struct Term {
+pub(crate) struct Integral {
+    /// The signal in the model language: an input, or what the states and their derivatives below the leading one make.
+    pub signal: String,
+    /// Order of its derivative.
+    pub order: usize,
+}
+
+/// What a term adds to one equation.
+#[derive(Debug, Clone, PartialEq)]
+pub(crate) struct Part {
     /// Index of the equation.
     pub equation: usize,
-    /// The term in the model language, without its coefficient.
+    /// What is multiplied by the coefficient, in the model language.
     pub expression: String,
+    /// Integrals whose sum is that of the expression.
+    pub integrals: Vec<Integral>,
+}
+
+impl Part {
+    /// A derivative of a state or an expression without leading derivatives.
+    pub(crate) fn new(equation: usize, expression: &str) -> Part {
+        let signal = expression.trim_end_matches('\'');
+        let integral = if signal.chars().all(|c| c.is_alphanumeric() || c == '_') {
+            Integral { signal: signal.to_string(), order: expression.len() - signal.len() }
+        } else {
+            Integral { signal: expression.to_string(), order: 0 }
+        };
+        Part { equation, expression: expression.to_string(), integrals: vec![integral] }
+    }
+}
+
+/// A candidate term: a coefficient and what it multiplies, in one equation or, where the term stems from an energy, in
+/// several.
+#[derive(Debug, Clone, PartialEq)]
+pub(crate) struct Term {
+    /// What it adds to the equations.
+    pub parts: Vec<Part>,
     /// Name of its coefficient.
     pub parameter: String,
     /// Exponents of the variables, for a monomial.
@@ -44,8 +76,22 @@ pub(crate) struct Extra {
 pub(crate) struct Equation {
     /// Name (that of the state it governs).
     pub name: String,
-    /// The input on the right; none: zero, and the leading coefficient is one.
+    /// The input on the right; none: zero.
     pub input: Option<String>,
+    /// Whether the leading coefficient is one: where neither an input nor another equation sets the scale.
+    pub normalised: bool,
+}
+
+impl Term {
+    /// What the term adds to an equation.
+    pub(crate) fn part(&self, equation: usize) -> Option<&Part> {
+        self.parts.iter().find(|p| p.equation == equation)
+    }
+
+    /// Whether it is `expression` in one equation alone.
+    pub(crate) fn is(&self, equation: usize, expression: &str) -> bool {
+        self.parts.len() == 1 && self.part(equation).is_some_and(|p| p.expression == expression)
+    }
 }
 
 /// Everything a search may choose from.
@@ -112,11 +158,14 @@ impl Structure {
                 .terms
                 .iter()
                 .enumerate()
-                .filter(|(i, t)| t.equation == e && active[*i])
-                .map(|(i, t)| match (self.has_coefficient(i), t.expression.as_str()) {
+                .filter(|(i, _)| active[*i])
+                .filter_map(|(i, t)| {
+                    Some((self.has_coefficient(i), &t.parameter, t.part(e)?.expression.as_str()))
+                })
+                .map(|(has_coefficient, parameter, expression)| match (has_coefficient, expression) {
                     (false, expression) => expression.to_string(),
-                    (true, "1") => t.parameter.clone(),
-                    (true, expression) => format!("{}*{expression}", t.parameter),
+                    (true, "1") => parameter.clone(),
+                    (true, expression) => format!("{parameter}*{expression}"),
                 })
                 .collect();
             left.extend(self.extras.iter().map(|x| x.expression.clone()));
@@ -127,12 +176,69 @@ impl Structure {
         text
     }
 
-    /// Whether a candidate has a coefficient to estimate: all but the leading term of an equation without
-    /// input, which sets the scale.
+    /// Whether a candidate has a coefficient to estimate: all but the leading term that sets an equation's scale.
     pub(crate) fn has_coefficient(&self, term: usize) -> bool {
         let t = &self.terms[term];
-        t.optional || self.equations[t.equation].input.is_some()
+        t.optional || !t.parts.iter().any(|p| self.equations[p.equation].normalised)
     }
+
+    /// The same with one scale for all equations, as terms in several of them ask for: that of the first input, in each
+    /// of the equations that it may act on; that of every input, in different equations; without any input, that of
+    /// the first leading coefficient.
+    pub(crate) fn scaled_together(&self) -> Vec<Structure> {
+        let n = self.equations.len();
+        let names: Vec<&String> = self.inputs.iter().map(|(signal, _)| &signal.name).collect();
+        let mut choices: Vec<Vec<(usize, &String)>> = Vec::new();
+        if let Some(first) = names.first() {
+            choices.extend((0..n).map(|e| vec![(e, *first)]));
+        }
+        if (2..=n).contains(&names.len()) {
+            choices.extend(
+                arrangements(n, names.len()).into_iter().map(|a| a.into_iter().zip(names.clone()).collect()),
+            );
+        }
+        if choices.is_empty() {
+            choices.push(Vec::new());
+        }
+        choices
+            .into_iter()
+            .map(|choice| {
+                let mut structure = self.clone();
+                for (e, equation) in structure.equations.iter_mut().enumerate() {
+                    equation.input = choice.iter().find(|(at, _)| *at == e).map(|(_, name)| (*name).clone());
+                    equation.normalised = choice.is_empty() && e == 0;
+                }
+                structure.terms.retain(|term| !choice.iter().any(|(e, name)| term.is(*e, name)));
+                structure
+            })
+            .collect()
+    }
+
+    /// Equations that share coefficients: each group is one regression.
+    pub(crate) fn groups(&self) -> Vec<Vec<usize>> {
+        let mut groups: Vec<Vec<usize>> = (0..self.equations.len()).map(|e| vec![e]).collect();
+        for term in &self.terms {
+            let (with, mut without): (Vec<Vec<usize>>, _) =
+                groups.into_iter().partition(|g| term.parts.iter().any(|p| g.contains(&p.equation)));
+            without.push(with.concat());
+            groups = without;
+        }
+        groups.iter_mut().for_each(|g| g.sort_unstable());
+        groups.sort_unstable();
+        groups
+    }
+}
+
+/// All ordered choices of `count` among `0..n`.
+fn arrangements(n: usize, count: usize) -> Vec<Vec<usize>> {
+    let mut out: Vec<Vec<usize>> = vec![Vec::new()];
+    for _ in 0..count {
+        out = out
+            .iter()
+            .flat_map(|a| (0..n).filter(|e| !a.contains(e)).map(|e| a.iter().copied().chain([e]).collect()))
+            .collect();
+    }
+    out
 }
 
 fn toml_string(text: &str) -> String {

@@ -5,13 +5,15 @@
 //! are taken of the smoothed states. Errors in these regressors bias the coefficients a little, and the
 //! choice of terms with them: that is why what is found here is only where the output error starts.
 
+use std::collections::{BTreeMap, BTreeSet};
+
 use greybox_algebraic::{Column, Hold as Join, Kernel, rows_of_pieces};
 use greybox_calibrate::{Data, SmoothedStates, qr};
 use greybox_model::tape::{Column as Lane, LeafKind, Tape};
 use greybox_model::{Expr, Hold, Model};
 
 use crate::choose::Reduced;
-use crate::structure::Structure;
+use crate::structure::{Integral, Structure};
 
 /// Columns of one equation's regression.
 pub(crate) struct Rows {
@@ -55,13 +57,21 @@ fn earlier(signal: &[f64], dt: f64, delay: f64) -> Vec<f64> {
         .collect()
 }
 
-/// Values of all candidate terms along the smoothed states, `[piece][term][sample]`.
+/// Signals along the smoothed states.
+pub(crate) struct Values {
+    /// Index of each signal.
+    index: BTreeMap<String, usize>,
+    /// `[piece][signal][sample]`.
+    values: Vec<Vec<Vec<f64>>>,
+}
+
+/// Values of all signals that the candidate terms integrate.
 pub(crate) fn evaluate(
     structure: &Structure,
     model: &Model,
     data: &Data,
     smoothed_states: &SmoothedStates,
-) -> Option<Vec<Vec<Vec<f64>>>> {
+) -> Option<Values> {
     let orders: Vec<usize> = model.states.iter().map(|s| s.order).collect();
     let offsets: Vec<usize> = orders
         .iter()
@@ -80,17 +90,17 @@ pub(crate) fn evaluate(
         let input = model.inputs.iter().position(|u| u.name == name)?;
         (primes == 0).then_some(nx + input)
     };
-    let exprs: Vec<Expr> = structure
-        .terms
+    let parts = structure.terms.iter().flat_map(|t| &t.parts);
+    let signals: BTreeSet<&String> = parts.flat_map(|p| &p.integrals).map(|i| &i.signal).collect();
+    let exprs: Vec<Expr> = signals
         .iter()
-        .map(|t| {
-            let text = if t.optional { t.expression.as_str() } else { "0" };
-            greybox_model::parse(text).ok().map(|p| p.expr)
-        })
+        .map(|signal| greybox_model::parse(signal).ok().map(|p| p.expr))
         .collect::<Option<_>>()?;
+    let index = signals.into_iter().enumerate().map(|(i, signal)| (signal.clone(), i)).collect();
     let kinds = vec![LeafKind::Input; nx + model.inputs.len()];
     let tape = Tape::compile(&exprs, kinds, &resolve).ok()?;
-    data.pieces
+    let values = data
+        .pieces
         .iter()
         .zip(&smoothed_states.states)
         .map(|(piece, smoothed_states)| {
@@ -106,7 +116,8 @@ pub(crate) fn evaluate(
             };
             Some(tape.eval_batch(piece.len, &leaf))
         })
-        .collect()
+        .collect::<Option<_>>()?;
+    Some(Values { index, values })
 }
 
 /// Rows of one equation with windows of `window` seconds.
@@ -114,7 +125,7 @@ pub(crate) fn rows(
     structure: &Structure,
     model: &Model,
     data: &Data,
-    values: &[Vec<Vec<f64>>],
+    values: &Values,
     equation: usize,
     window: f64,
     trial: Option<Trial>,
@@ -125,47 +136,50 @@ pub(crate) fn rows(
     let kernel = Kernel::new(order, order + 1, intervals, dt).ok()?;
     let hop = (intervals / 20).max(1);
     let terms: Vec<usize> =
-        (0..structure.terms.len()).filter(|&i| structure.terms[i].equation == equation).collect();
+        (0..structure.terms.len()).filter(|&i| structure.terms[i].part(equation).is_some()).collect();
+    let parts = || terms.iter().filter_map(|&t| structure.terms[t].part(equation));
     let input = structure.equations[equation].input.as_ref().and_then(|name| model.input(name));
     let late: Vec<Vec<f64>> = match trial {
         Some(t) => data.pieces.iter().map(|p| earlier(&p.smooth[t.state].value, p.dt, t.delay)).collect(),
         None => Vec::new(),
     };
     let zeros: Vec<Vec<f64>> = data.pieces.iter().map(|p| vec![0.0; p.len]).collect();
-    let state_of = |expression: &str| -> Option<(usize, usize)> {
-        let name = expression.trim_end_matches('\'');
-        let primes = expression.len() - name.len();
-        model.states.iter().position(|s| s.name == name).map(|j| (j, primes))
-    };
     let pieces: Vec<Vec<Column<'_>>> = data
         .pieces
         .iter()
         .enumerate()
         .filter(|(_, p)| (p.dt / dt - 1.0).abs() < 1e-6)
         .map(|(i, piece)| {
-            let mut columns: Vec<Column<'_>> = terms
-                .iter()
-                .map(|&t| match state_of(&structure.terms[t].expression) {
+            let input_column = |u: usize| Column {
+                signal: &piece.inputs[u],
+                order: 0,
+                hold: match model.inputs[u].hold {
+                    Hold::Zero => Join::Zero,
+                    Hold::Linear => Join::Linear,
+                    Hold::BandLimited => Join::Smooth,
+                },
+            };
+            let column = |integral: &Integral| -> Column<'_> {
+                let state = model.states.iter().position(|s| s.name == integral.signal);
+                match (state, model.input(&integral.signal)) {
                     // A derivative of a measured state: from the measurement itself.
-                    Some((j, primes)) => {
-                        Column { signal: &piece.measured[j], order: primes, hold: Join::Smooth }
+                    (Some(j), _) => {
+                        Column { signal: &piece.measured[j], order: integral.order, hold: Join::Smooth }
                     }
-                    None => Column { signal: &values[i][t], order: 0, hold: Join::Smooth },
-                })
-                .collect();
+                    (None, Some(u)) => input_column(u),
+                    (None, None) => Column {
+                        signal: &values.values[i][values.index[&integral.signal]],
+                        order: integral.order,
+                        hold: Join::Smooth,
+                    },
+                }
+            };
+            let mut columns: Vec<Column<'_>> = parts().flat_map(|p| &p.integrals).map(column).collect();
             if let Some(signal) = late.get(i) {
                 columns.push(Column { signal, order: 0, hold: Join::Linear });
             }
             columns.push(match input {
-                Some(u) => Column {
-                    signal: &piece.inputs[u],
-                    order: 0,
-                    hold: match model.inputs[u].hold {
-                        Hold::Zero => Join::Zero,
-                        Hold::Linear => Join::Linear,
-                        Hold::BandLimited => Join::Smooth,
-                    },
-                },
+                Some(u) => input_column(u),
                 None => Column { signal: &zeros[i], order: 0, hold: Join::Linear },
             });
             columns
@@ -174,6 +188,17 @@ pub(crate) fn rows(
     let mut rows = rows_of_pieces(&kernel, &pieces, hop).ok()?;
     let target = rows.columns.pop()?;
     let delayed = if trial.is_some() { rows.columns.pop() } else { None };
+    // A part is the sum of its integrals.
+    let mut integrals = rows.columns.into_iter();
+    let columns: Vec<Vec<f64>> = parts()
+        .map(|part| {
+            let mut sum = integrals.next().unwrap_or_default();
+            for integral in integrals.by_ref().take(part.integrals.len() - 1) {
+                sum.iter_mut().zip(integral).for_each(|(s, v)| *s += v);
+            }
+            sum
+        })
+        .collect();
     let overlap = intervals.div_ceil(hop);
     let independent = (target.len() as f64 / overlap as f64).max(1.0);
     let mut pieces: Vec<std::ops::Range<usize>> = Vec::new();
@@ -183,10 +208,11 @@ pub(crate) fn rows(
             _ => pieces.push(row..row + 1),
         }
     }
-    Some(Rows { columns: rows.columns, target, terms, delayed, independent, overlap, pieces })
+    Some(Rows { columns, target, terms, delayed, independent, overlap, pieces })
 }
 
 /// A linear regression.
+#[derive(Default)]
 pub(crate) struct Regression {
     /// Right-hand side.
     pub target: Vec<f64>,
@@ -196,8 +222,75 @@ pub(crate) struct Regression {
     pub protected: Vec<usize>,
 }
 
-/// The rows as a regression. Without input the leading derivative moves to the right; a delayed feedback does where its gain is known.
-pub(crate) fn regression(structure: &Structure, rows: &Rows, gain: Option<f64>) -> Regression {
+/// The rows of equations that share coefficients as one regression, each equation weighted by the noise of its rows.
+pub(crate) fn regression(structure: &Structure, rows: &[Rows], gain: Option<f64>) -> Regression {
+    let single: Vec<Regression> = rows.iter().map(|r| regression_of_one(structure, r, gain)).collect();
+    if single.len() == 1 {
+        return single.into_iter().next().unwrap_or_default();
+    }
+    // First every equation as large as its leading derivative, then as large as what the fit of all leaves.
+    let leading = |rows: &Rows| {
+        let at = rows.terms.iter().position(|t| !structure.terms[*t].optional);
+        at.map_or(1.0, |at| rms(&rows.columns[at]))
+    };
+    let mut scale: Vec<f64> = rows.iter().map(leading).collect();
+    let mut stacked = stack(structure, &single, &scale);
+    let (n, k) = (stacked.target.len(), stacked.columns.len());
+    let mut a: Vec<f64> = stacked.columns.iter().flat_map(|c| c.1.iter().copied()).collect();
+    a.extend_from_slice(&stacked.target);
+    let t = qr::triangle(&mut a, n, k + 1);
+    let all: Vec<usize> = (0..k).collect();
+    let values = Reduced::from_triangle(&t, k, n as f64, 0.0).solve(&all).values;
+    let mut from = 0;
+    for (scale, of_equation) in scale.iter_mut().zip(&single) {
+        let range = from..from + of_equation.target.len();
+        from = range.end;
+        let mut left = stacked.target[range.clone()].to_vec();
+        for (value, column) in values.iter().zip(&stacked.columns) {
+            left.iter_mut().zip(&column.1[range.clone()]).for_each(|(l, c)| *l -= value * c);
+        }
+        *scale *= rms(&left).max(1e-6);
+    }
+    if scale.iter().all(|s| s.is_finite()) {
+        stacked = stack(structure, &single, &scale);
+    }
+    stacked
+}
+
+fn rms(values: &[f64]) -> f64 {
+    (values.iter().map(|v| v * v).sum::<f64>() / values.len().max(1) as f64).sqrt().max(f64::MIN_POSITIVE)
+}
+
+/// One regression of several, each divided by its `scale`; a column is zero in equations that its term does not enter.
+fn stack(structure: &Structure, single: &[Regression], scale: &[f64]) -> Regression {
+    let n: usize = single.iter().map(|r| r.target.len()).sum();
+    let present: BTreeSet<Option<usize>> =
+        single.iter().flat_map(|r| r.columns.iter().map(|c| c.0)).collect();
+    let mut columns: Vec<(Option<usize>, Vec<f64>)> =
+        present.into_iter().map(|t| (t, vec![0.0; n])).collect();
+    let mut target = Vec::with_capacity(n);
+    for (regression, scale) in single.iter().zip(scale) {
+        let from = target.len();
+        target.extend(regression.target.iter().map(|v| v / scale));
+        for (term, column) in &regression.columns {
+            let Some((_, stacked)) = columns.iter_mut().find(|c| c.0 == *term) else { continue };
+            stacked[from..].iter_mut().zip(column).for_each(|(s, v)| *s = v / scale);
+        }
+    }
+    Regression::new(structure, target, columns)
+}
+
+impl Regression {
+    fn new(structure: &Structure, target: Vec<f64>, columns: Vec<(Option<usize>, Vec<f64>)>) -> Regression {
+        let stays = |t: &Option<usize>| t.is_none_or(|t| !structure.terms[t].optional);
+        let protected = (0..columns.len()).filter(|&c| stays(&columns[c].0)).collect();
+        Regression { target, columns, protected }
+    }
+}
+
+/// The rows of one equation as a regression. Where the leading derivative has no coefficient it moves to the right; a
+/// delayed feedback does where its gain is known.
+fn regression_of_one(structure: &Structure, rows: &Rows, gain: Option<f64>) -> Regression {
     let mut target = rows.target.clone();
     let mut columns: Vec<(Option<usize>, Vec<f64>)> = Vec::new();
     if let Some(delayed) = &rows.delayed {
@@ -213,13 +306,15 @@ pub(crate) fn regression(structure: &Structure, rows: &Rows, gain: Option<f64>) 
             target.iter_mut().zip(column).for_each(|(t, v)| *t -= v);
         }
     }
-    let stays = |t: &Option<usize>| t.is_none_or(|t| !structure.terms[t].optional);
-    let protected = (0..columns.len()).filter(|&c| stays(&columns[c].0)).collect();
-    Regression { target, columns, protected }
+    Regression::new(structure, target, columns)
 }
 
 /// The regression in triangular form, and the candidates of its columns (none: the delayed feedback).
-pub(crate) fn reduce(structure: &Structure, rows: &Rows, gain: Option<f64>) -> (Reduced, Vec<Option<usize>>) {
+pub(crate) fn reduce(
+    structure: &Structure,
+    rows: &[Rows],
+    gain: Option<f64>,
+) -> (Reduced, Vec<Option<usize>>) {
     let Regression { target, columns, .. } = regression(structure, rows, gain);
     let n = target.len();
     let k = columns.len();
@@ -231,8 +326,9 @@ pub(crate) fn reduce(structure: &Structure, rows: &Rows, gain: Option<f64>) -> (
     let t = qr::triangle(&mut a, n, k + 1);
     let floor = 1e-10 * target.iter().map(|v| v * v).sum::<f64>() / n.max(1) as f64;
     // Rows of overlapping windows share their noise: a window's worth of them counts as one.
-    let reduced = Reduced::from_triangle(&t, k, n as f64, floor).weighted(rows.independent / n as f64);
-    let samples = rows.independent.max(k as f64 + 2.0);
+    let independent: f64 = rows.iter().map(|r| r.independent).sum();
+    let reduced = Reduced::from_triangle(&t, k, n as f64, floor).weighted(independent / n as f64);
+    let samples = independent.max(k as f64 + 2.0);
     (Reduced { samples, ..reduced }, columns.into_iter().map(|c| c.0).collect())
 }
 

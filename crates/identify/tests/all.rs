@@ -3,4 +3,5 @@
 
 mod blocks;
 mod invariance;
+mod machines;
 mod recovery;

@@ -195,7 +195,7 @@ fn first_order_systems_and_second_inputs() {
     let y = noisy(&y, 2e-3, &mut random);
     let data = [recording(dt, &[("u", None, u), ("w", None, w), ("y", None, y)])];
     let options = Options {
-        derivatives: 1,
+        derivatives: vec![1],
         order: 3,
         replicates: 0,
         hold: Some(Hold::Linear),
@@ -377,9 +377,10 @@ fn the_sine_of_a_pendulum_is_found() {
 fn every_part_of_the_library_makes_a_model() {
     let recordings = [pendulum(None)];
     for monomials in [Monomials::Tensor, Monomials::TotalDegree, Monomials::Separate] {
-        for parts in 0..8 {
-            let [constant, friction, trigonometric] = [1, 2, 4].map(|part| parts & part != 0);
-            let library = Library { monomials, constant, friction, trigonometric, terms: Vec::new() };
+        for parts in 0..16 {
+            let [constant, friction, trigonometric, lagrangian] = [1, 2, 4, 8].map(|part| parts & part != 0);
+            let library =
+                Library { monomials, constant, friction, trigonometric, lagrangian, terms: Vec::new() };
             let options = Options { order: 1, ..with(library.clone()) };
             if let Err(error) = identify(&recordings, &recordings, &options, &Quiet) {
                 panic!("{library:?}: {error}");

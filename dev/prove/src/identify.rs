@@ -3,9 +3,13 @@
 //! Every case makes recordings from a seed, identifies, and compares with the equation that made them. The
 //! rigs integrate on their own and know nothing of the model language.
 
+mod machines;
 mod nominal;
 
+use std::path::Path;
+
 use anyhow::{Context, Result};
+use greybox_dev::book;
 use greybox_identify::{
     DelayedState, FoundEquation, Identification, Library, Monomials, Options, Quiet, identify,
 };
@@ -22,36 +26,51 @@ use rayon::prelude::*;
 
 use super::{Figure, Outcome};
 
-/// Terms of an equation with their true coefficients.
-type Truth = &'static [(&'static str, f64)];
+/// An equation that made recordings.
+#[derive(Debug, Clone, Copy)]
+struct Truth<'a> {
+    /// The input on its right.
+    input: Option<&'a str>,
+    /// Its terms with their coefficients.
+    terms: &'a [(&'a str, f64)],
+}
 
 /// Thesis Eq 2.18.
-const DUFFING: Truth = &[("x''", 2.0), ("x", 6.0), ("x^3", 0.1), ("x'", 1.0), ("x^2*x'", 0.2), ("x'^3", 1.0)];
+const DUFFING: Truth<'static> = Truth {
+    input: Some("f"),
+    terms: &[("x''", 2.0), ("x", 6.0), ("x^3", 0.1), ("x'", 1.0), ("x^2*x'", 0.2), ("x'^3", 1.0)],
+};
 /// Thesis Eq 2.24 with the identified column of Table 2.3.
-const HUB: Truth = &[
-    ("theta''", 0.0190),
-    ("theta'", 0.6623),
-    ("theta'^3", -0.0065),
-    ("theta", 0.4151),
-    ("theta^2", 0.0933),
-    ("theta^3", -1.5354),
-    ("alpha'", -0.0420),
-    ("alpha", -6.3840),
-    ("alpha^2", 5.8953),
-    ("sign(theta')", 0.1151),
-];
+const HUB: Truth<'static> = Truth {
+    input: Some("v"),
+    terms: &[
+        ("theta''", 0.0190),
+        ("theta'", 0.6623),
+        ("theta'^3", -0.0065),
+        ("theta", 0.4151),
+        ("theta^2", 0.0933),
+        ("theta^3", -1.5354),
+        ("alpha'", -0.0420),
+        ("alpha", -6.3840),
+        ("alpha^2", 5.8953),
+        ("sign(theta')", 0.1151),
+    ],
+};
 /// Thesis Eq 2.25, likewise.
-const LINK: Truth = &[
-    ("alpha''", -0.0118),
-    ("theta'", 0.5890),
-    ("theta", 0.7113),
-    ("theta^2", 0.0935),
-    ("theta^3", -2.7442),
-    ("alpha'", -0.0872),
-    ("alpha", -13.1712),
-    ("alpha^2", 6.2922),
-    ("sign(theta')", 0.1474),
-];
+const LINK: Truth<'static> = Truth {
+    input: Some("v"),
+    terms: &[
+        ("alpha''", -0.0118),
+        ("theta'", 0.5890),
+        ("theta", 0.7113),
+        ("theta^2", 0.0935),
+        ("theta^3", -2.7442),
+        ("alpha'", -0.0872),
+        ("alpha", -13.1712),
+        ("alpha^2", 6.2922),
+        ("sign(theta')", 0.1474),
+    ],
+};
 
 /// One seed's result.
 #[derive(Debug, Clone)]
@@ -70,7 +89,7 @@ struct Trial {
     doubted: (usize, usize),
 }
 
-fn compare(found: &Identification, truth: &[Truth], delay: Option<f64>) -> Trial {
+fn compare(found: &Identification, truth: &[Truth<'_>], delay: Option<f64>) -> Trial {
     let mut trial = Trial {
         exact: Vec::new(),
         errors: Vec::new(),
@@ -82,13 +101,15 @@ fn compare(found: &Identification, truth: &[Truth], delay: Option<f64>) -> Trial
     for (equation, truth) in found.equations.iter().zip(truth) {
         let terms: Vec<_> = equation.terms.iter().filter(|t| !t.expression.starts_with("delay(")).collect();
         let of = |name: &str| terms.iter().find(|t| t.expression == name);
-        let exact = terms.len() == truth.len() && truth.iter().all(|t| of(t.0).is_some());
+        let exact = equation.input.as_deref() == truth.input
+            && terms.len() == truth.terms.len()
+            && truth.terms.iter().all(|t| of(t.0).is_some());
         trial.exact.push(exact);
         trial
             .errors
-            .push(truth.iter().map(|t| of(t.0).map_or(1.0, |f| (f.value / t.1 - 1.0).abs())).collect());
+            .push(truth.terms.iter().map(|t| of(t.0).map_or(1.0, |f| (f.value / t.1 - 1.0).abs())).collect());
         let mut scores = Vec::new();
-        for (name, value) in truth.iter().copied() {
+        for (name, value) in truth.terms.iter().copied() {
             if let Some(term) = of(name)
                 && let Some((low, high)) = term.ci95
             {
@@ -98,7 +119,7 @@ fn compare(found: &Identification, truth: &[Truth], delay: Option<f64>) -> Trial
             }
         }
         trial.scores.push(if exact { scores } else { Vec::new() });
-        let wrong = wrong_terms(equation, truth);
+        let wrong = wrong_terms(equation, *truth);
         trial.doubted.1 += wrong.len();
         trial.doubted.0 +=
             wrong.iter().filter(|w| equation.doubtful.iter().any(|d| d.expression == **w)).count();
@@ -109,15 +130,15 @@ fn compare(found: &Identification, truth: &[Truth], delay: Option<f64>) -> Trial
     trial
 }
 
-fn wrong_terms(equation: &FoundEquation, truth: Truth) -> Vec<String> {
-    let is_true = |name: &str| truth.iter().any(|t| t.0 == name);
+fn wrong_terms(equation: &FoundEquation, truth: Truth<'_>) -> Vec<String> {
+    let is_true = |name: &str| truth.terms.iter().any(|t| t.0 == name);
     let found = |name: &str| equation.terms.iter().any(|t| t.expression == name);
     let extra = equation
         .terms
         .iter()
         .filter(|t| !is_true(&t.expression) && !t.expression.starts_with("delay("))
         .map(|t| t.expression.clone());
-    extra.chain(truth.iter().filter(|t| !found(t.0)).map(|t| t.0.to_string())).collect()
+    extra.chain(truth.terms.iter().filter(|t| !found(t.0)).map(|t| t.0.to_string())).collect()
 }
 
 fn times(samples: usize, dt: f64) -> Vec<f64> {
@@ -226,13 +247,16 @@ fn delayed_options(gain: Option<f64>) -> Options {
 }
 
 /// Thesis Eq 3.3 with Table 3.2.
-const DELAYED: Truth = &[("x''", 1.0), ("x", 6.0), ("x^3", 2.0), ("x'", 1.0), ("x^2*x'", 1.0), ("x'^3", 1.0)];
+const DELAYED: Truth<'static> = Truth {
+    input: Some("f"),
+    terms: &[("x''", 1.0), ("x", 6.0), ("x^3", 2.0), ("x'", 1.0), ("x^2*x'", 1.0), ("x'^3", 1.0)],
+};
 
 fn run_seeds(
     seeds: &[u64],
     make: impl Fn(u64) -> Result<Vec<Recording>> + Sync,
     options: &Options,
-    truth: &[Truth],
+    truth: &[Truth<'_>],
     delay: Option<f64>,
 ) -> Result<Vec<Trial>> {
     seeds
@@ -313,7 +337,7 @@ fn doubt_figure(trials: &[Trial]) -> Figure {
 type CaseFn = fn(&[u64]) -> Result<Vec<Figure>>;
 
 /// Name, seeds of the full proof, what to do.
-const CASES: [(&str, usize, CaseFn); 15] = [
+const CASES: [(&str, usize, CaseFn); 23] = [
     ("duffing, thesis set-up, 60 s", 100, thesis_case),
     ("peers' protocol, 1 ms, 0.01", 100, |s| peers_case(s, 0.001, 0.01, 99)),
     ("peers' protocol, 1 ms, 0.05", 100, |s| peers_case(s, 0.001, 0.05, 97)),
@@ -329,6 +353,16 @@ const CASES: [(&str, usize, CaseFn); 15] = [
     ("delayed duffing, 20 s, kp free", 30, |s| delayed_case(s, 20.0, None, None)),
     ("flexible joint with delay", 10, joint_case),
     ("observer of the thesis", 1, observer_case),
+    ("machine: chain of two masses, force on the first", 100, |s| machines::chain_case(s, 2, &[0])),
+    ("machine: chain of two masses, force on the second", 100, |s| machines::chain_case(s, 2, &[1])),
+    ("machine: chain of two masses, a force on each", 100, |s| machines::chain_case(s, 2, &[0, 1])),
+    ("machine: chain of three masses, force on the second", 100, |s| machines::chain_case(s, 3, &[1])),
+    ("machine: chain of three masses, forces on the first and last", 100, |s| {
+        machines::chain_case(s, 3, &[0, 2])
+    }),
+    ("machine: drive with current, voltage and load", 100, machines::drive_case),
+    ("machine: pendulum on a cart, force on the cart", 100, machines::cart_case),
+    ("machine: arm of two links, a torque at each joint", 100, machines::arm_case),
 ];
 
 fn thesis_case(seeds: &[u64]) -> Result<Vec<Figure>> {
@@ -449,7 +483,8 @@ fn row_bootstrap(seed: u64) -> Result<(usize, usize)> {
         &Penalty::Fixed(0.0),
         &options,
     )?;
-    let held = (0..6).filter(|&j| (drawn.mean[j] - DUFFING[j].1).abs() <= 1.96 * drawn.deviation[j]).count();
+    let held =
+        (0..6).filter(|&j| (drawn.mean[j] - DUFFING.terms[j].1).abs() <= 1.96 * drawn.deviation[j]).count();
     Ok((held, 6))
 }
 
@@ -569,8 +604,10 @@ fn joint_case(seeds: &[u64]) -> Result<Vec<Figure>> {
         delay: Some(DelayedState { state: "theta".to_string(), gain: Some(-1.0), longest: 0.4 }),
         ..Options::new(&["theta", "alpha"], &["r"])
     };
+    // Only the delay is judged.
+    let unknown = Truth { input: Some("r"), terms: &[] };
     let make = |seed| Ok(vec![joint_recording(seed, 20.0, 1e-3)?]);
-    let trials = run_seeds(seeds, make, &options, &[&[], &[]], Some(0.2))?;
+    let trials = run_seeds(seeds, make, &options, &[unknown, unknown], Some(0.2))?;
     let errors: Vec<f64> = trials.iter().filter_map(|t| t.delay.map(|d| 100.0 * d.0.abs())).collect();
     let worst = errors.iter().copied().fold(0.0, f64::max);
     let name = "error of tau: median, worst";
@@ -578,12 +615,35 @@ fn joint_case(seeds: &[u64]) -> Result<Vec<Figure>> {
     Ok(vec![Figure::judged(name, text, "<= 1.5 %", worst <= 1.5)])
 }
 
+const PAGE: &str = "identify.md";
+pub(crate) const BEGIN: &str =
+    "<!-- Made by `cargo xtask prove --identify --only machine: --write-docs`; do not edit. -->";
+
+/// Puts the figures of the machines with several coordinates into the book.
+pub(crate) fn write(root: &Path, outcomes: &[Outcome]) -> Result<()> {
+    let all = CASES.iter().filter(|c| c.0.starts_with(machines::PREFIX));
+    for case in all {
+        let ran = outcomes.iter().any(|o| o.case == case.0);
+        anyhow::ensure!(ran, "`{}` was not run: the table in the book has all machines", case.0);
+    }
+    book::put_table(root, PAGE, BEGIN, &machines::table(outcomes))
+}
+
+/// Writes the recordings of the machines for other tools.
+pub(crate) fn keep(folder: &Path, first: u64, count: Option<usize>) -> Result<()> {
+    machines::keep(folder, &seeds(first, count.unwrap_or(20)))
+}
+
+fn seeds(first: u64, count: usize) -> Vec<u64> {
+    (0..count as u64).map(|i| first.wrapping_mul(1_000_003).wrapping_add(i)).collect()
+}
+
 /// Runs the cases whose name contains `only` on at most `count` of their seeds each; `first` shifts all seeds.
 pub(crate) fn run(first: u64, count: Option<usize>, only: Option<&str>) -> Result<Vec<Outcome>> {
     let mut outcomes = Vec::new();
     for (name, full, case) in CASES.iter().filter(|c| only.is_none_or(|o| c.0.contains(o))) {
         let n = count.map_or(*full, |c| c.min(*full));
-        let seeds: Vec<u64> = (0..n as u64).map(|i| first.wrapping_mul(1_000_003).wrapping_add(i)).collect();
+        let seeds = seeds(first, n);
         eprintln!("{name} ({n} seeds) …");
         outcomes.push(Outcome { case: (*name).to_string(), figures: case(&seeds)? });
     }

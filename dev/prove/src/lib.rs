@@ -36,8 +36,8 @@ pub struct Arguments {
     /// Measure coverage, false alarms and the reliability of confidence over seeds instead
     #[arg(long, conflicts_with_all = ["recordings", "identify", "floors"])]
     statistics: bool,
-    /// Put what --statistics, or --recordings on the real sets, measured into the book
-    #[arg(long, conflicts_with = "only")]
+    /// Put what --statistics, --identify, or --recordings on the real sets, measured into the book
+    #[arg(long)]
     write_docs: bool,
     /// Seed of the concealed suite; first seed of --identify and --statistics
     #[arg(long, value_name = "N", default_value_t = 1)]
@@ -45,7 +45,8 @@ pub struct Arguments {
     /// Cases of the concealed suite (three rounds of 42 otherwise); seeds per case of --identify and --statistics
     #[arg(long, value_name = "N")]
     count: Option<usize>,
-    /// Keep the concealed suite's cases, truths and results here (target/prove/concealed otherwise)
+    /// Keep the concealed suite's cases, truths and results here (target/prove/concealed otherwise), or the recordings of
+    /// --identify's machines
     #[arg(long, value_name = "DIR")]
     keep: Option<PathBuf>,
     /// Cases of the concealed suite that run at the same time
@@ -117,8 +118,17 @@ pub(crate) struct Outcome {
 /// # Errors
 /// When a recording is missing, greybox does not build, or a file cannot be written.
 pub fn run(root: &Path, arguments: &Arguments) -> Result<Ending> {
+    if arguments.write_docs && arguments.only.is_some() && !arguments.identify {
+        bail!("--write-docs with --only would leave rows out of a table of the book");
+    }
     if arguments.identify {
+        if let Some(folder) = &arguments.keep {
+            identify::keep(folder, arguments.seed, arguments.count)?;
+        }
         let outcomes = identify::run(arguments.seed, arguments.count, arguments.only.as_deref())?;
+        if arguments.write_docs {
+            identify::write(root, &outcomes)?;
+        }
         return conclude(&outcomes, arguments.json.as_deref());
     }
     if arguments.statistics {

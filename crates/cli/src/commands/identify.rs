@@ -51,7 +51,7 @@ pub(crate) struct Arguments {
     #[arg(long, value_name = "X,…", value_delimiter = ',', num_args = 1, required_unless_present = "model")]
     states: Vec<String>,
 
-    /// Channels that drive it; the first one sets the scale of the equations
+    /// Channels that drive it; which of them enters which equation is found
     #[arg(long, value_name = "F,…", value_delimiter = ',', num_args = 1)]
     inputs: Vec<String>,
 
@@ -68,9 +68,9 @@ pub(crate) struct Arguments {
     #[arg(long = "term", value_name = "EXPR")]
     terms: Vec<String>,
 
-    /// Order of the leading derivative: 2 for mechanics, 1 for first-order systems
-    #[arg(long, value_name = "1|2", default_value_t = 2)]
-    derivatives: usize,
+    /// Order of the leading derivative, one for all states or one for each: 2 for mechanics, 1 for first-order systems
+    #[arg(long, value_name = "1|2,…", value_delimiter = ',', num_args = 1, default_value = "2")]
+    derivatives: Vec<usize>,
 
     /// What the inputs do between samples [default: found from the recordings]
     #[arg(long, value_name = "HOLD")]
@@ -134,6 +134,8 @@ enum Part {
     Friction,
     /// Sine and cosine of every state
     Trigonometric,
+    /// Terms of kinetic energy and gravity, shared by the equations of rigid bodies on joints
+    Lagrangian,
 }
 
 impl Part {
@@ -142,7 +144,7 @@ impl Part {
             Part::Tensor => Some(Monomials::Tensor),
             Part::Total => Some(Monomials::TotalDegree),
             Part::Separate => Some(Monomials::Separate),
-            Part::Constant | Part::Friction | Part::Trigonometric => None,
+            Part::Constant | Part::Friction | Part::Trigonometric | Part::Lagrangian => None,
         }
     }
 }
@@ -241,7 +243,7 @@ fn options(arguments: &Arguments) -> Result<Options, Failure> {
         longest: arguments.longest,
     });
     Ok(Options {
-        derivatives: arguments.derivatives,
+        derivatives: of_every_state(&arguments.derivatives, arguments.states.len()),
         library: library(arguments, usual.library.monomials)?,
         order: arguments.order.unwrap_or(usual.order),
         hold: arguments.hold.map(Hold::from),
@@ -251,6 +253,14 @@ fn options(arguments: &Arguments) -> Result<Options, Failure> {
         work: arguments.work.map_or(usual.work, |work| work.saturating_mul(BILLION)),
         ..usual
     })
+}
+
+/// One value for every state, where one stands for all.
+fn of_every_state(given: &[usize], states: usize) -> Vec<usize> {
+    match given {
+        [one] => vec![*one; states],
+        several => several.to_vec(),
+    }
 }
 
 fn library(arguments: &Arguments, usual: Monomials) -> Result<Library, Failure> {
@@ -266,6 +276,7 @@ fn library(arguments: &Arguments, usual: Monomials) -> Result<Library, Failure> 
         constant: parts.contains(&Part::Constant),
         friction: parts.contains(&Part::Friction),
         trigonometric: parts.contains(&Part::Trigonometric),
+        lagrangian: parts.contains(&Part::Lagrangian),
         terms: arguments.terms.clone(),
     })
 }
