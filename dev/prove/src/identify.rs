@@ -652,3 +652,29 @@ pub(crate) fn run(first: u64, count: Option<usize>, only: Option<&str>) -> Resul
     }
     Ok(outcomes)
 }
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn the_book_has_a_place_for_the_machines_and_no_row_of_others() {
+        assert!(book::has_table(&greybox_dev::root(), PAGE, BEGIN));
+        let outcome = |case: &str| Outcome {
+            case: case.to_string(),
+            figures: vec![
+                Figure::plain("all equations exact", "3 of 4"),
+                Figure::plain("intervals", "95 % of 9"),
+            ],
+        };
+        let table = machines::table(&[outcome("machine: a chain"), outcome("duffing")]);
+        assert!(table.ends_with("| a chain | 3 of 4 | 95 % of 9 |\n"), "{table}");
+        assert!(!table.contains("duffing"));
+    }
+
+    #[test]
+    fn a_table_without_all_machines_is_not_written() {
+        let error = write(&greybox_dev::root(), &[]).unwrap_err().to_string();
+        assert!(error.contains("machine: "), "{error}");
+    }
+}

@@ -1,10 +1,12 @@
 //! Chapter 2: identification by the algebraic method.
 
 use std::fmt::Write as _;
+use std::ops::Range;
 
-use anyhow::{Context, Result};
-use greybox_simulate::rigs::RotaryFlexibleLink;
+use anyhow::{Context, Result, bail};
+use greybox_simulate::rigs::{LinkRun, RotaryFlexibleLink};
 use greybox_sparse::Search;
+use greybox_sparse::folds::contiguous;
 use greybox_sparse::select::{FoldKind, Selector};
 
 use super::duffing::{self, Integrals, Variant, Velocity};
@@ -38,22 +40,29 @@ pub(crate) fn photograph(_: &Fixture) -> Result<Piece> {
     ))
 }
 
-/// Rows of fold k when n rows in time are cut into K contiguous folds, as even as they can be.
-fn fold(n: usize, folds: usize, k: usize) -> std::ops::Range<usize> {
-    k * n / folds..(k + 1) * n / folds
+/// Rows that each of K contiguous folds of n rows holds out.
+fn held_out(n: usize, count: usize) -> Result<Vec<Range<usize>>> {
+    // One recording.
+    let folds = contiguous(std::slice::from_ref(&(0..n)), count, 0)?;
+    let of_fold = |parts: &Vec<usize>| -> Result<Range<usize>> {
+        let ranges: Vec<&Range<usize>> = parts.iter().flat_map(|part| &folds.parts[*part]).collect();
+        let [one] = ranges.as_slice() else { bail!("a fold of one recording is in {} pieces", ranges.len()) };
+        Ok((*one).clone())
+    };
+    folds.held_out.iter().map(of_fold).collect()
 }
 
-/// Figure 2.1: contiguous folds, drawn from the cut itself.
+/// Figure 2.1: contiguous folds, drawn from the cut of `sparse::folds`, which Algorithm 1 uses.
 fn figure_2_1(fixture: &Fixture) -> Result<Piece> {
     let folds = fixture.number("folds of the numerical example", "thesis")? as usize;
     let rows = 30_000;
+    let cut = held_out(rows, folds)?;
     let (left, width, height) = (92.0, 612.0, 26.0);
     let mut svg = open(720.0, 62.0 + 32.0 * folds as f64, "Contiguous folds: each validates once");
     for validating in 0..folds {
         let y = 34.0 + 32.0 * validating as f64;
         let _ = write!(svg, "<text x=\"4\" y=\"{:.1}\">model {}</text>", y + 18.0, validating + 1);
-        for k in 0..folds {
-            let range = fold(rows, folds, k);
+        for (k, range) in cut.iter().enumerate() {
             let place = |row: usize| left + width * row as f64 / rows as f64;
             let (from, to) = (place(range.start), place(range.end));
             let (fill, ink, text) = if k == validating {
@@ -71,8 +80,7 @@ fn figure_2_1(fixture: &Fixture) -> Result<Piece> {
             );
         }
     }
-    for k in 0..folds {
-        let range = fold(rows, folds, k);
+    for (k, range) in cut.iter().enumerate() {
         let middle = left + width * 0.5 * (range.start + range.end) as f64 / rows as f64;
         let _ = write!(svg, "<text x=\"{middle:.1}\" y=\"22\" text-anchor=\"middle\">{}</text>", k + 1);
     }
@@ -84,7 +92,7 @@ fn figure_2_1(fixture: &Fixture) -> Result<Piece> {
     );
 
     // An uneven number of rows, where a careless cut shows.
-    let sizes: Vec<usize> = (0..folds).map(|k| fold(rows - 1, folds, k).len()).collect();
+    let sizes: Vec<usize> = held_out(rows - 1, folds)?.iter().map(Range::len).collect();
     let spread = sizes.iter().max().zip(sizes.iter().min()).map_or(0, |(most, least)| most - least);
     let mut piece = Piece::new(
         Status::Reproduced,
@@ -699,6 +707,17 @@ fn figure_2_7(_: &Fixture) -> Result<Piece> {
         let axes = (Axis::linear("time in s"), Axis::linear(format!("{symbol} in degrees")));
         draw(&mut piece, &format!("{symbol} on the square wave of ±30°, 0.66 Hz."), axes, series)?;
     }
+    let voltage = |(name, run): &(&str, LinkRun)| {
+        let style = if *name == "identified" { Style::Dashed } else { Style::Line };
+        let points = run.voltages.iter().enumerate().step_by(10).map(|(k, v)| [k as f64 * link::STEP, *v]);
+        Series::new(*name, style, points.collect())
+    };
+    let axes = (Axis::linear("time in s"), Axis::linear("input voltage in V"));
+    draw(&mut piece, "The voltage that the controller asks for.", axes, runs.iter().map(voltage).collect())?;
+    let largest = |run: &LinkRun| run.voltages.iter().fold(0.0_f64, |most, v| most.max(v.abs()));
+    piece.checks.push(Check::new("largest voltage of the rig", largest(&runs[1].1)));
+    let off = 100.0 * relative_rms(&runs[2].1.voltages, &runs[1].1.voltages);
+    piece.checks.push(Check::new("voltage, identified, relative rms error in %", off));
     Ok(piece)
 }
 
@@ -712,19 +731,6 @@ pub fn relative_rms(estimate: &[f64], truth: &[f64]) -> f64 {
 #[cfg(test)]
 mod tests {
     use super::*;
-
-    #[test]
-    fn folds_cover_all_rows_once_whatever_their_number() {
-        for (n, folds) in [(10, 5), (11, 5), (7, 10), (29_999, 5)] {
-            let mut next = 0;
-            for k in 0..folds {
-                let range = fold(n, folds, k);
-                assert_eq!(range.start, next);
-                next = range.end;
-            }
-            assert_eq!(next, n);
-        }
-    }
 
     #[test]
     fn the_constants_in_use_are_those_of_the_tables() {
