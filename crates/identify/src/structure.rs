@@ -182,16 +182,14 @@ impl Structure {
         t.optional || !t.parts.iter().any(|p| self.equations[p.equation].normalised)
     }
 
-    /// The same with one scale for all equations, as terms in several of them ask for: that of the first input, in each
-    /// of the equations that it may act on; that of every input, in different equations; without any input, that of
-    /// the first leading coefficient.
+    /// The same with one scale for all equations, as terms in several of them ask for: that of one input on one of the
+    /// equations; that of every input, on different equations; without any input, that of the first leading
+    /// coefficient.
     pub(crate) fn scaled_together(&self) -> Vec<Structure> {
         let n = self.equations.len();
         let names: Vec<&String> = self.inputs.iter().map(|(signal, _)| &signal.name).collect();
-        let mut choices: Vec<Vec<(usize, &String)>> = Vec::new();
-        if let Some(first) = names.first() {
-            choices.extend((0..n).map(|e| vec![(e, *first)]));
-        }
+        let mut choices: Vec<Vec<(usize, &String)>> =
+            names.iter().flat_map(|name| (0..n).map(move |e| vec![(e, *name)])).collect();
         if (2..=n).contains(&names.len()) {
             choices.extend(
                 arrangements(n, names.len()).into_iter().map(|a| a.into_iter().zip(names.clone()).collect()),
@@ -254,4 +252,72 @@ fn toml_string(text: &str) -> String {
     }
     out.push('"');
     out
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn term(parts: &[(usize, &str)], optional: bool) -> Term {
+        let parts = parts.iter().map(|(equation, expression)| Part::new(*equation, expression)).collect();
+        let parameter = "p".to_string();
+        Term { parts, parameter, powers: Vec::new(), order: 1, even: false, optional }
+    }
+
+    fn signal(name: &str) -> Signal {
+        Signal { name: name.to_string(), unit: None }
+    }
+
+    /// Three states; the first two share a term. Two inputs, each a term of every equation.
+    fn structure() -> Structure {
+        let mut terms: Vec<Term> =
+            ["x''", "y''", "z''"].iter().enumerate().map(|(e, q)| term(&[(e, q)], false)).collect();
+        terms.push(term(&[(0, "cos(y)*y''"), (1, "cos(y)*x''")], true));
+        terms.extend((0..3).flat_map(|e| [term(&[(e, "u")], true), term(&[(e, "w")], true)]));
+        Structure {
+            title: "t".to_string(),
+            inputs: ["u", "w"].map(|name| (signal(name), Hold::Linear)).to_vec(),
+            states: ["x", "y", "z"].map(signal).to_vec(),
+            equations: ["x", "y", "z"]
+                .map(|name| Equation { name: name.to_string(), input: None, normalised: true })
+                .to_vec(),
+            terms,
+            extras: Vec::new(),
+        }
+    }
+
+    #[test]
+    fn equations_that_share_a_coefficient_are_one_group() {
+        assert_eq!(structure().groups(), [vec![0, 1], vec![2]]);
+        let mut apart = structure();
+        apart.terms.remove(3);
+        assert_eq!(apart.groups(), [vec![0], vec![1], vec![2]]);
+    }
+
+    #[test]
+    fn one_scale_is_that_of_every_input_on_every_equation_and_of_all_inputs_on_different_ones() {
+        let tried: Vec<Vec<Option<String>>> = structure()
+            .scaled_together()
+            .iter()
+            .map(|s| s.equations.iter().map(|e| e.input.clone()).collect())
+            .collect();
+        // Two inputs on three equations; then 3 · 2 ordered pairs.
+        assert_eq!(tried.len(), 2 * 3 + 6);
+        assert!((1..tried.len()).all(|k| !tried[..k].contains(&tried[k])));
+        for scaled in structure().scaled_together() {
+            for (e, equation) in scaled.equations.iter().enumerate() {
+                assert!(!equation.normalised, "the leading coefficient is estimated");
+                let on_the_right = |t: &Term| equation.input.as_deref().is_some_and(|u| t.is(e, u));
+                assert!(!scaled.terms.iter().any(on_the_right), "what stands on the right is no candidate");
+            }
+        }
+    }
+
+    #[test]
+    fn without_inputs_the_first_leading_coefficient_sets_the_scale() {
+        let alone = Structure { inputs: Vec::new(), ..structure() };
+        let [only] = alone.scaled_together().try_into().unwrap();
+        let normalised: Vec<bool> = only.equations.iter().map(|e| e.normalised).collect();
+        assert_eq!(normalised, [true, false, false]);
+    }
 }

@@ -211,7 +211,7 @@ pub(crate) fn rows(
     Some(Rows { columns, target, terms, delayed, independent, overlap, pieces })
 }
 
-/// A linear regression.
+/// A linear regression, the columns of small orders first.
 #[derive(Default)]
 pub(crate) struct Regression {
     /// Right-hand side.
@@ -233,28 +233,21 @@ pub(crate) fn regression(structure: &Structure, rows: &[Rows], gain: Option<f64>
         let at = rows.terms.iter().position(|t| !structure.terms[*t].optional);
         at.map_or(1.0, |at| rms(&rows.columns[at]))
     };
-    let mut scale: Vec<f64> = rows.iter().map(leading).collect();
-    let mut stacked = stack(structure, &single, &scale);
-    let (n, k) = (stacked.target.len(), stacked.columns.len());
-    let mut a: Vec<f64> = stacked.columns.iter().flat_map(|c| c.1.iter().copied()).collect();
-    a.extend_from_slice(&stacked.target);
-    let t = qr::triangle(&mut a, n, k + 1);
-    let all: Vec<usize> = (0..k).collect();
-    let values = Reduced::from_triangle(&t, k, n as f64, 0.0).solve(&all).values;
+    let scale: Vec<f64> = rows.iter().map(leading).collect();
+    let stacked = stack(structure, &single, &scale);
+    let left = stacked.residual();
     let mut from = 0;
-    for (scale, of_equation) in scale.iter_mut().zip(&single) {
-        let range = from..from + of_equation.target.len();
-        from = range.end;
-        let mut left = stacked.target[range.clone()].to_vec();
-        for (value, column) in values.iter().zip(&stacked.columns) {
-            left.iter_mut().zip(&column.1[range.clone()]).for_each(|(l, c)| *l -= value * c);
-        }
-        *scale *= rms(&left).max(1e-6);
-    }
-    if scale.iter().all(|s| s.is_finite()) {
-        stacked = stack(structure, &single, &scale);
-    }
-    stacked
+    let scale: Vec<f64> = scale
+        .iter()
+        .zip(&single)
+        .map(|(scale, of_equation)| {
+            let range = from..from + of_equation.target.len();
+            from = range.end;
+            // Where nothing is left, rounding is.
+            scale * rms(&left[range]).max(1e-6)
+        })
+        .collect();
+    if scale.iter().all(|s| s.is_finite()) { stack(structure, &single, &scale) } else { stacked }
 }
 
 fn rms(values: &[f64]) -> f64 {
@@ -281,10 +274,36 @@ fn stack(structure: &Structure, single: &[Regression], scale: &[f64]) -> Regress
 }
 
 impl Regression {
-    fn new(structure: &Structure, target: Vec<f64>, columns: Vec<(Option<usize>, Vec<f64>)>) -> Regression {
+    fn new(
+        structure: &Structure,
+        target: Vec<f64>,
+        mut columns: Vec<(Option<usize>, Vec<f64>)>,
+    ) -> Regression {
         let stays = |t: &Option<usize>| t.is_none_or(|t| !structure.terms[t].optional);
+        columns.sort_by_key(|c| c.0.map_or(0, |t| structure.terms[t].order));
         let protected = (0..columns.len()).filter(|&c| stays(&columns[c].0)).collect();
         Regression { target, columns, protected }
+    }
+
+    /// The triangle of \[columns | target\].
+    fn triangle(&self) -> Vec<f64> {
+        let (n, k) = (self.target.len(), self.columns.len());
+        let mut a = Vec::with_capacity(n * (k + 1));
+        self.columns.iter().for_each(|(_, column)| a.extend_from_slice(column));
+        a.extend_from_slice(&self.target);
+        qr::triangle(&mut a, n, k + 1)
+    }
+
+    /// What least squares on all columns leaves of the target.
+    fn residual(&self) -> Vec<f64> {
+        let (n, k) = (self.target.len(), self.columns.len());
+        let all: Vec<usize> = (0..k).collect();
+        let values = Reduced::from_triangle(&self.triangle(), k, n as f64, 0.0).solve(&all).values;
+        let mut left = self.target.clone();
+        for (value, (_, column)) in values.iter().zip(&self.columns) {
+            left.iter_mut().zip(column).for_each(|(l, c)| *l -= value * c);
+        }
+        left
     }
 }
 
@@ -315,15 +334,10 @@ pub(crate) fn reduce(
     rows: &[Rows],
     gain: Option<f64>,
 ) -> (Reduced, Vec<Option<usize>>) {
-    let Regression { target, columns, .. } = regression(structure, rows, gain);
-    let n = target.len();
-    let k = columns.len();
-    let mut a = Vec::with_capacity(n * (k + 1));
-    for (_, column) in &columns {
-        a.extend_from_slice(column);
-    }
-    a.extend_from_slice(&target);
-    let t = qr::triangle(&mut a, n, k + 1);
+    let regression = regression(structure, rows, gain);
+    let t = regression.triangle();
+    let Regression { target, columns, .. } = regression;
+    let (n, k) = (target.len(), columns.len());
     let floor = 1e-10 * target.iter().map(|v| v * v).sum::<f64>() / n.max(1) as f64;
     // Rows of overlapping windows share their noise: a window's worth of them counts as one.
     let independent: f64 = rows.iter().map(|r| r.independent).sum();
@@ -359,4 +373,46 @@ pub(crate) fn period(data: &Data) -> f64 {
             2.0 * duration / crossings.max(2) as f64
         })
         .fold(f64::INFINITY, f64::min)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::structure::Term;
+
+    fn term(order: usize, optional: bool) -> Term {
+        Term { parts: Vec::new(), parameter: String::new(), powers: Vec::new(), order, even: false, optional }
+    }
+
+    /// A structure with these terms and nothing else.
+    fn of(terms: Vec<Term>) -> Structure {
+        let (inputs, states, equations, extras) = (Vec::new(), Vec::new(), Vec::new(), Vec::new());
+        Structure { title: String::new(), inputs, states, equations, terms, extras }
+    }
+
+    #[test]
+    fn columns_stand_in_the_order_of_the_library_whatever_that_of_the_terms() {
+        // Terms of energies have order one and come last.
+        let structure = of(vec![term(1, false), term(1, true), term(3, true), term(1, true)]);
+        let columns = [Some(0), Some(1), Some(2), Some(3), None].map(|t| (t, vec![0.0])).to_vec();
+        let regression = Regression::new(&structure, vec![0.0], columns);
+        let order: Vec<Option<usize>> = regression.columns.iter().map(|c| c.0).collect();
+        assert_eq!(order, [None, Some(0), Some(1), Some(3), Some(2)]);
+        assert_eq!(regression.protected, [0, 1], "the delayed feedback and the leading derivative stay");
+    }
+
+    #[test]
+    fn equations_are_stacked_with_zeros_where_a_term_does_not_enter() {
+        let structure = of(vec![term(1, true), term(1, true)]);
+        let first = Regression::new(
+            &structure,
+            vec![2.0, 4.0],
+            vec![(Some(0), vec![6.0, 8.0]), (Some(1), vec![1.0, 2.0])],
+        );
+        let second = Regression::new(&structure, vec![9.0], vec![(Some(1), vec![3.0])]);
+        let stacked = stack(&structure, &[first, second], &[2.0, 3.0]);
+        assert_eq!(stacked.target, [1.0, 2.0, 3.0]);
+        assert_eq!(stacked.columns, [(Some(0), vec![3.0, 4.0, 0.0]), (Some(1), vec![0.5, 1.0, 1.0])]);
+        assert!(stacked.residual().iter().all(|v| v.is_finite()));
+    }
 }

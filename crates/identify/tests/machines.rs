@@ -247,6 +247,19 @@ fn two_torques_of_strength_one_stand_on_the_right_of_their_equations() {
 }
 
 #[test]
+fn an_input_that_does_nothing_sets_no_scale_of_rigid_bodies_and_orders_are_found_beside_energies() {
+    // A pendulum with a cubic spring: θ″ + 0.3 θ′ + 9 sin θ + 4 θ³ = f.
+    let inputs = [(("idle", "V"), 1.0), (("f", "N*m"), 6.0)];
+    let recording = record(13, 0.005, (2, &[("theta", "rad")]), &inputs, |x, u| {
+        vec![x[1], u[1] - 0.3 * x[1] - 9.0 * x[0].sin() - 4.0 * x[0].powi(3)]
+    });
+    let found = found(&recording, &Options { order: 3, ..rigid(&["theta"], &["idle", "f"]) });
+    assert_eq!(written(&found, 0), "sin(theta) + theta' + theta'' + theta^3 = f");
+    near(&found, 0, &[("theta''", 1.0), ("sin(theta)", 9.0), ("theta^3", 4.0)], 0.03);
+    assert_eq!(found.order.chosen, 3);
+}
+
+#[test]
 fn energies_without_an_angle_or_leading_derivatives_for_other_states_are_refused() {
     let recording = chain(1, [1.0, 0.0]);
     let error = |options: Options| {
