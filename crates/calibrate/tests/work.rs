@@ -41,6 +41,37 @@ fn a_fit_ends_at_its_own_limit() {
     assert_eq!(same.point, whole.point);
 }
 
+/// What a part does counts for the whole; it ends at its own limit, at that of the whole, and when the whole is given up.
+#[test]
+fn a_part_of_the_work_ends_alone_and_with_the_whole() {
+    let (n, dt) = (600, 0.01);
+    let f = force(7, n, dt, 1.0, 5.0);
+    let model = Model::from_toml(OSCILLATOR, "oscillator.toml").unwrap();
+    let measured = measure(&model, &f, dt, &[0.0, 0.0]);
+    let free = setup(&model, &f, dt, &measured);
+    let level = free.level(4);
+    let ending = |work: Work| -> (Ending, u64) {
+        let work = Arc::new(work);
+        let setup = Setup { work: work.clone(), ..free.clone() };
+        let parameters: Vec<f64> = setup.values().iter().map(|v| 3.0 * v).collect();
+        let point = Point { starts: setup.starts(&level, &parameters), parameters };
+        let limits = Limits { iterations: 50, tolerance: 1e-12 };
+        (setup.fit(&level, &free.data.sigma, &[point], limits).ending, work.done())
+    };
+    let (_, cost) = ending(Work::default());
+    let ample = Arc::new(Work::within(10 * cost));
+    assert_eq!(ending(Work::part_of(&ample, 2 * cost)), (Ending::Converged, cost));
+    assert_eq!(ample.done(), cost);
+    let (cut, spent) = ending(Work::part_of(&ample, cost / 2));
+    assert_eq!((cut, ample.done()), (Ending::Limit, cost + spent));
+    assert!(spent < cost && !ample.is_spent(), "{spent} of {cost}");
+    let little = Arc::new(Work::within(cost / 2));
+    assert_eq!(ending(Work::part_of(&little, 2 * cost)).0, Ending::Limit);
+    let over = Arc::new(Work::default());
+    over.give_up();
+    assert!(ending(Work::part_of(&over, 2 * cost)).1 < cost / 2);
+}
+
 /// A point that is alone is simulated once, with its derivatives; one beside another is priced first. The fit is the same.
 #[test]
 fn a_fit_does_not_depend_on_how_its_start_was_simulated() {
