@@ -76,6 +76,12 @@ pub enum IdentifyError {
     /// More inputs than equations can be told apart by.
     #[error("an input must be named for a delayed state: without one the gain of the feedback sets no scale")]
     DelayWithoutInput,
+    /// A delayed feedback and equations that share coefficients.
+    #[error(
+        "a delayed feedback stands beside one input in every equation, which terms of energies shared by several equations do \
+         not allow; leave `lagrangian` or the delay out"
+    )]
+    DelayWithEnergies,
     /// The delayed state is none of the states.
     #[error("the delayed state `{name}` is not among the states {states}")]
     DelayedState {

@@ -200,7 +200,8 @@ pub(crate) fn search(
     listener: &dyn ProgressListener,
 ) -> Result<Search, IdentifyError> {
     let plain = structure(fit_on, options)?;
-    let structures = if options.library.lagrangian { plain.scaled_together() } else { vec![plain] };
+    let together = options.library.lagrangian && options.states.len() > 1;
+    let structures = if together { plain.scaled_together() } else { vec![plain] };
     let plain = &structures[0];
     let all = vec![true; plain.terms.len()];
     let ones: Vec<f64> = plain.terms.iter().map(|t| if t.optional { 0.0 } else { 1.0 }).collect();
@@ -334,6 +335,9 @@ pub(crate) fn structure(recordings: &[Recording], options: &Options) -> Result<S
                 found,
                 range: "the finite numbers",
             });
+        }
+        if options.library.lagrangian && options.states.len() > 1 {
+            return Err(IdentifyError::DelayWithEnergies);
         }
         let lengths = recordings.iter().flat_map(|r| &r.pieces).map(|p| p.len as f64 * p.dt);
         let recorded = lengths.fold(0.0, f64::max);
@@ -579,7 +583,7 @@ fn estimate(
     Some((badness, state))
 }
 
-/// A start that costs so many times as much to fit as another has a model that can hardly be simulated.
+/// A start whose simulations cost so many times as much as another's has a model that can hardly be simulated.
 const HARD: u64 = 10;
 
 /// The best first fit of all structures' starts; each does at most a part of half of the work.
@@ -597,7 +601,9 @@ fn best_begun(
             let before = work.done();
             let part = Work::part_of(work, most);
             let Some(refined) = output_error::begin(structure, data, start.clone(), part) else { continue };
-            most = most.min(HARD * (work.done() - before).max(1));
+            // As if the fit had taken all of its steps.
+            let step = (work.done() - before) / (refined.fit.iterations as u64 + 1);
+            most = most.min(HARD * (output_error::FIRST_STEPS as u64 + 1) * step.max(1));
             if best.as_ref().is_none_or(|(_, b)| refined.score() < b.score()) {
                 best = Some((k, refined));
             }

@@ -405,13 +405,16 @@ fn levels(structure: &Structure) -> &'static [usize] {
     if structure.extras.is_empty() { &LEVELS } else { &LEVELS[3..] }
 }
 
+/// Most steps of a first fit.
+pub(crate) const FIRST_STEPS: usize = 15;
+
 /// A first fit of `start` on short segments.
 pub(crate) fn begin(structure: &Structure, data: &Arc<Data>, start: State, work: Work) -> Option<Refined> {
     let setup = Setup { work: Arc::new(work), ..setup(structure, data, &start, None)? };
     let level = setup.level(levels(structure)[0]);
     let scale: Vec<f64> = data.sigma.iter().zip(&data.spread).map(|(s, d)| s.max(1e-6 * d)).collect();
     let point = Point { parameters: setup.values(), starts: setup.starts(&level, &setup.values()) };
-    let limits = Limits { iterations: 15, tolerance: 1e-4 };
+    let limits = Limits { iterations: FIRST_STEPS, tolerance: 1e-4 };
     let fit = setup.with_problem(&level, &scale, |p| p.fit(point, limits));
     fit.cost
         .is_finite()

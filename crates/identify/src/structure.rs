@@ -191,9 +191,10 @@ impl Structure {
         let mut choices: Vec<Vec<(usize, &String)>> =
             names.iter().flat_map(|name| (0..n).map(move |e| vec![(e, *name)])).collect();
         if (2..=n).contains(&names.len()) {
-            choices.extend(
-                arrangements(n, names.len()).into_iter().map(|a| a.into_iter().zip(names.clone()).collect()),
-            );
+            let mut all = arrangements(n, names.len());
+            // The first is the order of the states.
+            all.truncate(if all.len() > MOST_ARRANGEMENTS { 1 } else { MOST_ARRANGEMENTS });
+            choices.extend(all.into_iter().map(|a| a.into_iter().zip(names.iter().copied()).collect()));
         }
         if choices.is_empty() {
             choices.push(Vec::new());
@@ -226,6 +227,10 @@ impl Structure {
         groups
     }
 }
+
+/// Most arrangements of inputs on equations that are tried, those of four on four; of more inputs and equations only the one
+/// in the order of the states.
+const MOST_ARRANGEMENTS: usize = 24;
 
 /// All ordered choices of `count` among `0..n`.
 fn arrangements(n: usize, count: usize) -> Vec<Vec<usize>> {
@@ -311,6 +316,24 @@ mod tests {
                 assert!(!scaled.terms.iter().any(on_the_right), "what stands on the right is no candidate");
             }
         }
+    }
+
+    #[test]
+    fn of_many_inputs_only_their_own_order_is_tried() {
+        assert_eq!(arrangements(4, 4).len(), MOST_ARRANGEMENTS);
+        let names: Vec<String> = (0..5).map(|k| format!("u{k}")).collect();
+        let many = Structure {
+            inputs: names.iter().map(|name| (signal(name), Hold::Linear)).collect(),
+            equations: names
+                .iter()
+                .map(|name| Equation { name: name.clone(), input: None, normalised: true })
+                .collect(),
+            ..structure()
+        };
+        let tried = many.scaled_together();
+        assert_eq!(tried.len(), 5 * 5 + 1);
+        let last: Vec<&str> = tried[25].equations.iter().filter_map(|e| e.input.as_deref()).collect();
+        assert_eq!(last, names);
     }
 
     #[test]

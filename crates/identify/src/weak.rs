@@ -6,6 +6,7 @@
 //! choice of terms with them: that is why what is found here is only where the output error starts.
 
 use std::collections::{BTreeMap, BTreeSet};
+use std::ops::Range;
 
 use greybox_algebraic::{Column, Hold as Join, Kernel, rows_of_pieces};
 use greybox_calibrate::{Data, SmoothedStates, qr};
@@ -30,7 +31,7 @@ pub(crate) struct Rows {
     /// Rows that share samples with one row, on one side.
     pub overlap: usize,
     /// Row ranges of the pieces.
-    pub pieces: Vec<std::ops::Range<usize>>,
+    pub pieces: Vec<Range<usize>>,
 }
 
 /// A delayed feedback, its delay held at a trial value.
@@ -120,6 +121,15 @@ pub(crate) fn evaluate(
     Some(Values { index, values })
 }
 
+/// How a signal that acts as `hold` says runs between its samples.
+fn join(hold: Hold) -> Join {
+    match hold {
+        Hold::Zero => Join::Zero,
+        Hold::Linear => Join::Linear,
+        Hold::BandLimited => Join::Smooth,
+    }
+}
+
 /// Rows of one equation with windows of `window` seconds.
 pub(crate) fn rows(
     structure: &Structure,
@@ -150,15 +160,8 @@ pub(crate) fn rows(
         .enumerate()
         .filter(|(_, p)| (p.dt / dt - 1.0).abs() < 1e-6)
         .map(|(i, piece)| {
-            let input_column = |u: usize| Column {
-                signal: &piece.inputs[u],
-                order: 0,
-                hold: match model.inputs[u].hold {
-                    Hold::Zero => Join::Zero,
-                    Hold::Linear => Join::Linear,
-                    Hold::BandLimited => Join::Smooth,
-                },
-            };
+            let input_column =
+                |u: usize| Column { signal: &piece.inputs[u], order: 0, hold: join(model.inputs[u].hold) };
             let column = |integral: &Integral| -> Column<'_> {
                 let state = model.states.iter().position(|s| s.name == integral.signal);
                 match (state, model.input(&integral.signal)) {
@@ -201,14 +204,19 @@ pub(crate) fn rows(
         .collect();
     let overlap = intervals.div_ceil(hop);
     let independent = (target.len() as f64 / overlap as f64).max(1.0);
-    let mut pieces: Vec<std::ops::Range<usize>> = Vec::new();
-    for (row, piece) in rows.pieces.iter().enumerate() {
+    Some(Rows { columns, target, terms, delayed, independent, overlap, pieces: ranges(&rows.pieces) })
+}
+
+/// Ranges of consecutive rows of the same piece.
+fn ranges(piece_of_row: &[usize]) -> Vec<Range<usize>> {
+    let mut pieces: Vec<Range<usize>> = Vec::new();
+    for (row, piece) in piece_of_row.iter().enumerate() {
         match pieces.last_mut() {
-            Some(range) if rows.pieces[range.start] == *piece => range.end = row + 1,
+            Some(range) if piece_of_row[range.start] == *piece => range.end = row + 1,
             _ => pieces.push(row..row + 1),
         }
     }
-    Some(Rows { columns, target, terms, delayed, independent, overlap, pieces })
+    pieces
 }
 
 /// A linear regression, the columns of small orders first.

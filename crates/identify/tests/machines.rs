@@ -1,6 +1,6 @@
 //! Machines with several coordinates and inputs: which input drives which equation is found, not told.
 
-use greybox_identify::{Identification, IdentifyError, Library, Options, Quiet, identify};
+use greybox_identify::{DelayedState, Identification, IdentifyError, Library, Options, Quiet, identify};
 use greybox_model::Hold;
 use greybox_recording::{Channel, Recording};
 use rand::{RngExt, SeedableRng};
@@ -267,6 +267,11 @@ fn energies_without_an_angle_or_leading_derivatives_for_other_states_are_refused
         identify(one, one, &options, &Quiet).unwrap_err()
     };
     assert!(matches!(error(rigid(&["x1", "x2"], &["f"])), IdentifyError::NoAngle { .. }));
+    let recording = cart(1);
+    let delay = DelayedState { state: "x".to_string(), gain: None, longest: 0.5 };
+    let delayed = Options { delay: Some(delay), ..rigid(&["x", "theta"], &["f"]) };
+    let refused = identify(std::slice::from_ref(&recording), &[], &delayed, &Quiet).unwrap_err();
+    assert!(matches!(refused, IdentifyError::DelayWithEnergies), "{refused}");
     let one_order = Options { derivatives: vec![2], ..options(&["x1", "x2"], &["f"], 1) };
     let text = error(one_order).to_string();
     assert!(text.contains("1 orders") && text.contains("x1, x2"), "{text}");
