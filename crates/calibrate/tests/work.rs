@@ -3,19 +3,25 @@
 use std::sync::Arc;
 
 use crate::common::*;
-use greybox_calibrate::{Ending, Fit, Limits, Point, Setup, Work};
+use greybox_calibrate::{Ending, Fit, Limits, Point, Segmentation, Setup, Work};
 use greybox_model::Model;
 use rayon::prelude::*;
 
-/// A fit with little work ends early with the step that it is at, and with the same one whatever other fits do.
-#[test]
-fn a_fit_ends_at_its_own_limit() {
+/// An oscillator whose parameters are free, and four segments of its recording.
+fn oscillator() -> (Setup, Segmentation) {
     let (n, dt) = (600, 0.01);
     let f = force(7, n, dt, 1.0, 5.0);
     let model = Model::from_toml(OSCILLATOR, "oscillator.toml").unwrap();
     let measured = measure(&model, &f, dt, &[0.0, 0.0]);
     let free = setup(&model, &f, dt, &measured);
     let level = free.level(4);
+    (free, level)
+}
+
+/// A fit with little work ends early with the step that it is at, and with the same one whatever other fits do.
+#[test]
+fn a_fit_ends_at_its_own_limit() {
+    let (free, level) = oscillator();
     let fit = |most: Option<u64>| -> (Fit, u64) {
         let work = Arc::new(most.map_or_else(Work::default, Work::of_fits_within));
         let setup = Setup { work: work.clone(), ..free.clone() };
@@ -44,12 +50,7 @@ fn a_fit_ends_at_its_own_limit() {
 /// What a part does counts for the whole; it ends at its own limit, at that of the whole, and when the whole is given up.
 #[test]
 fn a_part_of_the_work_ends_alone_and_with_the_whole() {
-    let (n, dt) = (600, 0.01);
-    let f = force(7, n, dt, 1.0, 5.0);
-    let model = Model::from_toml(OSCILLATOR, "oscillator.toml").unwrap();
-    let measured = measure(&model, &f, dt, &[0.0, 0.0]);
-    let free = setup(&model, &f, dt, &measured);
-    let level = free.level(4);
+    let (free, level) = oscillator();
     let ending = |work: Work| -> (Ending, u64) {
         let work = Arc::new(work);
         let setup = Setup { work: work.clone(), ..free.clone() };
@@ -75,12 +76,7 @@ fn a_part_of_the_work_ends_alone_and_with_the_whole() {
 /// A point that is alone is simulated once, with its derivatives; one beside another is priced first. The fit is the same.
 #[test]
 fn a_fit_does_not_depend_on_how_its_start_was_simulated() {
-    let (n, dt) = (600, 0.01);
-    let f = force(7, n, dt, 1.0, 5.0);
-    let model = Model::from_toml(OSCILLATOR, "oscillator.toml").unwrap();
-    let measured = measure(&model, &f, dt, &[0.0, 0.0]);
-    let free = setup(&model, &f, dt, &measured);
-    let level = free.level(4);
+    let (free, level) = oscillator();
     for factor in [0.4, 1.2, 3.0] {
         let parameters: Vec<f64> = free.values().iter().map(|v| factor * v).collect();
         let point = Point { starts: free.starts(&level, &parameters), parameters };

@@ -310,6 +310,17 @@ mod tests {
     }
 
     #[test]
+    fn among_many_candidates_a_term_beside_giants_must_pay_more_than_schwarz_asks() {
+        // ln 8000 = 9.0 < 3.2² = 10.2 < 11.1 < 3.5² = 12.3: halfway to what the giants imply, within ln 8000 + ln 50.
+        let chosen = |weak: f64| {
+            let mut t = vec![0.0; 50];
+            t[..9].copy_from_slice(&[900.0, 700.0, 800.0, 750.0, 850.0, 950.0, 650.0, 720.0, weak]);
+            orthogonal(&t, 8000.0, 0.0).choose(&roles(50)).columns.contains(&8)
+        };
+        assert!(!chosen(3.2) && chosen(3.5));
+    }
+
+    #[test]
     fn kept_columns_stay_and_even_terms_must_pay_for_the_symmetry_they_break() {
         let reduced = orthogonal(&[50.0, 3.4, 0.1], 1000.0, 0.0);
         let odd = Roles { kept: vec![2], optional: vec![0, 1], ..roles(3) };

@@ -200,8 +200,7 @@ pub(crate) fn search(
     listener: &dyn ProgressListener,
 ) -> Result<Search, IdentifyError> {
     let plain = structure(fit_on, options)?;
-    let together = options.library.lagrangian && options.states.len() > 1;
-    let structures = if together { plain.scaled_together() } else { vec![plain] };
+    let structures = if options.has_one_scale() { plain.scaled_together() } else { vec![plain] };
     let plain = &structures[0];
     let all = vec![true; plain.terms.len()];
     let ones: Vec<f64> = plain.terms.iter().map(|t| if t.optional { 0.0 } else { 1.0 }).collect();
@@ -336,7 +335,7 @@ pub(crate) fn structure(recordings: &[Recording], options: &Options) -> Result<S
                 range: "the finite numbers",
             });
         }
-        if options.library.lagrangian && options.states.len() > 1 {
+        if options.has_one_scale() {
             return Err(IdentifyError::DelayWithEnergies);
         }
         let lengths = recordings.iter().flat_map(|r| &r.pieces).map(|p| p.len as f64 * p.dt);

@@ -11,7 +11,8 @@ pub struct Options {
     pub states: Vec<String>,
     /// Channels that drive the machine. Which of them enters which equation is part of the choice where there are
     /// several states or inputs. The first that an equation has stands on its right with factor one, the others enter
-    /// as terms. An equation without any is divided by its leading coefficient.
+    /// as terms. An equation without any is divided by its leading coefficient. With a delayed feedback every equation
+    /// has the first input on its right.
     pub inputs: Vec<String>,
     /// Order of the leading derivative of every state: 2 for mechanics (q̈), 1 for a current or a temperature.
     pub derivatives: Vec<usize>,
@@ -51,6 +52,13 @@ impl Options {
             seed: 0,
             work: MOST_WORK,
         }
+    }
+}
+
+impl Options {
+    /// Whether equations share the coefficients of energies, and so have one scale.
+    pub(crate) fn has_one_scale(&self) -> bool {
+        self.library.lagrangian && self.states.len() > 1
     }
 }
 

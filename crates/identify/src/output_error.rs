@@ -16,7 +16,7 @@ use rayon::prelude::*;
 
 use crate::choose::{Reduced, Roles};
 use crate::correlation::{FEW, LONGEST, Lagged};
-use crate::structure::Structure;
+use crate::structure::{Signal, Structure};
 
 /// Misfit, relative to a channel's spread, that counts as numerical: integration, rounding in the file.
 pub(crate) const NUMERICAL: f64 = 1e-5;
@@ -440,19 +440,19 @@ pub(crate) fn scaled_by_inputs(
 ) -> (Structure, Refined) {
     let mut scaled = structure.clone();
     let mut state = refined.state.clone();
+    let mut moved = Vec::new();
     for (e, equation) in
         scaled.equations.iter_mut().enumerate().filter(|(_, e)| e.input.is_none() && e.normalised)
     {
         let of_equation = |i: usize| structure.terms[i].part(e).is_some();
-        let term_of = |name: &str| {
-            (0..structure.terms.len()).find(|&i| state.active[i] && structure.terms[i].is(e, name))
+        let Some((name, term)) = first_input(&structure, &state, e).filter(|i| state.values[i.1] != 0.0)
+        else {
+            continue;
         };
-        let first =
-            structure.inputs.iter().find_map(|(signal, _)| Some((&signal.name, term_of(&signal.name)?)));
-        let Some((name, term)) = first.filter(|(_, term)| state.values[*term] != 0.0) else { continue };
         let strength = -state.values[term];
-        (equation.input, equation.normalised) = (Some(name.clone()), false);
-        (state.active[term], allowed[term]) = (false, false);
+        (equation.input, equation.normalised) = (Some(name.to_string()), false);
+        state.active[term] = false;
+        moved.push(term);
         (0..structure.terms.len()).filter(|i| of_equation(*i)).for_each(|i| state.values[i] /= strength);
         state.values[term] = 0.0;
     }
@@ -460,9 +460,20 @@ pub(crate) fn scaled_by_inputs(
         return (structure, refined);
     }
     match refit(&scaled, &Refined { state, ..refined.clone() }) {
-        Some(refined) => (scaled, refined),
+        Some(refined) => {
+            moved.into_iter().for_each(|term| allowed[term] = false);
+            (scaled, refined)
+        }
         None => (structure, refined),
     }
+}
+
+/// The first input that is a chosen term of an equation, and the term.
+fn first_input<'a>(structure: &'a Structure, state: &State, equation: usize) -> Option<(&'a str, usize)> {
+    structure.inputs.iter().find_map(|(Signal { name, .. }, _)| {
+        let acts = |i: &usize| state.active[*i] && structure.terms[*i].is(equation, name);
+        Some((name.as_str(), (0..structure.terms.len()).find(acts)?))
+    })
 }
 
 /// The fit with a parameter drawn to a value by a prior much narrower than any interval: from the optimum the others
@@ -491,14 +502,9 @@ pub(crate) fn with_inputs_of_strength_one(
         if equation.input.is_some() || equation.normalised {
             continue;
         }
-        let acts = |name: &str| {
-            (0..structure.terms.len()).find(|&i| refined.state.active[i] && structure.terms[i].is(e, name))
-        };
-        let first =
-            structure.inputs.iter().find_map(|(signal, _)| Some((signal.name.clone(), acts(&signal.name)?)));
-        let Some((name, term)) = first else { continue };
+        let Some((name, term)) = first_input(&structure, &refined.state, e) else { continue };
         let mut simpler = structure.clone();
-        simpler.equations[e].input = Some(name);
+        simpler.equations[e].input = Some(name.to_string());
         let mut held = held_at(&structure, &refined, &structure.terms[term].parameter, -1.0);
         (held.state.active[term], held.state.values[term]) = (false, 0.0);
         if let Some(refit) = refit(&simpler, &held)

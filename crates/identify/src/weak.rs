@@ -220,7 +220,6 @@ fn ranges(piece_of_row: &[usize]) -> Vec<Range<usize>> {
 }
 
 /// A linear regression, the columns of small orders first.
-#[derive(Default)]
 pub(crate) struct Regression {
     /// Right-hand side.
     pub target: Vec<f64>,
@@ -232,10 +231,10 @@ pub(crate) struct Regression {
 
 /// The rows of equations that share coefficients as one regression, each equation weighted by the noise of its rows.
 pub(crate) fn regression(structure: &Structure, rows: &[Rows], gain: Option<f64>) -> Regression {
-    let single: Vec<Regression> = rows.iter().map(|r| regression_of_one(structure, r, gain)).collect();
-    if single.len() == 1 {
-        return single.into_iter().next().unwrap_or_default();
+    if let [one] = rows {
+        return regression_of_one(structure, one, gain);
     }
+    let single: Vec<Regression> = rows.iter().map(|r| regression_of_one(structure, r, gain)).collect();
     // First every equation as large as its leading derivative, then as large as what the fit of all leaves.
     let leading = |rows: &Rows| {
         let at = rows.terms.iter().position(|t| !structure.terms[*t].optional);
