@@ -149,6 +149,31 @@ struct Row {
     first: f64,
 }
 
+/// What disturbs the rate of an equation's highest derivative but one.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct RateNoise {
+    /// Entry of the state vector.
+    pub entry: usize,
+    /// Intensity q, (unit of the highest derivative)²·s.
+    pub intensity: f64,
+    /// Where the rate is a speed, the square of the speed at which the intensity is at half.
+    pub slow: Option<f64>,
+}
+
+impl RateNoise {
+    /// Variance that gathers in `dt` seconds at the state `x`.
+    pub fn variance(&self, x: &[f64], dt: f64) -> f64 {
+        let full = self.intensity * dt;
+        match self.slow {
+            Some(slow) => {
+                let v = x[self.entry] * x[self.entry];
+                full * (AT_REST + v / (v + slow))
+            }
+            None => full,
+        }
+    }
+}
+
 /// The filter of a set of recordings, for all models of the same machine.
 #[derive(Debug, Clone)]
 pub struct Filter {
@@ -423,6 +448,20 @@ impl Filter {
         }
     }
 
+    /// What disturbs the rates of a model that errs so much.
+    pub fn rate_noise(&self, at: &Stochastic) -> Vec<RateNoise> {
+        let system = &at.setup.system;
+        self.rows
+            .iter()
+            .zip(&at.errors.force)
+            .filter_map(|(row, ln)| {
+                let j = at.setup.model.state(&row.state)?;
+                let entry = system.offsets[j] + system.orders[j] - 1;
+                Some(RateNoise { entry, intensity: ln.exp(), slow: row.slow })
+            })
+            .collect()
+    }
+
     /// Number of variances.
     fn variances(&self) -> usize {
         self.rows.len() + self.sensor.len()
@@ -487,8 +526,8 @@ impl Filter {
         self.pass_from(self.strides.len() / 2, at, false).map(|pass| pass.log)
     }
 
-    /// First state of a piece with its variances.
-    fn start(&self, at: &Stochastic, piece: usize) -> (Vec<f64>, Vec<f64>) {
+    /// First state of a piece, and its covariance (row by row).
+    pub fn start(&self, at: &Stochastic, piece: usize) -> (Vec<f64>, Vec<f64>) {
         let setup = &at.setup;
         let nx = setup.system.nx;
         let mut x = setup.start(piece, 0);
@@ -548,15 +587,7 @@ impl Filter {
         };
         let (np, lanes) = (seeds.parameters.len(), seeds.lanes());
         let nn = if derivatives { self.variances() } else { 0 };
-        let noise: Vec<(usize, f64, Option<f64>)> = self
-            .rows
-            .iter()
-            .zip(&at.errors.force)
-            .filter_map(|(row, ln)| {
-                let j = setup.model.state(&row.state)?;
-                Some((system.offsets[j] + system.orders[j] - 1, ln.exp() * environment.dt, row.slow))
-            })
-            .collect();
+        let noise = self.rate_noise(at);
         let (x0, mut p) = self.start(at, piece);
         let simulation = Simulation {
             system,
@@ -584,15 +615,9 @@ impl Filter {
         let last = first + (n - 1 - first) / stride * stride;
         // Half of a step's noise before it, half after it.
         let disturb = |p: &mut [f64], dp: &mut [f64], x: &[f64]| {
-            for (l, (entry, q, slow)) in noise.iter().enumerate() {
-                let q = match slow {
-                    Some(slow) => {
-                        let v = x[*entry] * x[*entry];
-                        q * (AT_REST + v / (v + slow))
-                    }
-                    None => *q,
-                };
-                let i = entry * nx + entry;
+            for (l, noise) in noise.iter().enumerate() {
+                let q = noise.variance(x, environment.dt);
+                let i = noise.entry * nx + noise.entry;
                 p[i] += 0.5 * q;
                 if !dp.is_empty() {
                     dp[l * nx * nx + i] += 0.5 * q;

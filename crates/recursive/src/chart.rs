@@ -153,6 +153,11 @@ impl Chart {
         self.count
     }
 
+    /// Mean of the values since the chart began.
+    pub fn mean(&self) -> f64 {
+        self.mean
+    }
+
     /// The larger of both sums over the limit: 1 is an alarm.
     pub fn level(&self) -> f64 {
         self.up.value.max(self.down.value) / self.limit

@@ -237,6 +237,17 @@ impl Filter {
         }
     }
 
+    /// The state begins anew with this mean and these standard deviations, and depends on no parameter yet. Slices of other
+    /// lengths change nothing.
+    pub fn restart(&mut self, state: &[f64], deviation: &[f64]) {
+        if state.len() == self.n && deviation.len() == self.n {
+            self.state.copy_from_slice(state);
+            self.sensitivity.fill(0.0);
+            self.root.fill(0.0);
+            deviation.iter().enumerate().for_each(|(i, d)| self.root[i * self.n + i] = *d);
+        }
+    }
+
     /// The state of another filter of the same shape, with its uncertainty; its sensitivities are not taken over.
     pub fn take_state(&mut self, from: &Filter) {
         if from.n == self.n {

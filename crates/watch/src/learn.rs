@@ -1,0 +1,189 @@
+//! What is usual: parameters, noise and model error of the first seconds.
+
+use std::sync::Arc;
+
+use greybox_calibrate::stochastic::{Filter, Fitted, RateNoise, Stochastic};
+use greybox_calibrate::{Data, Prior, Setup, free_parameters};
+use greybox_model::Model;
+use greybox_recording::Recording;
+use greybox_simulate::Method;
+use serde::{Deserialize, Serialize};
+
+use crate::error::WatchError;
+use crate::machine::Machine;
+use crate::options::{BLOCKS, Options};
+
+/// Steps of the fit.
+const ITERATIONS: usize = 60;
+/// Fewest samples of a block.
+const LEAST_SAMPLES: usize = 4;
+/// Standard deviation of a parameter of which nothing is known beforehand, over what the first seconds tell of it.
+const WIDE: f64 = 100.0;
+
+/// A parameter that may move.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+pub(crate) struct Free {
+    pub(crate) index: usize,
+    /// Name in the model, to tell models apart.
+    pub(crate) name: String,
+    /// How far it may be from the learned value.
+    pub(crate) std: f64,
+    /// Bounds, where physics sets them.
+    pub(crate) lower: Option<f64>,
+    pub(crate) upper: Option<f64>,
+}
+
+/// What disturbs a rate: [`RateNoise`] as data.
+#[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
+pub(crate) struct Rate {
+    pub(crate) entry: usize,
+    pub(crate) intensity: f64,
+    pub(crate) slow: Option<f64>,
+}
+
+impl Rate {
+    pub(crate) fn variance(&self, x: &[f64], dt: f64) -> f64 {
+        RateNoise { entry: self.entry, intensity: self.intensity, slow: self.slow }.variance(x, dt)
+    }
+}
+
+/// How the model is integrated from sample to sample.
+#[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
+pub(crate) enum Steps {
+    Rk4(usize),
+    Dp5(usize),
+    Dop853(usize),
+}
+
+impl Steps {
+    /// Of a method that a recording chose; one that chooses its steps itself takes the steps of the fifth order.
+    fn of(method: Method) -> Steps {
+        match method {
+            Method::Rk4 { substeps } => Steps::Rk4(substeps),
+            Method::Dp5 { substeps } => Steps::Dp5(substeps),
+            Method::Dop853 { substeps } => Steps::Dop853(substeps),
+            Method::Adaptive { .. } => Steps::Dp5(4),
+        }
+    }
+
+    pub(crate) fn method(self) -> Method {
+        match self {
+            Steps::Rk4(substeps) => Method::Rk4 { substeps },
+            Steps::Dp5(substeps) => Method::Dp5 { substeps },
+            Steps::Dop853(substeps) => Method::Dop853 { substeps },
+        }
+    }
+}
+
+/// What is usual.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+pub(crate) struct Usual {
+    /// All parameters of the model, SI.
+    pub(crate) values: Vec<f64>,
+    pub(crate) free: Vec<Free>,
+    /// Standard deviation of each sensor, SI.
+    pub(crate) noise: Vec<f64>,
+    pub(crate) rates: Vec<Rate>,
+    /// Seconds between two samples.
+    pub(crate) dt: f64,
+    pub(crate) steps: Steps,
+}
+
+/// A sample, SI, in the model's order.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+pub(crate) struct Sample {
+    pub(crate) t: f64,
+    pub(crate) inputs: Vec<f64>,
+    /// What is no number was not measured.
+    pub(crate) measured: Vec<Option<f64>>,
+}
+
+/// The first seconds.
+pub(crate) struct First {
+    pub(crate) machine: Machine,
+    pub(crate) usual: Usual,
+    /// First state and its standard deviations.
+    pub(crate) start: (Vec<f64>, Vec<f64>),
+    pub(crate) samples: Vec<Sample>,
+}
+
+/// Fits the model with its own error and the sensors' noise to the first seconds.
+pub(crate) fn learn(model: &Model, recording: &Recording, options: &Options) -> Result<First, WatchError> {
+    let data = Arc::new(Data::new(model, std::slice::from_ref(recording))?);
+    let longest = data.pieces.iter().map(|p| p.len).max().unwrap_or(0);
+    let needed = BLOCKS * LEAST_SAMPLES;
+    if longest < needed {
+        return Err(WatchError::TooShort { seconds: options.learn, samples: longest, needed });
+    }
+    let free = free_parameters(model);
+    if free.is_empty() {
+        return Err(WatchError::NothingFree);
+    }
+    let setup = Setup::new(model, data.clone(), free)?;
+    if !setup.system.rhs.delays.is_empty() || !setup.system.output.delays.is_empty() {
+        return Err(WatchError::Delayed);
+    }
+    let filter = Filter::new(&setup);
+    let weight = 1.0 / filter.strides().len() as f64;
+    let first =
+        Stochastic { parameters: setup.values(), errors: filter.first_errors(), starts: Vec::new(), setup };
+    let fitted = filter.fit(first, weight, ITERATIONS).ok_or(WatchError::Diverged)?;
+    let (x, covariance) = filter.start(&fitted.at, 0);
+    let nx = x.len();
+    let deviations = (0..nx).map(|i| covariance[i * nx + i].sqrt()).collect();
+    let usual = usual(&fitted, &filter.rate_noise(&fitted.at), weight);
+    let setup = fitted.at.setup;
+    let indices = setup.free.iter().map(|f| f.index).collect();
+    let machine = Machine::new(model.clone(), setup.system.clone(), usual.steps.method(), indices);
+    Ok(First { machine, usual, start: (x, deviations), samples: samples(&data) })
+}
+
+fn usual(fitted: &Fitted, noise: &[RateNoise], weight: f64) -> Usual {
+    let at = &fitted.at;
+    let n = fitted.pass.gradient.len();
+    let finite = |v: f64| v.is_finite().then_some(v);
+    let free = at
+        .setup
+        .free
+        .iter()
+        .enumerate()
+        .map(|(a, f)| {
+            let told = 1.0 / (weight * fitted.pass.information[a * n + a]).sqrt();
+            let wide = if told.is_finite() { WIDE * told } else { at.parameters[f.index].abs().max(1.0) };
+            let std = match f.prior {
+                Prior::Normal { std, .. } => std,
+                Prior::Cauchy { scale, .. } => scale.max(0.5 * at.parameters[f.index].abs()),
+                Prior::Flat => wide,
+            };
+            Free {
+                index: f.index,
+                name: at.setup.model.parameters[f.index].name.clone(),
+                std,
+                lower: finite(f.lower),
+                upper: finite(f.upper),
+            }
+        })
+        .collect();
+    let dt = at.setup.data.pieces.iter().max_by_key(|p| p.len).map_or(1.0, |p| p.dt);
+    Usual {
+        values: at.parameters.clone(),
+        free,
+        noise: at.errors.noise(),
+        rates: noise.iter().map(|r| Rate { entry: r.entry, intensity: r.intensity, slow: r.slow }).collect(),
+        dt,
+        steps: Steps::of(at.setup.method),
+    }
+}
+
+fn samples(data: &Data) -> Vec<Sample> {
+    data.pieces
+        .iter()
+        .flat_map(|piece| {
+            (0..piece.len).map(|k| Sample {
+                t: piece.start + piece.dt * k as f64,
+                inputs: piece.inputs.iter().map(|u| u[k]).collect(),
+                measured: piece.measured.iter().map(|y| Some(y[k]).filter(|v| v.is_finite())).collect(),
+            })
+        })
+        .collect()
+}

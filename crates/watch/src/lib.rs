@@ -1,0 +1,15 @@
+#![doc = include_str!("../README.md")]
+
+mod blocks;
+mod error;
+mod event;
+mod learn;
+mod machine;
+mod options;
+mod tracker;
+mod watch;
+
+pub use error::WatchError;
+pub use event::{Change, Clock, Estimates, Event, Irregular, Learned, Parameter, Subject};
+pub use options::Options;
+pub use watch::{Saved, Watch};
