@@ -5,9 +5,10 @@ use std::ffi::OsString;
 use clap::error::ErrorKind;
 use clap::{CommandFactory, Parser, Subcommand};
 
-use crate::answer::Answer;
+use crate::answer::{Answer, OutputFormat};
 use crate::commands::{
     calibrate, check, compare, control, demo, diagnose, export, identify, mechanisms, new, shell, simulate,
+    watch,
 };
 use crate::failure::{self, Failure};
 
@@ -26,6 +27,7 @@ use crate::failure::{self, Failure};
   greybox simulate result/improved.toml run3.csv --out simulated.csv
   greybox identify run1.csv --states x --inputs f --holdout run2.csv --out found
   greybox control result/improved.toml --track theta --to 0.5 --out controller
+  mosquitto_sub -t drive/samples | greybox watch result/improved.toml
   greybox export result/improved.toml --to python --out machine.py
   greybox new servo --out servo.toml
 
@@ -54,6 +56,7 @@ pub(crate) enum Command {
     Check(check::Arguments),
     Compare(compare::Arguments),
     Control(control::Arguments),
+    Watch(watch::Arguments),
     Export(export::Arguments),
     New(new::Arguments),
     Mechanisms(mechanisms::Arguments),
@@ -63,7 +66,8 @@ pub(crate) enum Command {
 }
 
 impl Command {
-    pub(crate) fn run(&self) -> Result<Answer, Failure> {
+    /// Runs it; `format` is for a command that answers while it works.
+    pub(crate) fn run(&self, format: OutputFormat) -> Result<Answer, Failure> {
         match self {
             Command::Diagnose(arguments) => diagnose::run(arguments),
             Command::Identify(arguments) => identify::run(arguments),
@@ -72,6 +76,7 @@ impl Command {
             Command::Check(arguments) => check::run(arguments),
             Command::Compare(arguments) => compare::run(arguments),
             Command::Control(arguments) => control::run(arguments),
+            Command::Watch(arguments) => watch::run(arguments, format),
             Command::Export(arguments) => export::run(arguments),
             Command::New(arguments) => new::run(arguments),
             Command::Mechanisms(arguments) => mechanisms::run(arguments),
@@ -98,7 +103,7 @@ impl Cli {
             {
                 Err(Failure::input("no command is given").help(
                     "name one: `greybox diagnose`, `identify`, `calibrate`, `simulate`, `check`, `compare`, `control`, \
-                     `export`, `new`, `mechanisms` or `demo`; \
+                     `watch`, `export`, `new`, `mechanisms` or `demo`; \
                      `greybox --help` explains them",
                 ))
             }

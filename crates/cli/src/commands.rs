@@ -12,3 +12,4 @@ pub(crate) mod mechanisms;
 pub(crate) mod new;
 pub(crate) mod shell;
 pub(crate) mod simulate;
+pub(crate) mod watch;

@@ -27,20 +27,21 @@ fn main() -> ExitCode {
     let format =
         if arguments.iter().any(|a| a == "--json") { OutputFormat::Json } else { OutputFormat::Text };
     // The default hook has said on standard error where a panic was.
-    let outcome = std::panic::catch_unwind(|| run(arguments)).unwrap_or_else(|_| Err(Failure::fault()));
+    let outcome =
+        std::panic::catch_unwind(|| run(arguments, format)).unwrap_or_else(|_| Err(Failure::fault()));
     match outcome.and_then(|answer| answer.print(format)) {
         Ok(status) => status,
         Err(failure) => failure::print(&failure, format),
     }
 }
 
-fn run(arguments: Vec<OsString>) -> Result<answer::Answer, Failure> {
+fn run(arguments: Vec<OsString>, format: OutputFormat) -> Result<answer::Answer, Failure> {
     match Cli::read(arguments)? {
         Ok(cli) => {
             if cli.log {
                 log::want();
             }
-            cli.command.run()
+            cli.command.run(format)
         }
         Err(help) => Ok(help),
     }

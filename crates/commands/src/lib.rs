@@ -21,5 +21,6 @@ pub mod loading;
 mod plausible;
 pub mod simulate;
 pub mod story;
+pub mod watch;
 
 pub use failure::Failure;

@@ -14,6 +14,10 @@ use std::fs;
 use std::io::{BufRead, BufReader, Read, Write};
 use std::path::Path;
 
+mod lines;
+
+pub use lines::CsvLines;
+
 /// Reads the recording in the file at `path`.
 ///
 /// # Errors
@@ -412,6 +416,7 @@ fn is_blank(record: &ByteRecord) -> bool {
     record.iter().all(|cell| cell.trim_ascii().is_empty())
 }
 
+#[derive(Debug, Clone)]
 struct Header {
     /// Seconds per unit of the time column.
     time_scale: f64,

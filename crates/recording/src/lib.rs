@@ -68,7 +68,7 @@ pub mod smooth;
 mod spectrum;
 
 pub use crate::correlation::Correlation;
-pub use crate::csv::{CsvBlocks, parse_csv, read_csv, write_csv, write_csv_file};
+pub use crate::csv::{CsvBlocks, CsvLines, parse_csv, read_csv, write_csv, write_csv_file};
 pub use crate::error::{Place, RecordingError};
 pub use crate::file::is_device;
 pub use crate::finding::{Finding, Severity, listed};

@@ -279,7 +279,9 @@ impl Watch {
         }
         events.push(Event::Estimates(self.estimates(ended)));
         match self.now.settling {
-            Some(change) if ended.t >= change.until => events.push(Event::Settled(self.settle(ended, change))),
+            Some(change) if ended.t >= change.until => {
+                events.push(Event::Settled(self.settle(ended, change)))
+            }
             Some(_) => {}
             None => events.extend(self.alarm(ended).map(Event::Changed)),
         }

@@ -86,13 +86,13 @@ fn look() {
     ];
     for (name, machine) in machines {
         for seed in 0..4 {
-        let samples = run(machine, 300.0, seed);
-        let (_, events) = watch(&samples, &Options::default());
-        for e in &events {
-            if !matches!(e, Event::Estimates(_)|Event::Learned(_)) {
-                eprintln!("{name} {}", serde_json::to_string(e).unwrap());
+            let samples = run(machine, 300.0, seed);
+            let (_, events) = watch(&samples, &Options::default());
+            for e in &events {
+                if !matches!(e, Event::Estimates(_) | Event::Learned(_)) {
+                    eprintln!("{name} {}", serde_json::to_string(e).unwrap());
+                }
             }
-        }
         }
     }
     let mut alarms = 0;

@@ -1,0 +1,126 @@
+//! CSV one line at a time, as it comes from a running machine.
+
+use super::{Header, bad_cell, cell_count, check_text, header, is_blank, number};
+use crate::error::{Place, RecordingError};
+use ::csv::{ByteRecord, ReaderBuilder};
+
+/// Lines of a CSV file that is still being written: the header first, then row after row.
+///
+/// A row is what [`read_csv`](super::read_csv) takes, but that its time may be anything: whether it is late or repeated is
+/// for the caller to judge. A fault of one row leaves the reader as it was.
+///
+/// ```
+/// use greybox_recording::CsvLines;
+/// let lines = CsvLines::new("t [ms],angle [deg],torque", "standard input", 1)?;
+/// assert_eq!(lines.columns()[0], ("angle".to_owned(), Some("deg".to_owned())));
+/// let row = lines.row("20,1.5,", 2)?.expect("a row");
+/// assert_eq!(row[..2], [0.02, 1.5]);           // the time in seconds, then the columns
+/// assert!(row[2].is_nan());                    // an empty cell is a missing sample
+/// assert!(lines.row("", 3)?.is_none());
+/// assert!(lines.row("40,1.5", 4).is_err());
+/// # Ok::<(), greybox_recording::RecordingError>(())
+/// ```
+#[derive(Debug, Clone)]
+pub struct CsvLines {
+    label: String,
+    header: Header,
+}
+
+impl CsvLines {
+    /// Reads the header, which stands in this line of what errors call `label`.
+    ///
+    /// # Errors
+    /// [`RecordingError`]: a header as [`read_csv`](super::read_csv) refuses it.
+    pub fn new(header_line: &str, label: &str, line: u64) -> Result<CsvLines, RecordingError> {
+        let text = check_text(header_line.as_bytes(), label, line - 1)?;
+        let record = cells(text, label)?;
+        let header = header(&record, &Place::line(label, line), text)?;
+        Ok(CsvLines { label: label.to_owned(), header })
+    }
+
+    /// Name and unit of every column after the time.
+    pub fn columns(&self) -> &[(String, Option<String>)] {
+        &self.header.columns
+    }
+
+    /// The time in seconds, then the value of every column (NaN = missing); `None` for a blank line.
+    ///
+    /// # Errors
+    /// [`RecordingError`]: another number of cells than the header has, a cell that is no number, no time.
+    pub fn row(&self, text: &str, line: u64) -> Result<Option<Vec<f64>>, RecordingError> {
+        let record = cells(text.as_bytes(), &self.label)?;
+        if is_blank(&record) {
+            return Ok(None);
+        }
+        let place = || Place::line(&self.label, line);
+        let width = self.header.columns.len() + 1;
+        if record.len() != width {
+            return Err(cell_count(&record, width, place()));
+        }
+        let name = |c: usize| if c == 0 { "t" } else { self.header.columns[c - 1].0.as_str() };
+        let mut row = record
+            .iter()
+            .enumerate()
+            .map(|(c, cell)| {
+                let cell = cell.trim_ascii();
+                number(cell).ok_or_else(|| bad_cell(cell, c, place().column(c, name(c))))
+            })
+            .collect::<Result<Vec<f64>, _>>()?;
+        if row[0].is_nan() {
+            return Err(RecordingError::MissingTime { place: place().column(0, "t") });
+        }
+        row[0] *= self.header.time_scale;
+        Ok(Some(row))
+    }
+}
+
+fn cells(text: &[u8], label: &str) -> Result<ByteRecord, RecordingError> {
+    let mut record = ByteRecord::new();
+    ReaderBuilder::new()
+        .has_headers(false)
+        .flexible(true)
+        .buffer_capacity(text.len().max(1))
+        .from_reader(text)
+        .read_byte_record(&mut record)
+        .map_err(|error| RecordingError::Io {
+            place: Place::file(label),
+            action: "read",
+            source: error.into(),
+        })?;
+    Ok(record)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_line_is_read_as_in_a_file() {
+        let text = "t,x [m],\"y\"\n0,1,2\n0.1,,-3e-2\n";
+        let whole = crate::parse_csv(
+            format!("{text}0.2,1,1\n0.3,1,1\n0.4,1,1\n0.5,1,1\n0.6,1,1\n0.7,1,1\n").as_bytes(),
+            "a",
+        )
+        .unwrap();
+        let mut read = text.lines();
+        let lines = CsvLines::new(read.next().unwrap(), "a", 1).unwrap();
+        for (k, line) in read.enumerate() {
+            let row = lines.row(line, k as u64 + 2).unwrap().unwrap();
+            assert_eq!(row[0], whole.time[k]);
+            for (c, channel) in whole.channels.iter().enumerate() {
+                assert_eq!(channel.name, lines.columns()[c].0);
+                assert_eq!(row[c + 1].to_bits(), channel.values[k].to_bits());
+            }
+        }
+    }
+
+    #[test]
+    fn faults_name_their_place() {
+        let lines = CsvLines::new("t,x", "in", 4).unwrap();
+        for (row, part) in [("1,a", "in:7"), ("1", "in:7"), (",2", "in:7"), ("1,inf", "in:7")] {
+            let said = lines.row(row, 7).unwrap_err().to_string();
+            assert!(said.starts_with(part), "{said}");
+        }
+        assert!(CsvLines::new("1,2", "in", 1).is_err());
+    }
+}
