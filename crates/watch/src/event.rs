@@ -130,7 +130,7 @@ fn direction<S: serde::Serializer>(direction: &Direction, serializer: S) -> Resu
     })
 }
 
-/// Samples of one block that were not as they should be.
+/// Samples since the last such report that were not as they should be; while they go on, reports come at doubling intervals.
 #[derive(Debug, Clone, Default, PartialEq, Eq, Serialize, Deserialize)]
 pub struct Irregular {
     /// Samples older than the one before: passed over.

@@ -19,6 +19,8 @@ const CHANGE: f64 = 1.0;
 const FEWEST: usize = 12;
 /// Blocks that are remembered to tell how large a change is.
 const REMEMBERED: usize = 512;
+/// Most blocks that irregularities wait until they are told.
+const MOST_WAIT: u32 = 256;
 /// Correlation from which on two changes cannot be told apart.
 const TWINS: f64 = 0.95;
 
@@ -29,8 +31,8 @@ const TWINS: f64 = 0.95;
 /// followed model:   recursive least squares of ν on ψ with forgetting  →  parameters with covariance
 /// ```
 ///
-/// zᵢ is the score of the change i alone (I. V. Basseville, I. Nikiforov, *Detection of Abrupt Changes*, 1993, §7.2, §8.4: the
-/// local approach). Where one parameter has changed, its own score is the largest in the mean (Cauchy–Schwarz), and its
+/// zᵢ is the score of the change i alone (M. Basseville, I. Nikiforov, *Detection of Abrupt Changes*, 1993, ch. 8: the local
+/// approach). Where one parameter has changed, its own score is the largest in the mean (Cauchy–Schwarz), and its
 /// chart the first to exceed its limit. What a wrong model leaves in the scores at all times is part of what the
 /// self-starting charts learn as usual.
 #[derive(Debug, Clone)]
@@ -64,6 +66,8 @@ pub struct Saved {
     last: Sample,
     settling: Option<Settling>,
     irregular: Irregular,
+    /// Blocks that irregularities wait until they are told, and the next wait: it doubles while they go on.
+    wait: (u32, u32),
 }
 
 /// A change that settles.
@@ -120,6 +124,7 @@ impl Watch {
             last,
             settling: None,
             irregular: Irregular::default(),
+            wait: (0, 1),
         };
         let mut watch = Watch { machine, now };
         for sample in samples.into_iter().skip(1) {
@@ -274,9 +279,15 @@ impl Watch {
 
     /// What a block has to say.
     fn judge(&mut self, ended: &Ended, events: &mut Vec<Event>) {
-        if !self.now.irregular.is_empty() {
-            events.push(Event::Irregular(std::mem::take(&mut self.now.irregular)));
-        }
+        let (wait, next) = self.now.wait;
+        self.now.wait = match (wait, self.now.irregular.is_empty()) {
+            (0, true) => (0, 1),
+            (0, false) => {
+                events.push(Event::Irregular(std::mem::take(&mut self.now.irregular)));
+                (next, (2 * next).min(MOST_WAIT))
+            }
+            (wait, _) => (wait - 1, next),
+        };
         events.push(Event::Estimates(self.estimates(ended)));
         match self.now.settling {
             Some(change) if ended.t >= change.until => {
