@@ -9,6 +9,7 @@ use common::{Bench, names};
 use serde_json::Value;
 use spring::{MODEL, TRUTH, recording};
 
+#[allow(dead_code, reason = "not every test file uses all of it")]
 mod common;
 #[path = "common/spring.rs"]
 mod spring;

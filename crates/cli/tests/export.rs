@@ -9,6 +9,7 @@ use common::Bench;
 use recordings::driven;
 use serde_json::Value;
 
+#[allow(dead_code, reason = "not every test file uses all of it")]
 mod common;
 #[path = "common/recordings.rs"]
 mod recordings;

@@ -13,6 +13,7 @@ use common::{Bench, names};
 use serde_json::{Value, json};
 use spring::{MODEL, recording};
 
+#[allow(dead_code, reason = "not every test file uses all of it")]
 mod common;
 #[path = "common/spring.rs"]
 mod spring;

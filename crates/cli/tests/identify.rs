@@ -10,6 +10,7 @@ use common::{Bench, names};
 use noise::Noise;
 use serde_json::Value;
 
+#[allow(dead_code, reason = "not every test file uses all of it")]
 mod common;
 #[path = "common/noise.rs"]
 mod noise;

@@ -10,6 +10,7 @@ use common::Bench;
 use serde_json::Value;
 use spring::{MODEL, recording};
 
+#[allow(dead_code, reason = "not every test file uses all of it")]
 mod common;
 #[path = "common/spring.rs"]
 mod spring;

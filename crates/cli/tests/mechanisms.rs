@@ -10,6 +10,7 @@ use std::path::Path;
 use common::Bench;
 use noise::Noise;
 
+#[allow(dead_code, reason = "not every test file uses all of it")]
 mod common;
 #[path = "common/noise.rs"]
 mod noise;

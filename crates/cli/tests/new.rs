@@ -5,6 +5,7 @@ use common::Bench;
 use noise::Noise;
 use recordings::driven;
 
+#[allow(dead_code, reason = "not every test file uses all of it")]
 mod common;
 #[path = "common/noise.rs"]
 mod noise;

@@ -14,6 +14,9 @@ use serde_json::Value;
 mod common;
 #[path = "common/noise.rs"]
 mod noise;
+#[allow(dead_code, reason = "not every test file uses all of it")]
+#[path = "common/throttle.rs"]
+mod throttle;
 
 fn read(page: &str) -> String {
     std::fs::read_to_string(Path::new(env!("CARGO_MANIFEST_DIR")).join("../../docs/src").join(page)).unwrap()
@@ -141,4 +144,17 @@ fn the_page_shows_what_is_said_of_a_pendulum_on_a_cart() {
     // What was written runs.
     let run = bench.json(&["simulate", "found/model.toml", "run1.csv", "--out", "simulated.csv"]);
     assert!(run["fit"]["x"]["nrmse"].as_f64().unwrap() < 0.05, "{run:#}");
+}
+
+/// What the page of `greybox watch` shows is what the command says of that throttle.
+#[test]
+fn the_page_of_the_watch_shows_what_the_command_says() {
+    let bench = Bench::empty();
+    bench.write("throttle.toml", throttle::MODEL);
+    let said = bench.greybox_fed(&["watch", "throttle.toml"], &throttle::csv(&throttle::samples(190.0)));
+    assert_eq!(said.code, 0, "{}", said.stderr);
+    let page = read("watch.md");
+    let shown: Vec<&str> =
+        page.split("```text\n").skip(1).map(|block| block.split("```").next().unwrap()).collect();
+    assert_eq!(shown[..2].concat(), said.stdout);
 }

@@ -376,10 +376,16 @@ fn in_words(event: &Event) -> Option<String> {
             );
         }
         Event::Changed(change) => {
-            let _ = writeln!(text, "{}: {}", at(change.t), changed(change, "has changed"));
+            let _ = writeln!(text, "{}: {}", at(change.t), changed(change));
         }
         Event::Settled(change) => {
-            let _ = writeln!(text, "{}: {}", at(change.t), changed(change, "has settled"));
+            let (name, since) = (subject(&change.subject), at(change.since));
+            let _ = writeln!(
+                text,
+                "{}: it was {name}, since {since}: {}; usual from now on",
+                at(change.t),
+                extent(change)
+            );
         }
         Event::Irregular(irregular) => {
             let _ = writeln!(text, "samples: {}", irregularities(irregular));
@@ -406,25 +412,27 @@ fn subject(subject: &Subject) -> String {
     }
 }
 
-fn changed(change: &Change, verb: &str) -> String {
-    let unit = change.unit.as_deref();
-    let mut text = format!("{} {verb}", subject(&change.subject));
+/// How far something has changed.
+fn extent(change: &Change) -> String {
     let relative = change.relative().map_or_else(String::new, |r| format!(" ({:+.1} %)", 100.0 * r));
-    let _ = match change.subject {
-        Subject::Noise(_) => write!(text, ": {} times what it was", format::number(change.now)),
-        _ => write!(
-            text,
-            ": {} to {}{relative}",
+    match change.subject {
+        Subject::Noise(_) => format!("{} times what it was", format::number(change.now)),
+        _ => format!(
+            "{} to {}{relative}",
             format::significant(change.before, 4),
-            value(change.now, change.std, unit)
+            value(change.now, change.std, change.unit.as_deref())
         ),
-    };
-    let _ = write!(text, ", since {}", at(change.since));
-    if !change.or.is_empty() {
-        let others = listed(change.or.iter().map(subject).collect());
-        let _ = write!(text, "; or {others}: these samples do not tell them apart");
     }
-    text
+}
+
+/// The sentence of an alarm.
+fn changed(change: &Change) -> String {
+    let (since, name, extent) = (at(change.since), subject(&change.subject), extent(change));
+    if change.or.is_empty() {
+        return format!("{name} has changed since {since}: {extent}");
+    }
+    let others = change.or.iter().map(subject).collect::<Vec<_>>().join(", ");
+    format!("something has changed since {since}, most likely {name}: {extent}; or {others}")
 }
 
 fn irregularities(i: &Irregular) -> String {

@@ -145,7 +145,11 @@ impl Filter {
             && to.by_parameters.len() == n * p
             && to.noise.len() == n;
         let all = [to.state, to.by_state, to.by_parameters, to.noise];
-        if !fits || !(to.memory > 0.0) || !all.iter().all(|s| s.iter().all(|v| v.is_finite())) {
+        if !fits
+            || to.memory.is_nan()
+            || to.memory <= 0.0
+            || !all.iter().all(|s| s.iter().all(|v| v.is_finite()))
+        {
             return false;
         }
         self.state.copy_from_slice(to.state);
@@ -192,7 +196,12 @@ impl Filter {
         for (channel, m) in measured.into_iter().enumerate() {
             let rows = [m.by_state, m.by_parameters];
             let finite = m.error.is_finite() && rows.iter().all(|r| r.iter().all(|v| v.is_finite()));
-            if !finite || m.by_state.len() != n || m.by_parameters.len() != p || !(m.noise > 0.0) {
+            if !finite
+                || m.by_state.len() != n
+                || m.by_parameters.len() != p
+                || m.noise.is_nan()
+                || m.noise <= 0.0
+            {
                 continue;
             }
             let dot = |a: &[f64], b: &[f64]| a.iter().zip(b).map(|(a, b)| a * b).sum::<f64>();

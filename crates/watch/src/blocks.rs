@@ -19,16 +19,21 @@ pub(crate) struct Block {
 pub(crate) struct Scores {
     pub(crate) gradient: Vec<f64>,
     pub(crate) information: Vec<f64>,
+    /// Σ ν², and how many there are.
+    pub(crate) squares: f64,
+    pub(crate) count: f64,
 }
 
 impl Scores {
     pub(crate) fn zero(effects: usize) -> Scores {
-        Scores { gradient: vec![0.0; effects], information: vec![0.0; effects] }
+        Scores { gradient: vec![0.0; effects], information: vec![0.0; effects], squares: 0.0, count: 0.0 }
     }
 
     pub(crate) fn add(&mut self, other: &Scores) {
         self.gradient.iter_mut().zip(&other.gradient).for_each(|(a, b)| *a += b);
         self.information.iter_mut().zip(&other.information).for_each(|(a, b)| *a += b);
+        self.squares += other.squares;
+        self.count += other.count;
     }
 
     /// Of successive blocks together.
@@ -81,6 +86,8 @@ impl Block {
                 scores.gradient[h] += psi * value;
                 scores.information[h] += psi * psi;
             }
+            scores.squares += value * value;
+            scores.count += 1.0;
         }
         scores
     }
@@ -117,17 +124,6 @@ impl Block {
                 (self.rows(c).map(left).sum::<f64>() / self.rows(c).count() as f64).ln()
             })
             .collect()
-    }
-
-    /// Correlation of the innovations that one change makes with those that every other makes.
-    pub(crate) fn correlations(&self, effect: usize) -> Vec<f64> {
-        let mut products = vec![0.0; self.effects];
-        for (row, _) in self.all() {
-            products.iter_mut().zip(row).for_each(|(p, psi)| *p += row[effect] * psi);
-        }
-        let scores = self.scores();
-        let norm = |h: usize| (scores.information[h] * scores.information[effect]).sqrt();
-        products.iter().enumerate().map(|(h, p)| if norm(h) > 0.0 { p / norm(h) } else { 0.0 }).collect()
     }
 }
 

@@ -5,6 +5,7 @@ mod error;
 mod event;
 mod learn;
 mod machine;
+mod naming;
 mod options;
 mod tracker;
 mod watch;

@@ -10,6 +10,7 @@ use crate::error::WatchError;
 use crate::event::{Change, Clock, Estimates, Event, Irregular, Learned, Parameter, Subject};
 use crate::learn::{First, Sample, Usual, learn};
 use crate::machine::Machine;
+use crate::naming::{Explanation, dispersion, explanations, rivals};
 use crate::options::{BLOCKS, Options};
 use crate::tracker::{Conditions, Effects, Tracker};
 
@@ -21,8 +22,6 @@ const FEWEST: usize = 12;
 const REMEMBERED: usize = 512;
 /// Most blocks that irregularities wait until they are told.
 const MOST_WAIT: u32 = 256;
-/// Correlation from which on two changes cannot be told apart.
-const TWINS: f64 = 0.95;
 
 /// A machine that is watched.
 ///
@@ -32,9 +31,9 @@ const TWINS: f64 = 0.95;
 /// ```
 ///
 /// zᵢ is the score of the change i alone (M. Basseville, I. Nikiforov, *Detection of Abrupt Changes*, 1993, ch. 8: the local
-/// approach). Where one parameter has changed, its own score is the largest in the mean (Cauchy–Schwarz), and its
-/// chart the first to exceed its limit. What a wrong model leaves in the scores at all times is part of what the
-/// self-starting charts learn as usual.
+/// approach). What a wrong model leaves in the scores at all times is part of what the self-starting charts learn as usual.
+/// Where a chart exceeds its limit, the change is named that explains the blocks since its onset best; after one memory,
+/// the parameter that the followed model has moved most.
 #[derive(Debug, Clone)]
 pub struct Watch {
     machine: Machine,
@@ -71,15 +70,14 @@ pub struct Saved {
 }
 
 /// A change that settles.
-#[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 struct Settling {
     until: f64,
-    /// The chart that has seen it.
-    chart: usize,
-    direction: Direction,
+    /// The channel whose scatter it is; else a parameter, a force or an offset.
+    noise: Option<usize>,
     since: f64,
-    /// Mean of the chart before.
-    mean: f64,
+    /// Means of all charts before.
+    means: Vec<f64>,
 }
 
 /// Version of [`Saved`].
@@ -289,96 +287,143 @@ impl Watch {
             (wait, _) => (wait - 1, next),
         };
         events.push(Event::Estimates(self.estimates(ended)));
-        match self.now.settling {
+        match self.now.settling.take() {
             Some(change) if ended.t >= change.until => {
-                events.push(Event::Settled(self.settle(ended, change)))
+                events.push(Event::Settled(self.settle(ended, &change)))
             }
-            Some(_) => {}
+            Some(change) => self.now.settling = Some(change),
             None => events.extend(self.alarm(ended).map(Event::Changed)),
         }
     }
 
-    /// Puts a block on the charts; what the one that exceeds its limit the most has seen.
+    /// Puts a block on the charts, and says what has changed where one exceeds its limit.
     fn alarm(&mut self, ended: &Ended) -> Option<Change> {
         let now = &mut self.now;
         let means: Vec<f64> = now.charts.iter().map(Chart::mean).collect();
         let alarms: Vec<_> = now.charts.iter_mut().zip(ended.values()).map(|(c, v)| c.push(v)).collect();
         let alarms = alarms.iter().enumerate().filter_map(|(i, alarm)| alarm.map(|a| (i, a)));
-        let (chart, alarm) = alarms.max_by(|(_, a), (_, b)| a.excess.total_cmp(&b.excess))?;
-        let blocks = onset(&now.history, chart, alarm.since as usize);
-        let change = Settling {
+        let (loudest, alarm) = alarms.max_by(|(_, a), (_, b)| a.excess.total_cmp(&b.excess))?;
+        let effects = ended.scores.gradient.len();
+        let noise = loudest.checked_sub(effects);
+        let mut change = Settling {
             until: ended.t + now.memory,
-            chart,
-            direction: alarm.direction,
-            since: ended.t - blocks as f64 * now.block_seconds,
-            mean: means[chart],
+            noise,
+            since: ended.t - alarm.since as f64 * now.block_seconds,
+            means,
         };
-        now.settling = Some(change);
-        if chart < now.usual.free.len() {
-            // What was known of the machine before the change is no longer so.
-            now.fit.restart();
-        }
-        Some(self.told(ended, &change, blocks))
+        let told = match noise {
+            Some(channel) => self.scatter_told(ended, &change, channel),
+            None => {
+                let all = explanations(&now.history, &change.means, alarm.since as usize);
+                change.since = ended.t - all[0].blocks as f64 * now.block_seconds;
+                // What was known of the machine before the change is no longer so.
+                now.fit.restart();
+                self.told(ended, &all)
+            }
+        };
+        self.now.settling = Some(change);
+        Some(told)
     }
 
     /// From here on what has changed is usual.
-    fn settle(&mut self, ended: &Ended, change: Settling) -> Change {
-        let blocks = ((ended.t - change.since) / self.now.block_seconds).round() as usize;
-        let mut told = self.told(ended, &change, blocks);
+    fn settle(&mut self, ended: &Ended, change: &Settling) -> Change {
+        let told = match change.noise {
+            Some(channel) => self.scatter_told(ended, change, channel),
+            None => {
+                let blocks = ((ended.t - change.since) / self.now.block_seconds).round() as usize;
+                let all = explanations(&self.now.history, &change.means, blocks);
+                let np = self.now.usual.free.len();
+                if all[0].effect < np { self.followed(ended) } else { self.told(ended, &all) }
+            }
+        };
+        let told = Change { since: change.since, ..told };
         let now = &mut self.now;
-        if let Some(free) = now.usual.free.get(change.chart) {
-            let unit = self.machine.model.parameters[free.index].unit.as_ref();
-            told.now = reported(unit, now.values[free.index]);
-            told.std = difference(unit, now.fit.deviations()[change.chart]);
+        if matches!(told.subject, Subject::Parameter(_)) {
             now.usual.values.clone_from(&now.values);
             now.keeping.filter.take_state(&now.following.filter);
         }
         now.charts.iter_mut().for_each(Chart::restart);
         now.history.clear();
-        now.settling = None;
         told
     }
 
-    /// The change that a chart has seen, told by the last blocks.
-    fn told(&self, ended: &Ended, change: &Settling, blocks: usize) -> Change {
-        let now = &self.now;
-        let (model, np) = (&self.machine.model, now.usual.free.len());
-        let (nz, effects) = (self.machine.system.nz, ended.scores.gradient.len());
-        let chart = change.chart;
-        let subject = |i: usize| match i {
-            i if i < np => Subject::Parameter(now.usual.free[i].name.clone()),
-            i if i < np + nz => Subject::Force(model.states[i - np].name.clone()),
-            i if i < effects => Subject::Offset(model.measurements[i - np - nz].channel.clone()),
-            i => Subject::Noise(model.measurements[i - effects].channel.clone()),
-        };
-        let (mut before, mut unit, mut or) = (0.0, None, Vec::new());
-        let (step, std) = if chart < effects {
-            let recent = &now.history[now.history.len().saturating_sub(blocks.max(1))..];
-            let (step, std) = Scores::sum(recent).change(chart);
-            if chart < np {
-                let index = now.usual.free[chart].index;
-                (before, unit) = (now.usual.values[index], model.parameters[index].unit.clone());
-            } else if chart >= np + nz {
-                unit = Some(model.measurements[chart - np - nz].unit.of_difference());
+    fn subject(&self, effect: usize) -> Subject {
+        let (model, free, nz) = (&self.machine.model, &self.now.usual.free, self.machine.system.nz);
+        match effect.checked_sub(free.len()) {
+            None => Subject::Parameter(free[effect].name.clone()),
+            Some(j) if j < nz => Subject::Force(model.states[j].name.clone()),
+            Some(j) => Subject::Offset(model.measurements[j - nz].channel.clone()),
+        }
+    }
+
+    /// The best explanation as a change.
+    fn told(&self, ended: &Ended, explanations: &[Explanation]) -> Change {
+        let (model, free, nz) = (&self.machine.model, &self.now.usual.free, self.machine.system.nz);
+        let best = explanations[0];
+        let (before, unit) = match best.effect.checked_sub(free.len()) {
+            None => {
+                let index = free[best.effect].index;
+                (self.now.usual.values[index], model.parameters[index].unit.clone())
             }
-            let correlations = ended.block.correlations(chart);
-            let twins = (0..effects).filter(|h| *h != chart && correlations[*h].abs() > TWINS);
-            or.extend(twins.map(subject));
-            (step, std * now.inflation.sqrt())
-        } else {
-            before = 1.0;
-            ((0.5 * (ended.scatter[chart - effects] - change.mean)).exp() - 1.0, 0.0)
+            Some(j) if j < nz => (0.0, None),
+            Some(j) => (0.0, Some(model.measurements[j - nz].unit.of_difference())),
         };
         Change {
             t: ended.t,
-            subject: subject(chart),
-            or,
-            direction: change.direction,
-            since: change.since,
+            subject: self.subject(best.effect),
+            or: rivals(explanations, self.now.inflation).map(|e| self.subject(e)).collect(),
+            direction: if best.step > 0.0 { Direction::Up } else { Direction::Down },
+            since: ended.t - best.blocks as f64 * self.now.block_seconds,
             before: reported(unit.as_ref(), before),
-            now: reported(unit.as_ref(), before + step),
-            std: difference(unit.as_ref(), std),
+            now: reported(unit.as_ref(), before + best.step),
+            std: difference(unit.as_ref(), best.std * dispersion(&best, self.now.inflation).sqrt()),
             unit: unit.map(|u| u.text),
+        }
+    }
+
+    /// The parameter that the followed model has moved the most, in its standard deviations.
+    fn followed(&self, ended: &Ended) -> Change {
+        let now = &self.now;
+        let deviations = now.fit.deviations();
+        let moved = |k: usize| {
+            let index = now.usual.free[k].index;
+            now.values[index] - now.usual.values[index]
+        };
+        let most = (0..deviations.len())
+            .max_by(|a, b| {
+                let size = |k: usize| (moved(k) / deviations[k]).abs();
+                size(*a).total_cmp(&size(*b))
+            })
+            .unwrap_or(0);
+        let index = now.usual.free[most].index;
+        let unit = self.machine.model.parameters[index].unit.as_ref();
+        Change {
+            t: ended.t,
+            subject: self.subject(most),
+            or: Vec::new(),
+            direction: if moved(most) > 0.0 { Direction::Up } else { Direction::Down },
+            since: ended.t,
+            before: reported(unit, now.usual.values[index]),
+            now: reported(unit, now.values[index]),
+            std: difference(unit, deviations[most]),
+            unit: unit.map(|u| u.text.clone()),
+        }
+    }
+
+    /// A channel that scatters more or less than it did, in standard deviations of before.
+    fn scatter_told(&self, ended: &Ended, change: &Settling, channel: usize) -> Change {
+        let mean = change.means[ended.scores.gradient.len() + channel];
+        let ratio = (0.5 * (ended.scatter[channel] - mean)).exp();
+        Change {
+            t: ended.t,
+            subject: Subject::Noise(self.machine.model.measurements[channel].channel.clone()),
+            or: Vec::new(),
+            direction: if ratio > 1.0 { Direction::Up } else { Direction::Down },
+            since: change.since,
+            before: 1.0,
+            now: ratio,
+            std: 0.0,
+            unit: None,
         }
     }
 
@@ -437,24 +482,6 @@ impl Watch {
                 .collect(),
         }
     }
-}
-
-/// How many blocks ago a change of unknown size began, by maximum likelihood, `most` at most.
-fn onset(history: &[Scores], effect: usize, most: usize) -> usize {
-    let (mut gradient, mut information, mut best) = (0.0, 0.0, (0.0, 1));
-    for (k, block) in history.iter().rev().take(most.max(1)).enumerate() {
-        // (The scatter has no scores: its last zero is all that is known.)
-        let (Some(g), Some(i)) = (block.gradient.get(effect), block.information.get(effect)) else {
-            return most;
-        };
-        gradient += g;
-        information += i;
-        let gain = gradient * gradient / information;
-        if gain > best.0 {
-            best = (gain, k + 1);
-        }
-    }
-    best.1
 }
 
 /// A value in its unit.

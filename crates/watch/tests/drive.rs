@@ -121,16 +121,19 @@ fn seen(machine: Machine, latest: f64, is: impl Fn(&Change) -> bool) {
 }
 
 #[test]
-fn a_step_of_the_damping_is_named_at_once_and_measured() {
+fn a_step_of_the_damping_is_seen_at_once_then_named_and_measured() {
     let machine = Machine { damping: |t| if t < EVENT { 0.06 } else { 0.066 }, ..SOUND };
     for seed in 0..10 {
         let events = watched(machine, 240.0, seed, &Options::default());
         let [Event::Changed(alarm), Event::Settled(settled)] = &events[..] else { panic!("{events:?}") };
         assert!((0.0..4.0).contains(&(alarm.t - EVENT)), "{alarm:?}");
         assert!((alarm.since - EVENT).abs() < 3.0, "{alarm:?}");
-        assert_eq!((&alarm.subject, &alarm.or), (&Subject::Parameter("b".into()), &vec![]));
-        assert_eq!((alarm.direction, alarm.unit.as_deref()), (Direction::Up, Some("N*m*s/rad")));
-        assert!(alarm.relative().is_some_and(|r| (0.02..0.12).contains(&r)), "{alarm:?}");
+        // (The block in which it begins is not yet what a change of the damping makes of it.)
+        let b = Subject::Parameter("b".into());
+        assert!(alarm.subject == b || alarm.or.contains(&b), "{alarm:?}");
+        assert_eq!((&settled.subject, &settled.or), (&b, &vec![]));
+        assert_eq!((settled.direction, settled.unit.as_deref()), (Direction::Up, Some("N*m*s/rad")));
+        assert!(settled.relative().is_some_and(|r| (0.09..0.11).contains(&r)), "{settled:?}");
         assert!((settled.now - 0.066).abs() < 4.0 * settled.std && settled.std < 5e-5, "{settled:?}");
     }
 }

@@ -13,6 +13,7 @@ mod runs;
 pub(crate) mod sets;
 pub(crate) mod statistics;
 mod table;
+mod watch;
 
 use std::path::{Path, PathBuf};
 use std::time::Duration;
@@ -36,17 +37,20 @@ pub struct Arguments {
     /// Measure coverage, false alarms and the reliability of confidence over seeds instead
     #[arg(long, conflicts_with_all = ["recordings", "identify", "floors"])]
     statistics: bool,
-    /// Put what --statistics, --identify, or --recordings on the real sets, measured into the book
+    /// Measure delays, names and false alarms of `greybox watch` over seeds instead
+    #[arg(long, conflicts_with_all = ["recordings", "identify", "statistics", "floors"])]
+    watch: bool,
+    /// Put what --statistics, --identify, --watch, or --recordings on the real sets, measured into the book
     #[arg(long)]
     write_docs: bool,
-    /// Seed of the concealed suite; first seed of --identify and --statistics
+    /// Seed of the concealed suite; first seed of --identify, --statistics and --watch
     #[arg(long, value_name = "N", default_value_t = 1)]
     seed: u64,
-    /// Cases of the concealed suite (three rounds of 42 otherwise); seeds per case of --identify and --statistics
+    /// Cases of the concealed suite (three rounds of 42 otherwise); seeds per case of --identify, --statistics and --watch
     #[arg(long, value_name = "N")]
     count: Option<usize>,
     /// Keep the concealed suite's cases, truths and results here (target/prove/concealed otherwise), or the recordings of
-    /// --identify's machines
+    /// --identify's and --watch's machines
     #[arg(long, value_name = "DIR")]
     keep: Option<PathBuf>,
     /// Cases of the concealed suite that run at the same time
@@ -137,6 +141,16 @@ pub fn run(root: &Path, arguments: &Arguments) -> Result<Ending> {
             statistics::write(root, &found)?;
         }
         return conclude(&found.outcomes, arguments.json.as_deref());
+    }
+    if arguments.watch {
+        if let Some(folder) = &arguments.keep {
+            watch::keep(folder, arguments.seed, arguments.count)?;
+        }
+        let outcomes = watch::run(arguments.seed, arguments.count, arguments.only.as_deref())?;
+        if arguments.write_docs {
+            watch::write(root, &outcomes)?;
+        }
+        return conclude(&outcomes, arguments.json.as_deref());
     }
     let folder = match &arguments.recordings {
         Some(given) if given.is_dir() => given.clone(),

@@ -64,7 +64,7 @@ pub(crate) fn run(arguments: &Arguments, format: OutputFormat) -> Result<Answer,
     let mut session = Session::new(model, &arguments.channels.map, options, saved)?;
     let mut input = io::stdin().lock();
     let mut line = Vec::new();
-    let mut last = Instant::now();
+    let mut saved_at = now();
     loop {
         line.clear();
         let read = input
@@ -79,10 +79,10 @@ pub(crate) fn run(arguments: &Arguments, format: OutputFormat) -> Result<Answer,
             }
         }
         if let Some(path) = state
-            && last.elapsed() >= SAVED_EVERY
+            && saved_at.elapsed() >= SAVED_EVERY
         {
             save(path, &session)?;
-            last = Instant::now();
+            saved_at = now();
         }
     }
     if let Some(path) = state {
@@ -90,6 +90,12 @@ pub(crate) fn run(arguments: &Arguments, format: OutputFormat) -> Result<Answer,
     }
     session.end()?;
     Ok(Answer::words(String::new()))
+}
+
+/// The clock of the saves, which is in no result.
+#[allow(clippy::disallowed_methods, reason = "when the state is saved")]
+fn now() -> Instant {
+    Instant::now()
 }
 
 /// Prints what is said; `false` where nobody reads any more.

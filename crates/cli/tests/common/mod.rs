@@ -58,6 +58,18 @@ impl Bench {
         }
     }
 
+    /// Runs `greybox` in the folder with this on standard input.
+    pub(crate) fn greybox_fed(&self, arguments: &[&str], input: &str) -> Outcome {
+        let mut command = Command::cargo_bin("greybox").unwrap();
+        let output =
+            command.current_dir(self.folder.path()).args(arguments).write_stdin(input).output().unwrap();
+        Outcome {
+            code: output.status.code().unwrap(),
+            stdout: String::from_utf8(output.stdout).unwrap(),
+            stderr: String::from_utf8(output.stderr).unwrap(),
+        }
+    }
+
     pub(crate) fn json(&self, arguments: &[&str]) -> Value {
         let outcome = self.greybox(&[arguments, &["--json"]].concat());
         assert_eq!(outcome.code, 0, "{}", outcome.stderr);

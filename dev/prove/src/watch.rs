@@ -1,0 +1,436 @@
+//! `cargo xtask prove --watch`: a machine that runs and changes, over seeds; delays, names and false alarms, beside control
+//! charts on the residual of the calibrated model.
+//!
+//! The machine is a spring-loaded throttle with Coulomb friction, integrated here: nothing is shared with what watches it.
+
+use std::path::Path;
+
+use anyhow::{Context, Result};
+use greybox_dev::book;
+use greybox_model::{Hold, Model, System};
+use greybox_recording::csv::write_csv_file;
+use greybox_recording::{Channel, Recording};
+use greybox_recursive::Chart;
+use greybox_simulate::{Environment, Method, Seeds, Signal, Simulation};
+use greybox_watch::{Event, Learned, Options, Subject, Watch};
+use rand::SeedableRng;
+use rand_distr::{Distribution, StandardNormal};
+use rand_pcg::Pcg64Mcg;
+use rayon::prelude::*;
+
+use crate::{Figure, Outcome};
+
+/// Seeds of each case.
+const SEEDS: usize = 20;
+/// Sampling, s.
+const STEP: f64 = 0.01;
+/// When something happens, s.
+const CHANGE: f64 = 600.0;
+/// Seconds watched afterwards; of the machine to which nothing happens, seconds in all.
+const AFTER: f64 = 300.0;
+const SOUND: f64 = 3660.0;
+/// False alarms an hour that are asked for.
+const ALARMS: f64 = 1.0;
+/// Page and mark of the table.
+const PAGE: &str = "watch.md";
+const BEGIN: &str = "<!-- Made by `cargo xtask prove --watch --write-docs`; do not edit. -->";
+
+const MODEL: &str = r#"
+name = "throttle"
+[inputs]
+torque = { unit = "N*m", hold = "zero" }
+[parameters]
+J = { value = 0.02, unit = "kg*m^2", fixed = true }
+b = { value = 0.03, unit = "N*m*s/rad" }
+c = { value = 0.08, unit = "N*m" }
+k = { value = 0.7, unit = "N*m/rad" }
+[states]
+angle = { unit = "rad" }
+[equations]
+plate = "J*angle'' + b*angle' + c*sign(angle') + k*angle = torque"
+"#;
+
+/// What the machine is at one time.
+#[derive(Clone, Copy)]
+struct Now {
+    viscous: f64,
+    coulomb: f64,
+    spring: f64,
+    load: f64,
+    offset: f64,
+    noise: f64,
+}
+
+const USUAL: Now = Now { viscous: 0.02, coulomb: 0.1, spring: 0.8, load: 0.0, offset: 0.0, noise: 0.002 };
+
+struct Case {
+    name: &'static str,
+    /// The machine, so many seconds after the change.
+    at: fn(f64) -> Now,
+    /// Names that are right; none where nothing happens.
+    right: &'static [Name],
+}
+
+/// A name without its parameter's text.
+#[derive(Debug, Clone, Copy, PartialEq)]
+enum Name {
+    Parameter(&'static str),
+    Force,
+    Offset,
+    Noise,
+}
+
+impl Name {
+    fn is(self, subject: &Subject) -> bool {
+        match (self, subject) {
+            (Name::Parameter(name), Subject::Parameter(found)) => name == found,
+            (Name::Force, Subject::Force(_))
+            | (Name::Offset, Subject::Offset(_))
+            | (Name::Noise, Subject::Noise(_)) => true,
+            _ => false,
+        }
+    }
+}
+
+const CASES: &[Case] = &[
+    Case {
+        name: "Coulomb friction + 30 %",
+        at: |_| Now { coulomb: 0.13, ..USUAL },
+        right: &[Name::Parameter("c")],
+    },
+    Case {
+        name: "Coulomb friction + 6 % a minute",
+        at: |s| Now { coulomb: 0.1 * (1.0 + 0.001 * s), ..USUAL },
+        right: &[Name::Parameter("c")],
+    },
+    Case {
+        name: "viscous friction + 30 %",
+        at: |_| Now { viscous: 0.026, ..USUAL },
+        right: &[Name::Parameter("b")],
+    },
+    Case { name: "spring − 2 %", at: |_| Now { spring: 0.784, ..USUAL }, right: &[Name::Parameter("k")] },
+    // A throttle that moves about its rest tells a load from an offset by the friction alone.
+    Case {
+        name: "load of 2 % of the largest torque",
+        at: |_| Now { load: 0.02, ..USUAL },
+        right: &[Name::Force, Name::Offset],
+    },
+    Case {
+        name: "sensor: offset of twice its noise",
+        at: |_| Now { offset: 0.004, ..USUAL },
+        right: &[Name::Offset, Name::Force],
+    },
+    Case { name: "sensor: noise + 50 %", at: |_| Now { noise: 0.003, ..USUAL }, right: &[Name::Noise] },
+    Case { name: "nothing", at: |_| USUAL, right: &[] },
+];
+
+/// Time, torque and measured angle of every sample.
+fn record(case: &Case, seed: u64) -> [Vec<f64>; 3] {
+    const SUBSTEPS: usize = 20;
+    let mut random = Pcg64Mcg::seed_from_u64(seed);
+    let mut normal = || -> f64 { StandardNormal.sample(&mut random) };
+    let seconds = if case.right.is_empty() { SOUND } else { CHANGE + AFTER };
+    let (mut angle, mut rate, mut torque) = (0.0f64, 0.0f64, 0.0);
+    let mut out = [Vec::new(), Vec::new(), Vec::new()];
+    for k in 0..(seconds / STEP) as usize {
+        let t = k as f64 * STEP;
+        let now = if t < CHANGE { USUAL } else { (case.at)(t - CHANGE) };
+        if k % 30 == 0 {
+            torque = 0.5 * normal();
+        }
+        out[0].push(t);
+        out[1].push(torque);
+        out[2].push(angle + now.offset + now.noise * normal());
+        let free = |a: f64, v: f64| torque + now.load - now.spring * a - now.viscous * v;
+        for _ in 0..SUBSTEPS {
+            let mut left = STEP / SUBSTEPS as f64;
+            while left > 0.0 {
+                let push = free(angle, 0.0);
+                if rate == 0.0 && push.abs() <= now.coulomb {
+                    break;
+                }
+                let way = if rate == 0.0 { push.signum() } else { rate.signum() };
+                let acceleration = |a: f64, v: f64| (free(a, v) - way * now.coulomb) / 0.02;
+                // (The midpoint rule.)
+                let middle = rate + 0.5 * left * acceleration(angle, rate);
+                let next = rate + left * acceleration(angle + 0.5 * left * rate, middle);
+                if next * way < 0.0 {
+                    // It stops within the step, and the rest of the step is another one.
+                    let taken = left * rate / (rate - next);
+                    angle += 0.5 * taken * rate;
+                    rate = 0.0;
+                    left -= taken;
+                } else {
+                    angle += 0.5 * left * (rate + next);
+                    rate = next;
+                    left = 0.0;
+                }
+            }
+        }
+    }
+    out
+}
+
+/// One seed of a case.
+struct Trial {
+    /// Seconds from the change to the alarm; `None`: not within the time watched.
+    delay: Option<f64>,
+    /// The alarm names it alone, or first among what it cannot tell apart; or at all.
+    named: (bool, bool),
+    /// What settled bears the right name.
+    settled: Option<bool>,
+    /// False alarms and hours.
+    false_alarms: (usize, f64),
+    /// Delay and false alarms of charts on the residual.
+    rival: (Option<f64>, usize),
+}
+
+fn trial(case: &Case, seed: u64) -> Result<Trial> {
+    let [time, torque, angle] = record(case, seed);
+    let model = Model::from_toml(MODEL, "throttle.toml").context("the throttle's model")?;
+    let options = Options { alarms_per_day: 24.0 * ALARMS, ..Options::default() };
+    let count = time.iter().take_while(|t| **t < options.learn).count();
+    let column = |name: &str, values: &[f64]| Channel {
+        name: name.to_string(),
+        unit: None,
+        values: values[..count].to_vec(),
+    };
+    let first = Recording::from_columns(
+        "first",
+        time[..count].to_vec(),
+        vec![column("torque", &torque), column("angle", &angle)],
+    )?;
+    let (mut watch, Event::Learned(learned)) = Watch::learn(&model, &first, &options)? else {
+        anyhow::bail!("nothing was learned");
+    };
+    let mut events = Vec::new();
+    for k in count..time.len() {
+        events.extend(watch.push(time[k], &torque[k..=k], &angle[k..=k]));
+    }
+    let sound = case.right.is_empty();
+    let changed = if sound { f64::INFINITY } else { CHANGE };
+    let is_right = |subject: &Subject| case.right.iter().any(|name| name.is(subject));
+    let mut trial = Trial {
+        delay: None,
+        named: (false, false),
+        settled: None,
+        false_alarms: (0, (changed.min(SOUND) - options.learn) / 3600.0),
+        rival: (None, 0),
+    };
+    for event in &events {
+        match event {
+            Event::Changed(change) if change.t < changed => trial.false_alarms.0 += 1,
+            Event::Changed(change) if trial.delay.is_none() => {
+                trial.delay = Some(change.t - changed);
+                let first = is_right(&change.subject);
+                trial.named = (first, first || change.or.iter().any(is_right));
+            }
+            Event::Settled(change) if change.t >= changed && trial.delay.is_some() => {
+                trial.settled.get_or_insert(is_right(&change.subject));
+            }
+            _ => {}
+        }
+    }
+    trial.rival = rival(&model, &learned, &time, &torque, &angle, changed)?;
+    Ok(trial)
+}
+
+/// The free run of the calibrated model, less what was measured.
+fn residual(model: &Model, learned: &Learned, torque: &[f64], angle: &[f64]) -> Result<Vec<f64>> {
+    let system = System::compile(model)?;
+    let mut values: Vec<f64> = model.parameters.iter().map(|p| p.value).collect();
+    for p in &learned.parameters {
+        let index = model.parameter(&p.name).context("a parameter of the model")?;
+        values[index] = p.value;
+    }
+    let environment = Environment {
+        start: 0.0,
+        dt: STEP,
+        len: torque.len(),
+        inputs: vec![Signal::new(Hold::Zero, STEP, torque, |_| Vec::new())],
+        forces: Vec::new(),
+    };
+    let simulation = Simulation {
+        system: &system,
+        environment: &environment,
+        parameters: &values,
+        method: Method::Rk4 { substeps: 4 },
+        seeds: &Seeds::default(),
+    };
+    let mut stepper = simulation.stepper(&[angle[0], 0.0]);
+    let mut out = Vec::with_capacity(angle.len());
+    for measured in angle {
+        out.push(measured - stepper.state()[0]);
+        stepper.step();
+    }
+    Ok(out)
+}
+
+/// Charts of mean and scatter of the residual, at the same rate of false alarms: delay, and false alarms before the change.
+fn rival(
+    model: &Model,
+    learned: &Learned,
+    time: &[f64],
+    torque: &[f64],
+    angle: &[f64],
+    changed: f64,
+) -> Result<(Option<f64>, usize)> {
+    let residual = residual(model, learned, torque, angle)?;
+    let per_block = (learned.block / STEP).round().max(1.0) as usize;
+    let values = 2.0 * 3600.0 / learned.block / ALARMS;
+    let mut charts = [Chart::new(1.0, values)?, Chart::new(1.0, values)?];
+    let (mut delay, mut count) = (None, 0);
+    for (k, block) in residual.chunks_exact(per_block).enumerate() {
+        let mean = block.iter().sum::<f64>() / per_block as f64;
+        let scatter = (block.iter().map(|r| (r - mean).powi(2)).sum::<f64>() / per_block as f64).ln();
+        let alarms = [charts[0].push(mean), charts[1].push(scatter)];
+        if alarms.iter().all(Option::is_none) {
+            continue;
+        }
+        charts.iter_mut().for_each(Chart::restart);
+        let t = time[(k + 1) * per_block - 1];
+        if t >= changed {
+            delay.get_or_insert(t - changed);
+        } else if t > Options::default().learn {
+            count += 1;
+        }
+    }
+    Ok((delay, count))
+}
+
+/// Runs the cases whose names contain `only`.
+///
+/// # Errors
+/// A machine that cannot be watched.
+pub(crate) fn run(first: u64, count: Option<usize>, only: Option<&str>) -> Result<Vec<Outcome>> {
+    let seeds: Vec<u64> = (first..first + count.unwrap_or(SEEDS) as u64).collect();
+    let chosen: Vec<&Case> = CASES.iter().filter(|c| only.is_none_or(|o| c.name.contains(o))).collect();
+    anyhow::ensure!(!chosen.is_empty(), "no case of --watch has that in its name");
+    chosen
+        .iter()
+        .map(|case| {
+            let trials: Vec<Trial> =
+                seeds.par_iter().map(|seed| trial(case, *seed)).collect::<Result<_>>()?;
+            Ok(outcome(case, &trials))
+        })
+        .collect()
+}
+
+/// Median of the delays, those without an alarm counted as the longest.
+fn median(delays: impl Iterator<Item = Option<f64>>) -> f64 {
+    let mut all: Vec<f64> = delays.map(|d| d.unwrap_or(f64::INFINITY)).collect();
+    all.sort_by(f64::total_cmp);
+    all[all.len() / 2]
+}
+
+fn seconds(delay: f64) -> String {
+    if delay.is_finite() { format!("{delay:.1} s") } else { "not seen".to_string() }
+}
+
+fn outcome(case: &Case, trials: &[Trial]) -> Outcome {
+    let n = trials.len();
+    let hours: f64 = trials.iter().map(|t| t.false_alarms.1).sum();
+    let alarms: usize = trials.iter().map(|t| t.false_alarms.0).sum();
+    let rival: usize = trials.iter().map(|t| t.rival.1).sum();
+    let share = |is: &dyn Fn(&Trial) -> bool| trials.iter().filter(|t| is(t)).count();
+    // Poisson, three standard deviations, of the alarms that are asked for.
+    let most = ALARMS * hours + 3.0 * (ALARMS * hours).sqrt();
+    let mut figures = Vec::new();
+    if !case.right.is_empty() {
+        let seen = share(&|t| t.delay.is_some());
+        let settled = share(&|t| t.settled == Some(true));
+        figures.push(Figure::judged(
+            "seen",
+            format!("{seen} of {n}"),
+            "≥ 95 %",
+            seen as f64 >= 0.95 * n as f64,
+        ));
+        figures.push(Figure::plain("median delay", seconds(median(trials.iter().map(|t| t.delay)))));
+        let (alone, among) = (share(&|t| t.named.0), share(&|t| t.named.1));
+        figures.push(Figure::plain("named at the alarm", format!("first {alone}, among {among} of {n}")));
+        figures.push(Figure::judged(
+            "named when settled",
+            format!("{settled} of {n}"),
+            "≥ 90 %",
+            settled as f64 >= 0.9 * n as f64,
+        ));
+        let delays = trials.iter().map(|t| t.rival.0);
+        let rival_seen = share(&|t| t.rival.0.is_some());
+        figures.push(Figure::plain(
+            "charts on the residual",
+            format!("{rival_seen} of {n}, {}", seconds(median(delays))),
+        ));
+    }
+    // (Before a change the machines are those to which nothing happens.)
+    if case.right.is_empty() {
+        figures.push(Figure::judged(
+            "false alarms",
+            format!("{:.2} an hour ({alarms} in {hours:.1} h)", alarms as f64 / hours),
+            format!("≤ {ALARMS} an hour"),
+            alarms as f64 <= most,
+        ));
+        figures.push(Figure::plain(
+            "false alarms of charts on the residual",
+            format!("{:.2} an hour", rival as f64 / hours),
+        ));
+    }
+    Outcome { case: case.name.to_string(), figures }
+}
+
+/// The table of the book.
+///
+/// # Errors
+/// Where a case was left out, or the page cannot be written.
+pub(crate) fn write(root: &Path, outcomes: &[Outcome]) -> Result<()> {
+    anyhow::ensure!(outcomes.len() == CASES.len(), "the table in the book has all cases");
+    let mut text = "| what changed | seen | median delay | named at the alarm | named when settled | false alarms an hour | charts on the residual: seen, median delay | their false alarms an hour |\n| --- | --- | --- | --- | --- | --- | --- | --- |\n".to_string();
+    for outcome in outcomes {
+        let of =
+            |name: &str| outcome.figures.iter().find(|f| f.name == name).map_or("", |f| f.measured.as_str());
+        let hourly = |name: &str| of(name).split(" an hour").next().unwrap_or_default().to_string();
+        text += &format!(
+            "| {} | {} | {} | {} | {} | {} | {} | {} |\n",
+            outcome.case,
+            of("seen"),
+            of("median delay"),
+            of("named at the alarm"),
+            of("named when settled"),
+            hourly("false alarms"),
+            of("charts on the residual"),
+            hourly("false alarms of charts on the residual")
+        );
+    }
+    book::put_table(root, PAGE, BEGIN, &text)
+}
+
+/// Writes the recordings of all cases with the residual of the calibrated model, for other detectors: `NUMBER-SEED.csv`.
+///
+/// # Errors
+/// A machine that cannot be watched, or a folder that cannot be written.
+pub(crate) fn keep(folder: &Path, first: u64, count: Option<usize>) -> Result<()> {
+    std::fs::create_dir_all(folder).with_context(|| format!("{} cannot be made", folder.display()))?;
+    let model = Model::from_toml(MODEL, "throttle.toml").context("the throttle's model")?;
+    let options = Options::default();
+    for (number, case) in CASES.iter().enumerate() {
+        for seed in first..first + count.unwrap_or(SEEDS) as u64 {
+            let [time, torque, angle] = record(case, seed);
+            let n = time.iter().take_while(|t| **t < options.learn).count();
+            let column = |name: &str, values: &[f64]| Channel {
+                name: name.into(),
+                unit: None,
+                values: values[..n].to_vec(),
+            };
+            let channels = vec![column("torque", &torque), column("angle", &angle)];
+            let first = Recording::from_columns("first", time[..n].to_vec(), channels)?;
+            let (_, Event::Learned(learned)) = Watch::learn(&model, &first, &options)? else { continue };
+            let residual = residual(&model, &learned, &torque, &angle)?;
+            let columns = [
+                ("torque [N*m]", &torque[..]),
+                ("angle [rad]", &angle[..]),
+                ("residual [rad]", &residual[..]),
+            ];
+            write_csv_file(folder.join(format!("{number}-{seed}.csv")), &time, &columns)?;
+        }
+    }
+    Ok(())
+}
