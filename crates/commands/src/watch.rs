@@ -380,11 +380,13 @@ fn in_words(event: &Event) -> Option<String> {
         }
         Event::Settled(change) => {
             let (name, since) = (subject(&change.subject), at(change.since));
+            let said = if change.or.is_empty() { "it was" } else { "most likely it was" };
             let _ = writeln!(
                 text,
-                "{}: it was {name}, since {since}: {}; usual from now on",
+                "{}: {said} {name}, since {since}: {}{}; usual from now on",
                 at(change.t),
-                extent(change)
+                extent(change),
+                others(change)
             );
         }
         Event::Irregular(irregular) => {
@@ -431,8 +433,13 @@ fn changed(change: &Change) -> String {
     if change.or.is_empty() {
         return format!("{name} has changed since {since}: {extent}");
     }
-    let others = change.or.iter().map(subject).collect::<Vec<_>>().join(", ");
-    format!("something has changed since {since}, most likely {name}: {extent}; or {others}")
+    format!("something has changed since {since}, most likely {name}: {extent}{}", others(change))
+}
+
+/// What the samples do not tell from the subject.
+fn others(change: &Change) -> String {
+    let others: Vec<String> = change.or.iter().map(subject).collect();
+    if others.is_empty() { String::new() } else { format!("; or {}", others.join(", ")) }
 }
 
 fn irregularities(i: &Irregular) -> String {

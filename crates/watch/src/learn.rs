@@ -11,12 +11,10 @@ use serde::{Deserialize, Serialize};
 
 use crate::error::WatchError;
 use crate::machine::Machine;
-use crate::options::{BLOCKS, Options};
+use crate::options::{BLOCK_SAMPLES, BLOCKS, Options};
 
 /// Steps of the fit.
 const ITERATIONS: usize = 60;
-/// Fewest samples of a block.
-const LEAST_SAMPLES: usize = 4;
 /// Standard deviation of a parameter of which nothing is known beforehand, over what the first seconds tell of it.
 const WIDE: f64 = 100.0;
 
@@ -111,7 +109,7 @@ pub(crate) struct First {
 pub(crate) fn learn(model: &Model, recording: &Recording, options: &Options) -> Result<First, WatchError> {
     let data = Arc::new(Data::new(model, std::slice::from_ref(recording))?);
     let longest = data.pieces.iter().map(|p| p.len).max().unwrap_or(0);
-    let needed = BLOCKS * LEAST_SAMPLES;
+    let needed = BLOCKS.0 * BLOCK_SAMPLES;
     if longest < needed {
         return Err(WatchError::TooShort { seconds: options.learn, samples: longest, needed });
     }

@@ -68,9 +68,26 @@ pub(crate) fn rivals(explanations: &[Explanation], usual: f64) -> impl Iterator<
     explanations.iter().skip(1).filter(move |e| e.gain > least).map(|e| e.effect)
 }
 
+/// The largest of some gains (twice the logarithm of a likelihood ratio), and those whose likelihood is a twentieth of its or
+/// more, the larger first.
+pub(crate) fn likeliest(gains: &[f64]) -> (usize, Vec<usize>) {
+    let mut order: Vec<usize> = (0..gains.len()).collect();
+    order.sort_by(|a, b| gains[*b].total_cmp(&gains[*a]));
+    let Some((most, others)) = order.split_first() else { return (0, Vec::new()) };
+    let least = gains[*most] - 2.0 * ODDS.ln();
+    (*most, others.iter().copied().filter(|k| gains[*k] > least).collect())
+}
+
 #[cfg(test)]
 mod tests {
     use super::*;
+
+    #[test]
+    fn what_the_data_do_not_tell_apart_is_listed() {
+        assert_eq!(likeliest(&[1.0, 40.0, 9.0]), (1, vec![]));
+        assert_eq!(likeliest(&[1.0, 4.0, 5.0]), (2, vec![1, 0]));
+        assert_eq!(likeliest(&[]), (0, vec![]));
+    }
 
     /// Blocks of information 4 (effect 0) and 1 (effect 1), which are correlated by 0.8; δ₀ = 3 since the last two.
     #[test]

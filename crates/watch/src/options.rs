@@ -2,8 +2,10 @@
 
 use crate::error::WatchError;
 
-/// Blocks into which the learned seconds are cut at first.
-pub(crate) const BLOCKS: usize = 50;
+/// Blocks into which the learned seconds are cut at first: as many as leave eight samples in each, within these bounds.
+pub(crate) const BLOCKS: (usize, usize) = (25, 200);
+/// Samples of such a block.
+pub(crate) const BLOCK_SAMPLES: usize = 8;
 
 /// What is asked of a watch.
 #[derive(Debug, Clone, Copy, PartialEq)]

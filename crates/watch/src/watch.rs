@@ -10,8 +10,8 @@ use crate::error::WatchError;
 use crate::event::{Change, Clock, Estimates, Event, Irregular, Learned, Parameter, Subject};
 use crate::learn::{First, Sample, Usual, learn};
 use crate::machine::Machine;
-use crate::naming::{Explanation, dispersion, explanations, rivals};
-use crate::options::{BLOCKS, Options};
+use crate::naming::{Explanation, dispersion, explanations, likeliest, rivals};
+use crate::options::{BLOCK_SAMPLES, BLOCKS, Options};
 use crate::tracker::{Conditions, Effects, Tracker};
 
 /// The change that a chart is quickest for, in standard deviations of one block.
@@ -20,6 +20,8 @@ const CHANGE: f64 = 1.0;
 const FEWEST: usize = 12;
 /// Blocks that are remembered to tell how large a change is.
 const REMEMBERED: usize = 512;
+/// Share of the memory after which a change is known so well that its linearisation is good.
+const COARSE: f64 = 0.1;
 /// Most blocks that irregularities wait until they are told.
 const MOST_WAIT: u32 = 256;
 
@@ -73,6 +75,8 @@ pub struct Saved {
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 struct Settling {
     until: f64,
+    /// When the fit begins once more, at parameters that are near by then: rows from before are of another linearisation.
+    again: Option<f64>,
     /// The channel whose scatter it is; else a parameter, a force or an offset.
     noise: Option<usize>,
     since: f64,
@@ -291,7 +295,12 @@ impl Watch {
             Some(change) if ended.t >= change.until => {
                 events.push(Event::Settled(self.settle(ended, &change)))
             }
-            Some(change) => self.now.settling = Some(change),
+            Some(mut change) => {
+                if change.again.take_if(|again| ended.t >= *again).is_some() {
+                    self.now.fit.restart();
+                }
+                self.now.settling = Some(change);
+            }
             None => events.extend(self.alarm(ended).map(Event::Changed)),
         }
     }
@@ -307,6 +316,7 @@ impl Watch {
         let noise = loudest.checked_sub(effects);
         let mut change = Settling {
             until: ended.t + now.memory,
+            again: noise.is_none().then_some(ended.t + COARSE * now.memory),
             noise,
             since: ended.t - alarm.since as f64 * now.block_seconds,
             means,
@@ -381,7 +391,8 @@ impl Watch {
         }
     }
 
-    /// The parameter that the followed model has moved the most, in its standard deviations.
+    /// The parameter that the followed model has moved the most, in its standard deviations, and those beside it whose
+    /// likelihood is a twentieth of its or more.
     fn followed(&self, ended: &Ended) -> Change {
         let now = &self.now;
         let deviations = now.fit.deviations();
@@ -389,18 +400,14 @@ impl Watch {
             let index = now.usual.free[k].index;
             now.values[index] - now.usual.values[index]
         };
-        let most = (0..deviations.len())
-            .max_by(|a, b| {
-                let size = |k: usize| (moved(k) / deviations[k]).abs();
-                size(*a).total_cmp(&size(*b))
-            })
-            .unwrap_or(0);
+        let gains: Vec<f64> = (0..deviations.len()).map(|k| (moved(k) / deviations[k]).powi(2)).collect();
+        let (most, rivals) = likeliest(&gains);
         let index = now.usual.free[most].index;
         let unit = self.machine.model.parameters[index].unit.as_ref();
         Change {
             t: ended.t,
             subject: self.subject(most),
-            or: Vec::new(),
+            or: rivals.into_iter().map(|k| self.subject(k)).collect(),
             direction: if moved(most) > 0.0 { Direction::Up } else { Direction::Down },
             since: ended.t,
             before: reported(unit, now.usual.values[index]),
@@ -525,7 +532,8 @@ fn first_pass(first: &First, options: &Options) -> Result<FirstPass, WatchError>
     let effects = tracker.count(machine);
     let by = Conditions { machine, usual, values: &usual.values, memory: options.memory };
     let seconds = samples[samples.len() - 1].t - samples[0].t;
-    let short = (seconds / BLOCKS as f64).max(usual.dt);
+    let count = (samples.len() / BLOCK_SAMPLES).clamp(BLOCKS.0, BLOCKS.1);
+    let short = (seconds / count as f64).max(usual.dt);
     let mut block = Block::new(effects, machine.system.ny);
     let (mut blocks, mut began) = (Vec::new(), samples[0].t);
     let nx = machine.system.nx;
