@@ -33,7 +33,7 @@ const MOST_WAIT: u32 = 256;
 /// ```
 ///
 /// zᵢ is the score of the change i alone (M. Basseville, I. Nikiforov, *Detection of Abrupt Changes*, 1993, ch. 8: the local
-/// approach). What a wrong model leaves in the scores at all times is part of what the self-starting charts learn as usual.
+/// approach). What a wrong model leaves in the scores at all times is part of what the charts, which compare ranks, take as usual.
 /// Where a chart exceeds its limit, the change is named that explains the blocks since its onset best; after one memory,
 /// the parameter that the followed model has moved most.
 #[derive(Debug, Clone)]
