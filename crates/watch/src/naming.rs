@@ -63,7 +63,7 @@ pub(crate) fn dispersion(best: &Explanation, usual: f64) -> f64 {
 }
 
 /// The effects that the blocks do not tell from the best one: whose likelihood is a twentieth of its or more.
-pub(crate) fn rivals(explanations: &[Explanation], usual: f64) -> impl Iterator<Item = usize> {
+pub(crate) fn alternatives(explanations: &[Explanation], usual: f64) -> impl Iterator<Item = usize> {
     let least = explanations.first().map_or(0.0, |e| e.gain - 2.0 * ODDS.ln() * dispersion(e, usual));
     explanations.iter().skip(1).filter(move |e| e.gain > least).map(|e| e.effect)
 }
@@ -106,8 +106,8 @@ mod tests {
         assert!((all[0].std - 1.0 / 8f64.sqrt()).abs() < 1e-12 && (all[0].gain - 72.0).abs() < 1e-9);
         assert!((all[0].left - 1.0).abs() < 1e-12 && all[1].effect == 1);
         // Gains of 72 and 46: told apart where innovations are white, not where they scatter five times as much.
-        assert_eq!(rivals(&all, 1.0).count(), 0);
-        assert_eq!(rivals(&all, 5.0).collect::<Vec<_>>(), [1]);
+        assert_eq!(alternatives(&all, 1.0).count(), 0);
+        assert_eq!(alternatives(&all, 5.0).collect::<Vec<_>>(), [1]);
         // A mean that is always there is no change.
         let means = [6.0, 4.8];
         assert!(explanations(&history[2..], &means, 2).iter().all(|e| e.gain < 1e-12));

@@ -10,7 +10,7 @@ use crate::error::WatchError;
 use crate::event::{Change, Clock, Estimates, Event, Irregular, Learned, Parameter, Subject};
 use crate::learn::{First, Sample, Usual, learn};
 use crate::machine::Machine;
-use crate::naming::{Explanation, dispersion, explanations, likeliest, rivals};
+use crate::naming::{Explanation, alternatives, dispersion, explanations, likeliest};
 use crate::options::{BLOCK_SAMPLES, BLOCKS, Options};
 use crate::tracker::{Conditions, Effects, Tracker};
 
@@ -381,7 +381,7 @@ impl Watch {
         Change {
             t: ended.t,
             subject: self.subject(best.effect),
-            or: rivals(explanations, self.now.inflation).map(|e| self.subject(e)).collect(),
+            or: alternatives(explanations, self.now.inflation).map(|e| self.subject(e)).collect(),
             direction: if best.step > 0.0 { Direction::Up } else { Direction::Down },
             since: ended.t - best.blocks as f64 * self.now.block_seconds,
             before: reported(unit.as_ref(), before),
@@ -401,13 +401,13 @@ impl Watch {
             now.values[index] - now.usual.values[index]
         };
         let gains: Vec<f64> = (0..deviations.len()).map(|k| (moved(k) / deviations[k]).powi(2)).collect();
-        let (most, rivals) = likeliest(&gains);
+        let (most, alternatives) = likeliest(&gains);
         let index = now.usual.free[most].index;
         let unit = self.machine.model.parameters[index].unit.as_ref();
         Change {
             t: ended.t,
             subject: self.subject(most),
-            or: rivals.into_iter().map(|k| self.subject(k)).collect(),
+            or: alternatives.into_iter().map(|k| self.subject(k)).collect(),
             direction: if moved(most) > 0.0 { Direction::Up } else { Direction::Down },
             since: ended.t,
             before: reported(unit, now.usual.values[index]),

@@ -212,7 +212,7 @@ struct Trial {
     /// False alarms and hours.
     false_alarms: (usize, f64),
     /// Delay and false alarms of charts on the residual.
-    rival: (Option<f64>, usize),
+    residual: (Option<f64>, usize),
 }
 
 fn trial(case: &Case, seed: u64) -> Result<Trial> {
@@ -246,7 +246,7 @@ fn trial(case: &Case, seed: u64) -> Result<Trial> {
         settled: None,
         wrong: false,
         false_alarms: (0, (changed.min(SOUND) - options.learn) / 3600.0),
-        rival: (None, 0),
+        residual: (None, 0),
     };
     for event in &events {
         match event {
@@ -266,7 +266,7 @@ fn trial(case: &Case, seed: u64) -> Result<Trial> {
             _ => {}
         }
     }
-    trial.rival = rival(&model, &learned, &time, &torque, &angle, changed)?;
+    trial.residual = on_residual(&model, &learned, &time, &torque, &angle, changed)?;
     Ok(trial)
 }
 
@@ -302,7 +302,7 @@ fn residual(model: &Model, learned: &Learned, torque: &[f64], angle: &[f64]) -> 
 }
 
 /// Charts of mean and scatter of the residual, at the same rate of false alarms: delay, and false alarms before the change.
-fn rival(
+fn on_residual(
     model: &Model,
     learned: &Learned,
     time: &[f64],
@@ -366,7 +366,7 @@ fn outcome(case: &Case, trials: &[Trial]) -> Outcome {
     let n = trials.len();
     let hours: f64 = trials.iter().map(|t| t.false_alarms.1).sum();
     let alarms: usize = trials.iter().map(|t| t.false_alarms.0).sum();
-    let rival: usize = trials.iter().map(|t| t.rival.1).sum();
+    let residual: usize = trials.iter().map(|t| t.residual.1).sum();
     let share = |is: &dyn Fn(&Trial) -> bool| trials.iter().filter(|t| is(t)).count();
     // Poisson, three standard deviations, of the alarms that are asked for.
     let most = ALARMS * hours + 3.0 * (ALARMS * hours).sqrt();
@@ -389,11 +389,11 @@ fn outcome(case: &Case, trials: &[Trial]) -> Outcome {
             "≥ 90 %",
             settled as f64 >= 0.9 * n as f64,
         ));
-        let delays = trials.iter().map(|t| t.rival.0);
-        let rival_seen = share(&|t| t.rival.0.is_some());
+        let delays = trials.iter().map(|t| t.residual.0);
+        let residual_seen = share(&|t| t.residual.0.is_some());
         figures.push(Figure::plain(
             "charts on the residual",
-            format!("{rival_seen} of {n}, {}", seconds(median(delays))),
+            format!("{residual_seen} of {n}, {}", seconds(median(delays))),
         ));
     }
     // (Before a change the machines are those to which nothing happens.)
@@ -406,7 +406,7 @@ fn outcome(case: &Case, trials: &[Trial]) -> Outcome {
         ));
         figures.push(Figure::plain(
             "false alarms of charts on the residual",
-            format!("{:.2} an hour", rival as f64 / hours),
+            format!("{:.2} an hour", residual as f64 / hours),
         ));
     }
     Outcome { case: case.name.to_string(), figures }
