@@ -177,6 +177,15 @@ impl Chart {
         self.limit
     }
 
+    /// Whether its parts agree: a chart that was restored from data may be anything.
+    pub fn is_consistent(&self) -> bool {
+        self.limit > 0.0
+            && self.reference > 0.0
+            && self.values.len() <= MOST
+            && self.recent.len() <= RECENT
+            && self.oldest <= self.values.len().saturating_sub(1)
+    }
+
     /// Values that are remembered.
     pub fn count(&self) -> usize {
         self.values.len()

@@ -118,6 +118,18 @@ impl Filter {
         })
     }
 
+    /// States and parameters, where the sizes of all parts agree: a filter that was restored from data may be anything.
+    pub fn shape(&self) -> Option<(usize, usize)> {
+        let (n, p) = (self.n, self.p);
+        let square = n.checked_mul(n)?;
+        let wide = n.checked_mul(p)?;
+        let agree = [&self.state, &self.row, &self.gain].iter().all(|v| v.len() == n)
+            && [&self.root, &self.next].iter().all(|v| v.len() == square)
+            && [&self.sensitivity, &self.wide].iter().all(|v| v.len() == wide)
+            && self.psi.len() == p;
+        agree.then_some((n, p))
+    }
+
     /// The state x̂.
     pub fn state(&self) -> &[f64] {
         &self.state

@@ -86,6 +86,13 @@ impl LeastSquares {
         self.n
     }
 
+    /// Whether the sizes of all parts agree: an estimator that was restored from data may be anything.
+    pub fn is_consistent(&self) -> bool {
+        let width = self.n.checked_add(1);
+        let size = width.and_then(|w| w.checked_mul(self.n));
+        size == Some(self.factor.len()) && self.prior.len() == self.n && width == Some(self.row.len())
+    }
+
     /// Whether there is nothing to estimate.
     pub fn is_empty(&self) -> bool {
         self.n == 0

@@ -61,6 +61,13 @@ impl Block {
         Block { effects, rows: vec![Vec::new(); channels] }
     }
 
+    /// Whether it is one of so many effects and channels.
+    pub(crate) fn is_consistent(&self, effects: usize, channels: usize) -> bool {
+        self.effects == effects
+            && self.rows.len() == channels
+            && self.rows.iter().all(|r| r.len().is_multiple_of(effects + 1))
+    }
+
     pub(crate) fn push(&mut self, channel: usize, innovation: &Innovation<'_>) {
         let rows = &mut self.rows[channel];
         rows.extend_from_slice(innovation.row);

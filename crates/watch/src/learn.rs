@@ -64,6 +64,13 @@ impl Steps {
         }
     }
 
+    /// Steps from sample to sample.
+    pub(crate) fn count(self) -> usize {
+        match self {
+            Steps::Rk4(n) | Steps::Dp5(n) | Steps::Dop853(n) => n,
+        }
+    }
+
     pub(crate) fn method(self) -> Method {
         match self {
             Steps::Rk4(substeps) => Method::Rk4 { substeps },

@@ -41,6 +41,11 @@ impl Tracker {
         Ok(Tracker { filter: Filter::new(state, deviation, count(machine, effects))?, effects })
     }
 
+    /// States and effects, where the sizes of all parts agree.
+    pub(crate) fn shape(&self) -> Option<(usize, usize, Effects)> {
+        self.filter.shape().map(|(n, p)| (n, p, self.effects))
+    }
+
     /// The state begins anew with this mean and these standard deviations.
     pub(crate) fn restart(&mut self, (mean, deviation): (&[f64], &[f64])) {
         self.filter.restart(mean, deviation);

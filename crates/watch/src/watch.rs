@@ -164,6 +164,9 @@ impl Watch {
         if let Some(f) = saved.usual.free.iter().find(|f| model.parameter(&f.name) != Some(f.index)) {
             return other(format!("the model has no parameter `{}` in that place", f.name));
         }
+        if !saved.is_consistent(&system) {
+            return other("its parts do not fit together".to_owned());
+        }
         let free = saved.usual.free.iter().map(|f| f.index).collect();
         let machine = Machine::new(model.clone(), system.into(), saved.usual.steps.method(), free);
         Ok(Watch { machine, now: saved })
@@ -247,6 +250,11 @@ impl Watch {
         });
         if !kept || !kept_up {
             now.irregular.diverged += 1;
+            if !kept_up {
+                // Parameters with which the model cannot be simulated are none to go on from.
+                now.values.clone_from(&now.usual.values);
+                now.fit.restart();
+            }
             self.begin_anew(sample);
             return None;
         }
@@ -488,6 +496,33 @@ impl Watch {
                 .map(|(m, rms)| (m.channel.clone(), rms))
                 .collect(),
         }
+    }
+}
+
+impl Saved {
+    /// Whether its parts have the sizes that they have of each other: it may have been written by anybody.
+    fn is_consistent(&self, system: &System) -> bool {
+        let (np, nx, ny) = (self.usual.free.len(), system.nx, system.ny);
+        let effects = np + system.nz + ny;
+        let scores = |s: &Scores| s.gradient.len() == effects && s.information.len() == effects;
+        let settles =
+            |s: &Settling| s.means.len() == effects + ny && s.noise.is_none_or(|channel| channel < ny);
+        let times = [self.block_seconds, self.memory, self.usual.dt, self.inflation, self.alarms_per_day];
+        times.iter().all(|v| *v > 0.0)
+            && self.values.len() == system.np
+            && self.usual.rates.iter().all(|r| r.entry < nx)
+            && self.usual.steps.count() > 0
+            && self.rest.1.len() == nx
+            && self.last.measured.len() == ny
+            && self.keeping.shape() == Some((nx, effects, Effects::Everything))
+            && self.following.shape() == Some((nx, np, Effects::Parameters))
+            && self.fit.len() == np
+            && self.fit.is_consistent()
+            && self.charts.len() == effects + ny
+            && self.charts.iter().all(Chart::is_consistent)
+            && self.block.is_consistent(effects, ny)
+            && self.history.iter().all(scores)
+            && self.settling.as_ref().is_none_or(settles)
     }
 }
 

@@ -248,6 +248,20 @@ fn a_saved_watch_goes_on_as_if_nothing_had_been() {
     assert_eq!(whole, parts);
 }
 
+/// Paths of all arrays that are not empty.
+fn arrays(value: &serde_json::Value, path: &str) -> Vec<String> {
+    let inner: Vec<(String, &serde_json::Value)> = match value {
+        serde_json::Value::Array(a) => a.iter().enumerate().map(|(k, v)| (k.to_string(), v)).collect(),
+        serde_json::Value::Object(o) => o.iter().map(|(k, v)| (k.clone(), v)).collect(),
+        _ => Vec::new(),
+    };
+    let own = value.as_array().filter(|a| !a.is_empty()).map(|_| path.to_owned());
+    // (Of arrays of arrays the first two are enough.)
+    let most = if value.is_array() { 2 } else { usize::MAX };
+    let below = inner.iter().take(most).flat_map(|(k, v)| arrays(v, &format!("{path}/{k}")));
+    own.into_iter().chain(below).collect()
+}
+
 #[test]
 fn what_cannot_be_watched_is_refused() {
     let samples = run(SOUND, 70.0, 6);
@@ -273,6 +287,20 @@ fn what_cannot_be_watched_is_refused() {
     assert!(matches!(refused(MODEL, &recording, never), WatchError::Option { .. }));
 
     let (watch, _) = learned(&samples, &usual);
+    // States that somebody has tampered with: every array of the file cut by one entry, one after the other.
+    let text = serde_json::to_value(watch.saved()).unwrap();
+    let mut refused = 0;
+    for path in arrays(&text, "") {
+        let mut cut = text.clone();
+        cut.pointer_mut(&path).unwrap().as_array_mut().unwrap().pop();
+        if let Ok(saved) = serde_json::from_value(cut) {
+            match Watch::restore(&model(), saved) {
+                Ok(mut watch) => drop(push(&mut watch, &samples[3000..3500])),
+                Err(_) => refused += 1,
+            }
+        }
+    }
+    assert!(refused > 15, "{refused}");
     let other = Model::from_toml(&MODEL.replace("b =", "c =").replace("b*", "c*"), "other.toml").unwrap();
     let error = Watch::restore(&other, watch.saved().clone()).map(|_| ()).unwrap_err();
     assert!(error.to_string().contains("no parameter `b`"), "{error}");

@@ -256,12 +256,12 @@ fn trial(case: &Case, seed: u64) -> Result<Trial> {
                 let first = is_right(&change.subject);
                 trial.named = (first, first || change.or.iter().any(is_right));
             }
-            Event::Settled(change) if change.t >= changed && trial.delay.is_some() => {
-                if trial.settled.is_none() {
-                    let right = is_right(&change.subject);
-                    trial.settled = Some(right);
-                    trial.wrong = !right && !change.or.iter().any(is_right);
-                }
+            Event::Settled(change)
+                if change.t >= changed && trial.delay.is_some() && trial.settled.is_none() =>
+            {
+                let right = is_right(&change.subject);
+                trial.settled = Some(right);
+                trial.wrong = !right && !change.or.iter().any(is_right);
             }
             _ => {}
         }
@@ -420,8 +420,9 @@ pub(crate) fn write(root: &Path, outcomes: &[Outcome]) -> Result<()> {
     anyhow::ensure!(outcomes.len() == CASES.len(), "the table in the book has all cases");
     let mut text = "| what changed | seen | median delay | named at the alarm | named when settled | false alarms an hour | charts on the residual: seen, median delay | their false alarms an hour |\n| --- | --- | --- | --- | --- | --- | --- | --- |\n".to_string();
     for outcome in outcomes {
-        let of =
-            |name: &str| outcome.figures.iter().find(|f| f.name == name).map_or("", |f| f.measured.as_str());
+        let of = |name: &str| {
+            outcome.figures.iter().find(|f| f.name == name).map_or("–", |f| f.measured.as_str())
+        };
         let hourly = |name: &str| of(name).split(" an hour").next().unwrap_or_default().to_string();
         text += &format!(
             "| {} | {} | {} | {} | {} | {} | {} | {} |\n",
@@ -468,4 +469,30 @@ pub(crate) fn keep(folder: &Path, first: u64, count: Option<usize>) -> Result<()
         }
     }
     Ok(())
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn the_page_has_a_place_for_the_table() {
+        assert!(book::has_table(&greybox_dev::root(), PAGE, BEGIN));
+    }
+
+    /// The throttle's free motion from one push: it stops within a whole number of half periods, at rest between ±c/k.
+    #[test]
+    fn the_throttle_sticks_where_friction_holds_the_spring() {
+        let case = Case { name: "", usual: Now { noise: 0.0, ..USUAL }, at: |_| USUAL, right: &[] };
+        let [_, torque, angle] = record(&case, 1);
+        let mut held = 0;
+        for k in (29..50_000).step_by(30) {
+            // At rest at the end of a step of the torque: what is left of the push is within the friction.
+            if angle[k] == angle[k - 1] {
+                held += 1;
+                assert!((torque[k] - USUAL.spring * angle[k]).abs() <= USUAL.coulomb * 1.001);
+            }
+        }
+        assert!(held > 21, "{held}");
+    }
 }
