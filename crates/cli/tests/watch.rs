@@ -95,6 +95,26 @@ fn a_state_in_a_file_is_gone_on_from() {
     assert_eq!(bench.names(), ["state.json", "throttle.toml"]);
 }
 
+/// While it learns, a clock that jumps back begins anew, and one that jumps on leaves a gap.
+#[test]
+fn a_clock_that_jumps_in_the_first_seconds_is_reported() {
+    let bench = bench();
+    let samples = throttle::samples(100.0);
+    let mut lines: Vec<[f64; 3]> = samples[..500].iter().map(|[t, u, y]| [t + 1e6, *u, *y]).collect();
+    lines.extend(samples.iter().map(|[t, u, y]| [if *t < 30.0 { *t } else { t + 3600.0 }, *u, *y]));
+    let said = bench.greybox_fed(&["watch", "throttle.toml", "--json"], &throttle::csv(&lines));
+    assert_eq!(said.code, 0, "{}", said.stderr);
+    let events = events(&said.stdout);
+    assert_eq!((&events[0]["event"], &events[0]["t"]), (&"restarted".into(), &0.0.into()));
+    let learned = &events[1];
+    assert_eq!(learned["event"], "learned");
+    assert!((learned["t"].as_f64().unwrap() - 3660.0).abs() < 0.05, "{learned}");
+    let k = &learned["parameters"][2];
+    let (value, std) = (k["value"].as_f64().unwrap(), k["std"].as_f64().unwrap());
+    assert!((value - 0.8).abs() < 5.0 * std && std < 1e-3, "{k}");
+    assert!(of(&events, "changed").is_empty(), "{events:?}");
+}
+
 #[test]
 fn what_cannot_be_watched_is_refused() {
     let bench = bench();

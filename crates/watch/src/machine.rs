@@ -56,6 +56,17 @@ impl Machine {
         &self.seeds.parameters
     }
 
+    /// Inputs on the way from one sample to the next, where samples are missing between them; `share` of it is behind.
+    pub(crate) fn inputs_between(&self, from: &[f64], to: &[f64], share: f64) -> Vec<f64> {
+        let between = self.holds.iter().zip(from.iter().zip(to));
+        between
+            .map(|(hold, (a, b))| match hold {
+                Hold::Zero if share < 1.0 => *a,
+                _ => a + share * (b - a),
+            })
+            .collect()
+    }
+
     /// Goes from the state `x` over a span. `false` where the simulation leaves every bound.
     pub(crate) fn step(&self, parameters: &[f64], x: &[f64], span: &Span<'_>, out: &mut Step) -> bool {
         let inputs = self
@@ -103,5 +114,71 @@ impl Machine {
         [&out.state, &out.by_state, &out.by_parameters, &out.outputs]
             .iter()
             .all(|v| v.iter().all(|v| v.is_finite()))
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    const MODEL: &str = r#"
+[inputs]
+u = { unit = "N", hold = "zero" }
+w = { unit = "m" }
+[parameters]
+m = { value = 2.0, unit = "kg", fixed = true }
+c = { value = 0.6, unit = "N*s/m" }
+k = { value = 8.0, unit = "N/m" }
+[states]
+x = { unit = "m" }
+[equations]
+body = "m*x'' + c*x' + k*(x - w) = u"
+"#;
+
+    fn machine() -> Machine {
+        let model = Model::from_toml(MODEL, "body.toml").unwrap();
+        let system = Arc::new(System::compile(&model).unwrap());
+        Machine::new(model, system, Method::Rk4 { substeps: 2 }, vec![1, 2])
+    }
+
+    /// State and output after a step, and what differences say of their derivatives.
+    #[test]
+    fn the_derivatives_of_a_step_are_those_of_differences() {
+        let machine = machine();
+        let span = Span { from: 3.0, dt: 0.05, before: &[1.0, 0.2], after: &[-1.0, 0.3] };
+        let at = |p: [f64; 3], x: [f64; 2]| {
+            let mut step = Step::default();
+            assert!(machine.step(&p, &x, &span, &mut step));
+            step
+        };
+        let (p, x, h) = ([2.0, 0.6, 8.0], [0.4, -0.7], 1e-5);
+        let step = at(p, x);
+        for i in 0..2 {
+            for j in 0..2 {
+                let moved = |sign: f64| {
+                    let (mut q, mut y) = (p, x);
+                    q[j + 1] += sign * h;
+                    y[j] += sign * h;
+                    (at(q, x).state[i], at(p, y).state[i])
+                };
+                let ((high_p, high_x), (low_p, low_x)) = (moved(1.0), moved(-1.0));
+                let by_parameter = (high_p - low_p) / (2.0 * h);
+                let by_state = (high_x - low_x) / (2.0 * h);
+                assert!((step.by_parameters[i * 2 + j] - by_parameter).abs() < 1e-8);
+                assert!((step.by_state[i * 2 + j] - by_state).abs() < 1e-8);
+            }
+        }
+        assert_eq!(step.outputs, [step.state[0]]);
+        assert_eq!(
+            (&step.outputs_by_state[..], &step.outputs_by_parameters[..]),
+            (&[1.0, 0.0][..], &[0.0; 2][..])
+        );
+    }
+
+    #[test]
+    fn a_held_input_stays_where_samples_are_missing() {
+        let machine = machine();
+        assert_eq!(machine.inputs_between(&[1.0, 1.0], &[3.0, 3.0], 0.25), [1.0, 1.5]);
+        assert_eq!(machine.inputs_between(&[1.0, 1.0], &[3.0, 3.0], 1.0), [3.0, 3.0]);
     }
 }

@@ -76,9 +76,7 @@ impl Tracker {
         let mut wide = vec![0.0; nx * width];
         let mut before = from.inputs.clone();
         for k in 0..steps as usize {
-            let share = (k + 1) as f64 / steps;
-            let after: Vec<f64> =
-                from.inputs.iter().zip(&to.inputs).map(|(a, b)| a + share * (b - a)).collect();
+            let after = machine.inputs_between(&from.inputs, &to.inputs, (k + 1) as f64 / steps);
             let span = Span { from: from.t + dt * k as f64, dt, before: &before, after: &after };
             let mut noise = vec![0.0; nx];
             for rate in &usual.rates {

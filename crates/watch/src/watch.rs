@@ -130,7 +130,9 @@ impl Watch {
         };
         let mut watch = Watch { machine, now };
         for sample in samples.into_iter().skip(1) {
-            if let Some(ended) = watch.advance(sample) {
+            if sample.t - watch.now.last.t > block_seconds {
+                watch.begin_anew(sample);
+            } else if let Some(ended) = watch.advance(sample) {
                 // (What a chart takes for a change here is still part of what is usual.)
                 let values = ended.values();
                 watch.now.charts.iter_mut().zip(values).for_each(|(chart, v)| {
@@ -574,6 +576,12 @@ fn first_pass(first: &First, options: &Options) -> Result<FirstPass, WatchError>
     let nx = machine.system.nx;
     let (mut sum, mut squares, mut count) = (vec![0.0; nx], vec![0.0; nx], 0.0);
     for pair in samples.windows(2) {
+        if pair[1].t - pair[0].t > short {
+            tracker.restart((&start.0, &start.1));
+            block.clear();
+            began = pair[1].t;
+            continue;
+        }
         if !tracker.advance(&by, &pair[0], &pair[1], |c, i| block.push(c, &i)) {
             return Err(WatchError::Diverged);
         }
