@@ -2,6 +2,11 @@
 #![allow(missing_docs, clippy::unwrap_used)]
 
 use std::fmt::Write as _;
+use std::io::Write as _;
+use std::net::TcpListener;
+use std::process::{Child, Command, Stdio};
+use std::thread::sleep;
+use std::time::Duration;
 
 use common::Bench;
 use serde_json::Value;
@@ -113,6 +118,78 @@ fn a_clock_that_jumps_in_the_first_seconds_is_reported() {
     let (value, std) = (k["value"].as_f64().unwrap(), k["std"].as_f64().unwrap());
     assert!((value - 0.8).abs() < 5.0 * std && std < 1e-3, "{k}");
     assert!(of(&events, "changed").is_empty(), "{events:?}");
+}
+
+/// A process that ends with the test.
+struct Running(Child);
+
+impl Drop for Running {
+    fn drop(&mut self) {
+        let _ = self.0.kill();
+        let _ = self.0.wait();
+    }
+}
+
+/// A port that is free just now.
+fn free_port() -> u16 {
+    TcpListener::bind("127.0.0.1:0").unwrap().local_addr().unwrap().port()
+}
+
+/// As on the page: samples published to a real MQTT broker, `mosquitto_sub` piped into the command.
+#[test]
+fn a_broker_is_piped_into_it() {
+    let bench = bench();
+    let port = free_port();
+    // (No limit to what waits: this publisher is faster than any plant.)
+    bench.write(
+        "broker.conf",
+        &format!("listener {port} 127.0.0.1\nallow_anonymous true\nmax_queued_messages 0\n"),
+    );
+    let broker =
+        Command::new("mosquitto").arg("-c").arg(bench.path("broker.conf")).stderr(Stdio::null()).spawn();
+    let Ok(broker) = broker else {
+        eprintln!("skipped: mosquitto is not installed (Debian: mosquitto, mosquitto-clients)");
+        return;
+    };
+    let _broker = Running(broker);
+    let samples = throttle::samples(30.0);
+    let (port, count) = (port.to_string(), samples.len().to_string());
+    let client = |program: &str, more: &[&str]| {
+        let mut command = Command::new(program);
+        command.args(["-h", "127.0.0.1", "-p", &port, "-q", "1", "-t", "plant/throttle"]).args(more);
+        command
+    };
+    // Until the broker listens.
+    for _ in 0..100 {
+        if client("mosquitto_pub", &["-n"]).stderr(Stdio::null()).status().is_ok_and(|s| s.success()) {
+            break;
+        }
+        sleep(Duration::from_millis(50));
+    }
+    let mut subscriber =
+        Running(client("mosquitto_sub", &["-C", &count, "-W", "60"]).stdout(Stdio::piped()).spawn().unwrap());
+    let lines = subscriber.0.stdout.take().unwrap();
+    let watch = Command::new(env!("CARGO_BIN_EXE_greybox"))
+        .args(["watch", "throttle.toml", "--learn", "15", "--json"])
+        .current_dir(bench.path("."))
+        .stdin(lines)
+        .stdout(Stdio::piped())
+        .spawn()
+        .unwrap();
+    sleep(Duration::from_millis(500));
+    let mut publisher = Running(client("mosquitto_pub", &["-l"]).stdin(Stdio::piped()).spawn().unwrap());
+    let mut input = publisher.0.stdin.take().unwrap();
+    for [t, torque, angle] in &samples {
+        writeln!(input, r#"{{"t": {t}, "torque": {torque:.5}, "angle": {angle:.6}}}"#).unwrap();
+    }
+    drop(input);
+    let output = watch.wait_with_output().unwrap();
+    assert!(output.status.success());
+    let piped = String::from_utf8(output.stdout).unwrap();
+    let fed =
+        bench.greybox_fed(&["watch", "throttle.toml", "--learn", "15", "--json"], &throttle::csv(&samples));
+    assert_eq!(piped, fed.stdout);
+    assert_eq!(of(&events(&piped), "learned").len(), 1);
 }
 
 #[test]
