@@ -161,9 +161,9 @@ impl Chart {
         Ok(Chart {
             reference,
             limit: high,
-            values: Vec::new(),
+            values: Vec::with_capacity(MOST),
             oldest: 0,
-            recent: Vec::new(),
+            recent: Vec::with_capacity(RECENT + 1),
             before: 0.0,
             squares: 0.0,
             products: 0.0,
