@@ -155,3 +155,75 @@ pub(crate) fn together(blocks: &[Scores], fewest: usize) -> usize {
         count *= 2;
     }
 }
+
+/// A block that has ended.
+pub(crate) struct Ended {
+    pub(crate) t: f64,
+    pub(crate) scores: Scores,
+    /// Per channel.
+    pub(crate) scatter: Vec<f64>,
+    pub(crate) block: Block,
+}
+
+impl Ended {
+    /// The values of all charts.
+    pub(crate) fn values(&self) -> Vec<f64> {
+        let deviates = (0..self.scores.gradient.len()).map(|h| self.scores.deviate(h));
+        deviates.chain(self.scatter.iter().copied()).collect()
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    /// Noise of variance one from a small generator.
+    fn noise(seed: &mut u64) -> f64 {
+        let mut uniform = || {
+            *seed = seed.wrapping_mul(6_364_136_223_846_793_005).wrapping_add(1_442_695_040_888_963_407);
+            (*seed >> 33) as f64 / f64::from(1u32 << 31)
+        };
+        (0..12).map(|_| uniform()).sum::<f64>() - 6.0
+    }
+
+    fn scores(gradient: f64) -> Scores {
+        Scores { gradient: vec![gradient], information: vec![1.0], squares: 1.0, count: 1.0 }
+    }
+
+    #[test]
+    fn blocks_are_as_long_as_their_scores_are_correlated() {
+        let mut seed = 1;
+        let white: Vec<Scores> = (0..200).map(|_| scores(noise(&mut seed))).collect();
+        assert_eq!(together(&white, 12), 1);
+        let mut x = 0.0;
+        let slow: Vec<Scores> = (0..200)
+            .map(|_| {
+                x = 0.8 * x + noise(&mut seed);
+                scores(x)
+            })
+            .collect();
+        let count = together(&slow, 12);
+        assert!((4..=16).contains(&count), "{count}");
+        // Few are left: no longer ones, however correlated they are.
+        assert_eq!(together(&slow[..30], 16), 1);
+    }
+
+    /// Innovations that one effect of size 3 makes, on noise: the score, its size, and the scatter that is left.
+    #[test]
+    fn a_block_says_how_large_a_single_change_is() {
+        let mut seed = 2;
+        let mut block = Block::new(2, 1);
+        for k in 0..500 {
+            let row = [(0.1 * f64::from(k)).sin(), 1.0];
+            let value = 3.0 * row[0] + 0.5 * noise(&mut seed);
+            block.push(0, &Innovation { value, row: &row, deviation: 1.0 });
+        }
+        let scores = block.scores();
+        let (step, std) = scores.change(0);
+        assert!((step - 3.0).abs() < 4.0 * 0.5 * std, "{step} {std}");
+        assert!((scores.deviate(0) - step / std).abs() < 1e-9 && scores.count == 500.0);
+        let scatter = block.scatter(&scores)[0];
+        assert!((scatter - 0.25f64.ln()).abs() < 0.3, "{scatter}");
+        assert!((block.rms()[0] - (4.5f64 + 0.25).sqrt()).abs() < 0.1);
+    }
+}

@@ -3,14 +3,18 @@
 mod blocks;
 mod error;
 mod event;
+mod first_pass;
 mod learn;
 mod machine;
 mod naming;
 mod options;
+mod saved;
+mod telling;
 mod tracker;
 mod watch;
 
 pub use error::WatchError;
 pub use event::{Change, Clock, Estimates, Event, Irregular, Learned, Parameter, Subject};
 pub use options::Options;
-pub use watch::{Saved, Watch};
+pub use saved::Saved;
+pub use watch::Watch;

@@ -1,23 +1,22 @@
 //! The watch: two filters, one that keeps to what is usual and one that follows the machine, and the charts.
 
-use greybox_model::{Model, System, Unit};
+use greybox_model::{Model, System};
 use greybox_recording::Recording;
-use greybox_recursive::{Chart, Direction, LeastSquares};
-use serde::{Deserialize, Serialize};
+use greybox_recursive::{Chart, LeastSquares};
 
-use crate::blocks::{Block, Scores, together};
+use crate::blocks::{Block, Ended};
 use crate::error::WatchError;
-use crate::event::{Change, Clock, Estimates, Event, Irregular, Learned, Parameter, Subject};
-use crate::learn::{First, Sample, Usual, learn};
+use crate::event::{Change, Clock, Event, Irregular, Subject};
+use crate::first_pass::{FirstPass, first_pass};
+use crate::learn::{First, Sample, learn};
 use crate::machine::Machine;
-use crate::naming::{Explanation, alternatives, dispersion, explanations, likeliest};
-use crate::options::{BLOCK_SAMPLES, BLOCKS, Options};
+use crate::naming::explanations;
+use crate::options::Options;
+use crate::saved::{Saved, Settling, VERSION};
 use crate::tracker::{Conditions, Effects, Tracker};
 
 /// The change that a chart is quickest for, in standard deviations of one block.
 const CHANGE: f64 = 1.0;
-/// Fewest blocks that the learned seconds are left with.
-const FEWEST: usize = 12;
 /// Blocks that are remembered to tell how large a change is.
 const REMEMBERED: usize = 512;
 /// Share of the memory after which a change is known so well that its linearisation is good.
@@ -38,54 +37,9 @@ const MOST_WAIT: u32 = 256;
 /// the parameter that the followed model has moved most.
 #[derive(Debug, Clone)]
 pub struct Watch {
-    machine: Machine,
-    now: Saved,
+    pub(crate) machine: Machine,
+    pub(crate) now: Saved,
 }
-
-/// The state of a watch as data: what [`Watch::restore`] goes on from.
-#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
-pub struct Saved {
-    version: u32,
-    alarms_per_day: f64,
-    memory: f64,
-    /// Seconds of a block.
-    block_seconds: f64,
-    usual: Usual,
-    /// Mean and standard deviation of the state while it learned: where it begins anew.
-    rest: (Vec<f64>, Vec<f64>),
-    /// Variance of the scores over that of white innovations.
-    inflation: f64,
-    keeping: Tracker,
-    following: Tracker,
-    fit: LeastSquares,
-    /// Parameters of the followed model, SI.
-    values: Vec<f64>,
-    charts: Vec<Chart>,
-    block: Block,
-    began: f64,
-    history: Vec<Scores>,
-    last: Sample,
-    settling: Option<Settling>,
-    irregular: Irregular,
-    /// Blocks that irregularities wait until they are told, and the next wait: it doubles while they go on.
-    wait: (u32, u32),
-}
-
-/// A change that settles.
-#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
-struct Settling {
-    until: f64,
-    /// When the fit begins once more, at parameters that are near by then: rows from before are of another linearisation.
-    again: Option<f64>,
-    /// The channel whose scatter it is; else a parameter, a force or an offset.
-    noise: Option<usize>,
-    since: f64,
-    /// Means of all charts before.
-    means: Vec<f64>,
-}
-
-/// Version of [`Saved`].
-const VERSION: u32 = 1;
 
 impl Watch {
     /// Learns from the first seconds of a machine what is usual: parameters, noise, model error.
@@ -366,244 +320,4 @@ impl Watch {
         now.history.clear();
         told
     }
-
-    fn subject(&self, effect: usize) -> Subject {
-        let (model, free, nz) = (&self.machine.model, &self.now.usual.free, self.machine.system.nz);
-        match effect.checked_sub(free.len()) {
-            None => Subject::Parameter(free[effect].name.clone()),
-            Some(j) if j < nz => Subject::Force(model.states[j].name.clone()),
-            Some(j) => Subject::Offset(model.measurements[j - nz].channel.clone()),
-        }
-    }
-
-    /// The best explanation as a change.
-    fn told(&self, ended: &Ended, explanations: &[Explanation]) -> Change {
-        let (model, free, nz) = (&self.machine.model, &self.now.usual.free, self.machine.system.nz);
-        let best = explanations[0];
-        let (before, unit) = match best.effect.checked_sub(free.len()) {
-            None => {
-                let index = free[best.effect].index;
-                (self.now.usual.values[index], model.parameters[index].unit.clone())
-            }
-            Some(j) if j < nz => (0.0, None),
-            Some(j) => (0.0, Some(model.measurements[j - nz].unit.of_difference())),
-        };
-        Change {
-            t: ended.t,
-            subject: self.subject(best.effect),
-            or: alternatives(explanations, self.now.inflation).map(|e| self.subject(e)).collect(),
-            direction: if best.step > 0.0 { Direction::Up } else { Direction::Down },
-            since: ended.t - best.blocks as f64 * self.now.block_seconds,
-            before: reported(unit.as_ref(), before),
-            now: reported(unit.as_ref(), before + best.step),
-            std: difference(unit.as_ref(), best.std * dispersion(&best, self.now.inflation).sqrt()),
-            unit: unit.map(|u| u.text),
-        }
-    }
-
-    /// The parameter that the followed model has moved the most, in its standard deviations, and those beside it whose
-    /// likelihood is a twentieth of its or more.
-    fn followed(&self, ended: &Ended) -> Change {
-        let now = &self.now;
-        let deviations = now.fit.deviations();
-        let moved = |k: usize| {
-            let index = now.usual.free[k].index;
-            now.values[index] - now.usual.values[index]
-        };
-        let gains: Vec<f64> = (0..deviations.len()).map(|k| (moved(k) / deviations[k]).powi(2)).collect();
-        let (most, alternatives) = likeliest(&gains);
-        let index = now.usual.free[most].index;
-        let unit = self.machine.model.parameters[index].unit.as_ref();
-        Change {
-            t: ended.t,
-            subject: self.subject(most),
-            or: alternatives.into_iter().map(|k| self.subject(k)).collect(),
-            direction: if moved(most) > 0.0 { Direction::Up } else { Direction::Down },
-            since: ended.t,
-            before: reported(unit, now.usual.values[index]),
-            now: reported(unit, now.values[index]),
-            std: difference(unit, deviations[most]),
-            unit: unit.map(|u| u.text.clone()),
-        }
-    }
-
-    /// A channel that scatters more or less than it did, in standard deviations of before.
-    fn scatter_told(&self, ended: &Ended, change: &Settling, channel: usize) -> Change {
-        let mean = change.means[ended.scores.gradient.len() + channel];
-        let ratio = (0.5 * (ended.scatter[channel] - mean)).exp();
-        Change {
-            t: ended.t,
-            subject: Subject::Noise(self.machine.model.measurements[channel].channel.clone()),
-            or: Vec::new(),
-            direction: if ratio > 1.0 { Direction::Up } else { Direction::Down },
-            since: change.since,
-            before: 1.0,
-            now: ratio,
-            std: 0.0,
-            unit: None,
-        }
-    }
-
-    fn parameters(&self, deviations: &[f64]) -> Vec<Parameter> {
-        let free = self.now.usual.free.iter().zip(deviations);
-        free.map(|(f, std)| {
-            let unit = self.machine.model.parameters[f.index].unit.as_ref();
-            Parameter {
-                name: f.name.clone(),
-                value: reported(unit, self.now.values[f.index]),
-                std: difference(unit, *std),
-                unit: unit.map(|u| u.text.clone()),
-            }
-        })
-        .collect()
-    }
-
-    fn learned(&self) -> Learned {
-        Learned {
-            t: self.now.last.t,
-            rate: 1.0 / self.now.usual.dt,
-            block: self.now.block_seconds,
-            alarms_per_day: self.now.alarms_per_day,
-            charts: self.now.charts.len(),
-            parameters: self.parameters(&self.now.fit.deviations()),
-        }
-    }
-
-    fn estimates(&self, ended: &Ended) -> Estimates {
-        let (model, free) = (&self.machine.model, &self.now.usual.free);
-        let n = free.len();
-        let mut covariance = self.now.fit.covariance();
-        let deviations: Vec<f64> = (0..n).map(|k| covariance[k * n + k].sqrt()).collect();
-        let unit = |k: usize| model.parameters[free[k].index].unit.as_ref();
-        for a in 0..n {
-            for b in 0..n {
-                let value = &mut covariance[a * n + b];
-                *value = difference(unit(a), difference(unit(b), *value));
-            }
-        }
-        let missing = model.states.iter().enumerate().map(|(j, state)| {
-            let (value, std) = ended.scores.change(n + j);
-            let std = std * self.now.inflation.sqrt();
-            Parameter { name: state.name.clone(), value, std, unit: None }
-        });
-        Estimates {
-            t: ended.t,
-            parameters: self.parameters(&deviations),
-            covariance,
-            missing: missing.collect(),
-            innovations: model
-                .measurements
-                .iter()
-                .zip(ended.block.rms())
-                .map(|(m, rms)| (m.channel.clone(), rms))
-                .collect(),
-        }
-    }
-}
-
-impl Saved {
-    /// Whether its parts have the sizes that they have of each other: it may have been written by anybody.
-    fn is_consistent(&self, system: &System) -> bool {
-        let (np, nx, ny) = (self.usual.free.len(), system.nx, system.ny);
-        let effects = np + system.nz + ny;
-        let scores = |s: &Scores| s.gradient.len() == effects && s.information.len() == effects;
-        let settles =
-            |s: &Settling| s.means.len() == effects + ny && s.noise.is_none_or(|channel| channel < ny);
-        let times = [self.block_seconds, self.memory, self.usual.dt, self.inflation, self.alarms_per_day];
-        times.iter().all(|v| *v > 0.0)
-            && self.values.len() == system.np
-            && self.usual.rates.iter().all(|r| r.entry < nx)
-            && self.usual.steps.count() > 0
-            && self.rest.1.len() == nx
-            && self.last.measured.len() == ny
-            && self.keeping.shape() == Some((nx, effects, Effects::Everything))
-            && self.following.shape() == Some((nx, np, Effects::Parameters))
-            && self.fit.len() == np
-            && self.fit.is_consistent()
-            && self.charts.len() == effects + ny
-            && self.charts.iter().all(Chart::is_consistent)
-            && self.block.is_consistent(effects, ny)
-            && self.history.iter().all(scores)
-            && self.settling.as_ref().is_none_or(settles)
-    }
-}
-
-/// A value in its unit.
-fn reported(unit: Option<&Unit>, si: f64) -> f64 {
-    unit.map_or(si, |u| u.from_si(si))
-}
-
-/// A difference in its unit.
-fn difference(unit: Option<&Unit>, si: f64) -> f64 {
-    unit.map_or(si, |u| u.difference_from_si(si))
-}
-
-/// A block that has ended.
-struct Ended {
-    t: f64,
-    scores: Scores,
-    /// Per channel.
-    scatter: Vec<f64>,
-    block: Block,
-}
-
-impl Ended {
-    /// The values of all charts.
-    fn values(&self) -> Vec<f64> {
-        let deviates = (0..self.scores.gradient.len()).map(|h| self.scores.deviate(h));
-        deviates.chain(self.scatter.iter().copied()).collect()
-    }
-}
-
-/// What a first pass over the learned seconds tells.
-struct FirstPass {
-    block_seconds: f64,
-    rest: (Vec<f64>, Vec<f64>),
-    inflation: f64,
-}
-
-/// Chooses the length of a block, and measures how far states and scores scatter.
-fn first_pass(first: &First, options: &Options) -> Result<FirstPass, WatchError> {
-    let First { machine, usual, start, samples } = first;
-    let mut tracker = Tracker::new(machine, (&start.0, &start.1), Effects::Everything)?;
-    let effects = tracker.count(machine);
-    let by = Conditions { machine, usual, values: &usual.values, memory: options.memory };
-    let seconds = samples[samples.len() - 1].t - samples[0].t;
-    let count = (samples.len() / BLOCK_SAMPLES).clamp(BLOCKS.0, BLOCKS.1);
-    let short = (seconds / count as f64).max(usual.dt);
-    let mut block = Block::new(effects, machine.system.ny);
-    let (mut blocks, mut began) = (Vec::new(), samples[0].t);
-    let nx = machine.system.nx;
-    let (mut sum, mut squares, mut count) = (vec![0.0; nx], vec![0.0; nx], 0.0);
-    for pair in samples.windows(2) {
-        if pair[1].t - pair[0].t > short {
-            tracker.restart((&start.0, &start.1));
-            block.clear();
-            began = pair[1].t;
-            continue;
-        }
-        if !tracker.advance(&by, &pair[0], &pair[1], |c, i| block.push(c, &i)) {
-            return Err(WatchError::Diverged);
-        }
-        count += 1.0;
-        for (i, x) in tracker.filter.state().iter().enumerate() {
-            sum[i] += x;
-            squares[i] += x * x;
-        }
-        if pair[1].t - began >= short - 0.5 * usual.dt {
-            blocks.push(block.scores());
-            block.clear();
-            began = pair[1].t;
-        }
-    }
-    // (The first block still feels where the filter began.)
-    let blocks = &blocks[1.min(blocks.len())..];
-    let count_together = together(blocks, FEWEST);
-    let merged: Vec<Scores> = blocks.chunks_exact(count_together).map(Scores::sum).collect();
-    let np = machine.free().len();
-    let square: f64 = merged.iter().map(|s| (0..np).map(|h| s.deviate(h).powi(2)).sum::<f64>()).sum::<f64>();
-    let inflation = (square / (merged.len() * np) as f64).max(1.0);
-    let mean: Vec<f64> = sum.iter().map(|s| s / count).collect();
-    let std = squares.iter().zip(&mean).map(|(s, m)| (s / count - m * m).max(0.0).sqrt()).collect();
-    Ok(FirstPass { block_seconds: short * count_together as f64, rest: (mean, std), inflation })
 }

@@ -1,0 +1,155 @@
+//! What a watch knows, as events in the units of the model file.
+
+use greybox_model::Unit;
+use greybox_recursive::Direction;
+
+use crate::blocks::Ended;
+use crate::event::{Change, Estimates, Learned, Parameter, Subject};
+use crate::naming::{Explanation, alternatives, dispersion, likeliest};
+use crate::saved::Settling;
+use crate::watch::Watch;
+
+impl Watch {
+    fn subject(&self, effect: usize) -> Subject {
+        let (model, free, nz) = (&self.machine.model, &self.now.usual.free, self.machine.system.nz);
+        match effect.checked_sub(free.len()) {
+            None => Subject::Parameter(free[effect].name.clone()),
+            Some(j) if j < nz => Subject::Force(model.states[j].name.clone()),
+            Some(j) => Subject::Offset(model.measurements[j - nz].channel.clone()),
+        }
+    }
+
+    /// The best explanation as a change.
+    pub(crate) fn told(&self, ended: &Ended, explanations: &[Explanation]) -> Change {
+        let (model, free, nz) = (&self.machine.model, &self.now.usual.free, self.machine.system.nz);
+        let best = explanations[0];
+        let (before, unit) = match best.effect.checked_sub(free.len()) {
+            None => {
+                let index = free[best.effect].index;
+                (self.now.usual.values[index], model.parameters[index].unit.clone())
+            }
+            Some(j) if j < nz => (0.0, None),
+            Some(j) => (0.0, Some(model.measurements[j - nz].unit.of_difference())),
+        };
+        Change {
+            t: ended.t,
+            subject: self.subject(best.effect),
+            or: alternatives(explanations, self.now.inflation).map(|e| self.subject(e)).collect(),
+            direction: if best.step > 0.0 { Direction::Up } else { Direction::Down },
+            since: ended.t - best.blocks as f64 * self.now.block_seconds,
+            before: reported(unit.as_ref(), before),
+            now: reported(unit.as_ref(), before + best.step),
+            std: difference(unit.as_ref(), best.std * dispersion(&best, self.now.inflation).sqrt()),
+            unit: unit.map(|u| u.text),
+        }
+    }
+
+    /// The parameter that the followed model has moved the most, in its standard deviations, and those beside it whose
+    /// likelihood is a twentieth of its or more.
+    pub(crate) fn followed(&self, ended: &Ended) -> Change {
+        let now = &self.now;
+        let deviations = now.fit.deviations();
+        let moved = |k: usize| {
+            let index = now.usual.free[k].index;
+            now.values[index] - now.usual.values[index]
+        };
+        let gains: Vec<f64> = (0..deviations.len()).map(|k| (moved(k) / deviations[k]).powi(2)).collect();
+        let (most, alternatives) = likeliest(&gains);
+        let index = now.usual.free[most].index;
+        let unit = self.machine.model.parameters[index].unit.as_ref();
+        Change {
+            t: ended.t,
+            subject: self.subject(most),
+            or: alternatives.into_iter().map(|k| self.subject(k)).collect(),
+            direction: if moved(most) > 0.0 { Direction::Up } else { Direction::Down },
+            since: ended.t,
+            before: reported(unit, now.usual.values[index]),
+            now: reported(unit, now.values[index]),
+            std: difference(unit, deviations[most]),
+            unit: unit.map(|u| u.text.clone()),
+        }
+    }
+
+    /// A channel that scatters more or less than it did, in standard deviations of before.
+    pub(crate) fn scatter_told(&self, ended: &Ended, change: &Settling, channel: usize) -> Change {
+        let mean = change.means[ended.scores.gradient.len() + channel];
+        let ratio = (0.5 * (ended.scatter[channel] - mean)).exp();
+        Change {
+            t: ended.t,
+            subject: Subject::Noise(self.machine.model.measurements[channel].channel.clone()),
+            or: Vec::new(),
+            direction: if ratio > 1.0 { Direction::Up } else { Direction::Down },
+            since: change.since,
+            before: 1.0,
+            now: ratio,
+            std: 0.0,
+            unit: None,
+        }
+    }
+
+    fn parameters(&self, deviations: &[f64]) -> Vec<Parameter> {
+        let free = self.now.usual.free.iter().zip(deviations);
+        free.map(|(f, std)| {
+            let unit = self.machine.model.parameters[f.index].unit.as_ref();
+            Parameter {
+                name: f.name.clone(),
+                value: reported(unit, self.now.values[f.index]),
+                std: difference(unit, *std),
+                unit: unit.map(|u| u.text.clone()),
+            }
+        })
+        .collect()
+    }
+
+    pub(crate) fn learned(&self) -> Learned {
+        Learned {
+            t: self.now.last.t,
+            rate: 1.0 / self.now.usual.dt,
+            block: self.now.block_seconds,
+            alarms_per_day: self.now.alarms_per_day,
+            charts: self.now.charts.len(),
+            parameters: self.parameters(&self.now.fit.deviations()),
+        }
+    }
+
+    pub(crate) fn estimates(&self, ended: &Ended) -> Estimates {
+        let (model, free) = (&self.machine.model, &self.now.usual.free);
+        let n = free.len();
+        let mut covariance = self.now.fit.covariance();
+        let deviations: Vec<f64> = (0..n).map(|k| covariance[k * n + k].sqrt()).collect();
+        let unit = |k: usize| model.parameters[free[k].index].unit.as_ref();
+        for a in 0..n {
+            for b in 0..n {
+                let value = &mut covariance[a * n + b];
+                *value = difference(unit(a), difference(unit(b), *value));
+            }
+        }
+        let missing = model.states.iter().enumerate().map(|(j, state)| {
+            let (value, std) = ended.scores.change(n + j);
+            let std = std * self.now.inflation.sqrt();
+            Parameter { name: state.name.clone(), value, std, unit: None }
+        });
+        Estimates {
+            t: ended.t,
+            parameters: self.parameters(&deviations),
+            covariance,
+            missing: missing.collect(),
+            innovations: model
+                .measurements
+                .iter()
+                .zip(ended.block.rms())
+                .map(|(m, rms)| (m.channel.clone(), rms))
+                .collect(),
+        }
+    }
+}
+
+/// A value in its unit.
+fn reported(unit: Option<&Unit>, si: f64) -> f64 {
+    unit.map_or(si, |u| u.from_si(si))
+}
+
+/// A difference in its unit.
+fn difference(unit: Option<&Unit>, si: f64) -> f64 {
+    unit.map_or(si, |u| u.difference_from_si(si))
+}
