@@ -9,7 +9,7 @@ use crate::event::Irregular;
 use crate::learn::{Sample, Usual};
 use crate::tracker::{Effects, Tracker};
 
-/// The state of a watch as data: what [`Watch::restore`] goes on from.
+/// The state of a watch as data: what [`Watch::restore`](crate::Watch::restore) goes on from.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub struct Saved {
     pub(crate) version: u32,
