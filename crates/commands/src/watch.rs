@@ -78,7 +78,7 @@ impl First {
 
 /// One thing that a session says.
 #[derive(Debug, Clone, PartialEq)]
-pub enum Said {
+pub enum Output {
     /// Of the machine.
     Event(Event),
     /// A line could not be read; it is passed over.
@@ -116,7 +116,7 @@ impl Session {
     /// # Errors
     /// Bad input: a header without the model's channels, first seconds from which nothing can be learned, or
     /// nothing but lines that cannot be read.
-    pub fn line(&mut self, text: &str) -> Result<Vec<Said>, Failure> {
+    pub fn line(&mut self, text: &str) -> Result<Vec<Output>, Failure> {
         self.line += 1;
         if text.trim().is_empty() {
             return Ok(Vec::new());
@@ -164,7 +164,7 @@ impl Session {
         .help("send more samples, or learn from fewer seconds: `--learn SECONDS`"))
     }
 
-    fn sample(&mut self, text: &str) -> Result<Vec<Said>, Failure> {
+    fn sample(&mut self, text: &str) -> Result<Vec<Output>, Failure> {
         let row = match self.lines.as_ref().map_or(Ok(None), |lines| lines.row(text, self.line)) {
             Ok(Some(row)) => row,
             Ok(None) => return Ok(Vec::new()),
@@ -176,7 +176,7 @@ impl Session {
                     ))
                     .help("send CSV with a header, or one JSON object a line with the time as `t`"));
                 }
-                return Ok(vec![Said::Unreadable { line: self.line, message }]);
+                return Ok(vec![Output::Unreadable { line: self.line, message }]);
             }
         };
         self.unreadable = 0;
@@ -184,17 +184,17 @@ impl Session {
             Stage::Watching(watch) => {
                 let inputs = self.model.model.inputs.len();
                 let events = watch.push(row[0], &row[1..=inputs], &row[1 + inputs..]);
-                Ok(events.into_iter().map(Said::Event).collect())
+                Ok(events.into_iter().map(Output::Event).collect())
             }
             Stage::Learning(first) => match first.add(row, self.options.learn) {
                 Added::More => Ok(Vec::new()),
-                Added::Restarted(clock) => Ok(vec![Said::Event(Event::Restarted(clock))]),
+                Added::Restarted(clock) => Ok(vec![Output::Event(Event::Restarted(clock))]),
                 Added::Enough => self.learn(),
             },
         }
     }
 
-    fn learn(&mut self) -> Result<Vec<Said>, Failure> {
+    fn learn(&mut self) -> Result<Vec<Output>, Failure> {
         let (Stage::Learning(First { rows, .. }), Some(lines)) = (&self.stage, &self.lines) else {
             return Ok(Vec::new());
         };
@@ -213,7 +213,7 @@ impl Session {
         let (watch, event) = Watch::learn(&self.model.model, &recording, &self.options)
             .map_err(|e| failure(&self.model, e))?;
         self.stage = Stage::Watching(Box::new(watch));
-        Ok(vec![Said::Event(event)])
+        Ok(vec![Output::Event(event)])
     }
 }
 

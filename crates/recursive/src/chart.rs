@@ -22,9 +22,9 @@ use crate::error::RecursiveError;
 /// 2 L = (exp(2kb) − 2kb − 1) / (2k²),     b = h + 1.166
 /// ```
 ///
-/// Where a score depends on the one before, by the correlation ρ of all but the last twenty (and
-/// forty without any), z is divided by √((1 + ρ)/(1 − ρ)), the root of what correlation makes of the variance
-/// of a sum.
+/// Scores may still depend on the one before. With ρ = Σ zₙ zₙ₋₁ / (Σ zₙ² + 40), z is divided by √((1 + ρ)/(1 − ρ)), by which
+/// correlation widens a sum. The sums leave out the last twenty scores: a change that begins makes those alike. The 40 stands
+/// for scores without correlation before the first.
 ///
 /// The price: one number, however far off, adds Φ⁻¹(1 − 1/(2n)) at most (2.6 of a hundred, 3.3 of a thousand), so that an alarm
 /// takes a few. Ranks are those among the last thousand numbers.

@@ -1,4 +1,5 @@
-//! Virtual rigs: the plants of G. Leylaz's thesis (University of California, Merced, 2021) written out in Rust.
+//! Virtual rigs: the plants of G. Leylaz's thesis (University of California, Merced, 2021), and a throttle that wears, written
+//! out in Rust.
 //!
 //! A rig makes recordings whose physics is known. It is written without the model language and without this
 //! crate's integrator, so that nothing which later explains a recording can share an error with what made it.
@@ -18,8 +19,10 @@
 //! # Ok::<(), greybox_simulate::rigs::RigError>(())
 //! ```
 mod delayed;
+mod throttle;
 
 pub use delayed::{DelayedDuffing, JointRun, RotaryFlexibleJoint};
+pub use throttle::Throttle;
 
 use std::f64::consts::{PI, TAU};
 

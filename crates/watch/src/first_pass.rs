@@ -26,8 +26,8 @@ pub(crate) fn first_pass(first: &First, options: &Options) -> Result<FirstPass, 
     let effects = tracker.count(machine);
     let by = Conditions { machine, usual, values: &usual.values, memory: options.memory };
     let seconds = samples[samples.len() - 1].t - samples[0].t;
-    let count = (samples.len() / BLOCK_SAMPLES).clamp(BLOCKS.0, BLOCKS.1);
-    let short = (seconds / count as f64).max(usual.dt);
+    let parts = (samples.len() / BLOCK_SAMPLES).clamp(BLOCKS.0, BLOCKS.1);
+    let short = (seconds / parts as f64).max(usual.dt);
     let mut block = Block::new(effects, machine.system.ny);
     let (mut blocks, mut began) = (Vec::new(), samples[0].t);
     let nx = machine.system.nx;
@@ -55,12 +55,12 @@ pub(crate) fn first_pass(first: &First, options: &Options) -> Result<FirstPass, 
     }
     // (The first block still feels where the filter began.)
     let blocks = &blocks[1.min(blocks.len())..];
-    let count_together = together(blocks, FEWEST);
-    let merged: Vec<Scores> = blocks.chunks_exact(count_together).map(Scores::sum).collect();
+    let doubled = together(blocks, FEWEST);
+    let merged: Vec<Scores> = blocks.chunks_exact(doubled).map(Scores::sum).collect();
     let np = machine.free().len();
     let square: f64 = merged.iter().map(|s| (0..np).map(|h| s.deviate(h).powi(2)).sum::<f64>()).sum::<f64>();
     let inflation = (square / (merged.len() * np) as f64).max(1.0);
     let mean: Vec<f64> = sum.iter().map(|s| s / count).collect();
     let std = squares.iter().zip(&mean).map(|(s, m)| (s / count - m * m).max(0.0).sqrt()).collect();
-    Ok(FirstPass { block_seconds: short * count_together as f64, rest: (mean, std), inflation })
+    Ok(FirstPass { block_seconds: short * doubled as f64, rest: (mean, std), inflation })
 }

@@ -153,8 +153,9 @@ fn usual(fitted: &Fitted, noise: &[RateNoise], weight: f64) -> Usual {
         .iter()
         .enumerate()
         .map(|(a, f)| {
-            let told = 1.0 / (weight * fitted.pass.information[a * n + a]).sqrt();
-            let wide = if told.is_finite() { WIDE * told } else { at.parameters[f.index].abs().max(1.0) };
+            let estimated = 1.0 / (weight * fitted.pass.information[a * n + a]).sqrt();
+            let wide =
+                if estimated.is_finite() { WIDE * estimated } else { at.parameters[f.index].abs().max(1.0) };
             let std = match f.prior {
                 Prior::Normal { std, .. } => std,
                 Prior::Cauchy { scale, .. } => scale.max(0.5 * at.parameters[f.index].abs()),

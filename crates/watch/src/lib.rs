@@ -1,6 +1,7 @@
 #![doc = include_str!("../README.md")]
 
 mod blocks;
+mod changes;
 mod error;
 mod event;
 mod first_pass;
@@ -9,7 +10,6 @@ mod machine;
 mod naming;
 mod options;
 mod saved;
-mod telling;
 mod tracker;
 mod watch;
 

@@ -62,19 +62,23 @@ pub(crate) fn dispersion(best: &Explanation, usual: f64) -> f64 {
     usual + (best.left - usual).max(0.0) * best.samples
 }
 
-/// The effects that the blocks do not tell from the best one: whose likelihood is a twentieth of its or more.
+/// Gain (twice the logarithm of a likelihood ratio) from which on an explanation is as likely as the best one, up to [`ODDS`].
+fn least_gain(best: f64, dispersion: f64) -> f64 {
+    best - 2.0 * ODDS.ln() * dispersion
+}
+
+/// The effects that the blocks do not tell from the best one.
 pub(crate) fn alternatives(explanations: &[Explanation], usual: f64) -> impl Iterator<Item = usize> {
-    let least = explanations.first().map_or(0.0, |e| e.gain - 2.0 * ODDS.ln() * dispersion(e, usual));
+    let least = explanations.first().map_or(0.0, |e| least_gain(e.gain, dispersion(e, usual)));
     explanations.iter().skip(1).filter(move |e| e.gain > least).map(|e| e.effect)
 }
 
-/// The largest of some gains (twice the logarithm of a likelihood ratio), and those whose likelihood is a twentieth of its or
-/// more, the larger first.
+/// The largest of some gains, and those that are as likely, the larger first.
 pub(crate) fn likeliest(gains: &[f64]) -> (usize, Vec<usize>) {
     let mut order: Vec<usize> = (0..gains.len()).collect();
     order.sort_by(|a, b| gains[*b].total_cmp(&gains[*a]));
     let Some((most, others)) = order.split_first() else { return (0, Vec::new()) };
-    let least = gains[*most] - 2.0 * ODDS.ln();
+    let least = least_gain(gains[*most], 1.0);
     (*most, others.iter().copied().filter(|k| gains[*k] > least).collect())
 }
 

@@ -22,10 +22,11 @@ pub struct Saved {
     pub(crate) rest: (Vec<f64>, Vec<f64>),
     /// Variance of the scores over that of white innovations.
     pub(crate) inflation: f64,
-    pub(crate) keeping: Tracker,
-    pub(crate) following: Tracker,
+    /// The filter that keeps to what is usual, and the one whose parameters follow the machine.
+    pub(crate) reference: Tracker,
+    pub(crate) adaptive: Tracker,
     pub(crate) fit: LeastSquares,
-    /// Parameters of the followed model, SI.
+    /// Parameters that follow the machine, SI.
     pub(crate) values: Vec<f64>,
     pub(crate) charts: Vec<Chart>,
     pub(crate) block: Block,
@@ -34,7 +35,7 @@ pub struct Saved {
     pub(crate) last: Sample,
     pub(crate) settling: Option<Settling>,
     pub(crate) irregular: Irregular,
-    /// Blocks that irregularities wait until they are told, and the next wait: it doubles while they go on.
+    /// Blocks that irregularities wait until they are reported, and the next wait: it doubles while they go on.
     pub(crate) wait: (u32, u32),
 }
 
@@ -69,8 +70,8 @@ impl Saved {
             && self.usual.steps.count() > 0
             && self.rest.1.len() == nx
             && self.last.measured.len() == ny
-            && self.keeping.shape() == Some((nx, effects, Effects::Everything))
-            && self.following.shape() == Some((nx, np, Effects::Parameters))
+            && self.reference.shape() == Some((nx, effects, Effects::Everything))
+            && self.adaptive.shape() == Some((nx, np, Effects::Parameters))
             && self.fit.len() == np
             && self.fit.is_consistent()
             && self.charts.len() == effects + ny

@@ -21,7 +21,7 @@ const CHANGE: f64 = 1.0;
 const REMEMBERED: usize = 512;
 /// Share of the memory after which a change is known so well that its linearisation is good.
 const COARSE: f64 = 0.1;
-/// Most blocks that irregularities wait until they are told.
+/// Most blocks that irregularities wait until they are reported.
 const MOST_WAIT: u32 = 256;
 
 /// A machine that is watched.
@@ -53,11 +53,11 @@ impl Watch {
         let FirstPass { block_seconds, rest, inflation } = first_pass(&first, options)?;
         let First { machine, usual, start, samples } = first;
         let (state, deviation) = (&start.0[..], &start.1[..]);
-        let keeping = Tracker::new(&machine, (state, deviation), Effects::Everything)?;
-        let following = Tracker::new(&machine, (state, deviation), Effects::Parameters)?;
+        let reference = Tracker::new(&machine, (state, deviation), Effects::Everything)?;
+        let adaptive = Tracker::new(&machine, (state, deviation), Effects::Parameters)?;
         let (mean, std): (Vec<f64>, Vec<f64>) =
             usual.free.iter().map(|f| (usual.values[f.index], f.std)).unzip();
-        let effects = keeping.count(&machine);
+        let effects = reference.count(&machine);
         let charts = effects + machine.system.ny;
         let chart = Chart::new(CHANGE, charts as f64 * 86_400.0 / block_seconds / options.alarms_per_day)?;
         let last = samples[0].clone();
@@ -71,8 +71,8 @@ impl Watch {
             usual,
             rest,
             inflation,
-            keeping,
-            following,
+            reference,
+            adaptive,
             charts: vec![chart; charts],
             block: Block::new(effects, machine.system.ny),
             began: last.t,
@@ -174,7 +174,7 @@ impl Watch {
     /// The state begins anew where nothing is known of it but what it was on the average.
     fn begin_anew(&mut self, sample: Sample) {
         let now = &mut self.now;
-        for tracker in [&mut now.keeping, &mut now.following] {
+        for tracker in [&mut now.reference, &mut now.adaptive] {
             tracker.restart((&now.rest.0, &now.rest.1));
         }
         now.block.clear();
@@ -191,7 +191,7 @@ impl Watch {
             values: &now.usual.values,
             memory: now.memory,
         };
-        let kept = now.keeping.advance(&usual, &now.last, &sample, |c, i| block.push(c, &i));
+        let kept = now.reference.advance(&usual, &now.last, &sample, |c, i| block.push(c, &i));
         let free = &now.usual.free;
         let at: Vec<f64> = free.iter().map(|f| now.values[f.index]).collect();
         let followed = Conditions { values: &now.values, ..usual };
@@ -199,7 +199,7 @@ impl Watch {
         fit.forget((-(sample.t - now.last.t) / now.memory).exp());
         let weight = 1.0 / now.inflation.sqrt();
         let mut row = vec![0.0; at.len()];
-        let kept_up = now.following.advance(&followed, &now.last, &sample, |_, i| {
+        let kept_up = now.adaptive.advance(&followed, &now.last, &sample, |_, i| {
             row.iter_mut().zip(i.row).for_each(|(r, psi)| *r = weight * psi);
             let here: f64 = row.iter().zip(&at).map(|(r, a)| r * a).sum();
             fit.update(&row, weight * i.value + here);
@@ -226,14 +226,14 @@ impl Watch {
             change[k] = to - at[k];
             now.values[f.index] = to;
         }
-        now.following.filter.follow(&change);
+        now.adaptive.filter.follow(&change);
         let t = sample.t;
         now.last = sample;
         if t - now.began < now.block_seconds - 0.5 * now.usual.dt {
             return None;
         }
         now.began = t;
-        let empty = Block::new(now.keeping.count(&self.machine), self.machine.system.ny);
+        let empty = Block::new(now.reference.count(&self.machine), self.machine.system.ny);
         let block = std::mem::replace(&mut now.block, empty);
         let scores = block.scores();
         now.history.push(scores.clone());
@@ -285,39 +285,43 @@ impl Watch {
             since: ended.t - alarm.since as f64 * now.block_seconds,
             means,
         };
-        let told = match noise {
-            Some(channel) => self.scatter_told(ended, &change, channel),
+        let found = match noise {
+            Some(channel) => self.scatter_change(ended, &change, channel),
             None => {
                 let all = explanations(&now.history, &change.means, alarm.since as usize);
                 change.since = ended.t - all[0].blocks as f64 * now.block_seconds;
                 // What was known of the machine before the change is no longer so.
                 now.fit.restart();
-                self.told(ended, &all)
+                self.effect_change(ended, &all)
             }
         };
         self.now.settling = Some(change);
-        Some(told)
+        Some(found)
     }
 
     /// From here on what has changed is usual.
     fn settle(&mut self, ended: &Ended, change: &Settling) -> Change {
-        let told = match change.noise {
-            Some(channel) => self.scatter_told(ended, change, channel),
+        let found = match change.noise {
+            Some(channel) => self.scatter_change(ended, change, channel),
             None => {
                 let blocks = ((ended.t - change.since) / self.now.block_seconds).round() as usize;
                 let all = explanations(&self.now.history, &change.means, blocks);
                 let np = self.now.usual.free.len();
-                if all[0].effect < np { self.followed(ended) } else { self.told(ended, &all) }
+                if all[0].effect < np {
+                    self.parameter_change(ended)
+                } else {
+                    self.effect_change(ended, &all)
+                }
             }
         };
-        let told = Change { since: change.since, ..told };
+        let found = Change { since: change.since, ..found };
         let now = &mut self.now;
-        if matches!(told.subject, Subject::Parameter(_)) {
+        if matches!(found.subject, Subject::Parameter(_)) {
             now.usual.values.clone_from(&now.values);
-            now.keeping.filter.take_state(&now.following.filter);
+            now.reference.filter.take_state(&now.adaptive.filter);
         }
         now.charts.iter_mut().for_each(Chart::restart);
         now.history.clear();
-        told
+        found
     }
 }

@@ -3,6 +3,7 @@
 use greybox_model::Model;
 use greybox_recording::{Channel, Recording};
 use greybox_recursive::Direction;
+use greybox_simulate::rigs::Throttle;
 use greybox_watch::{Change, Event, Irregular, Options, Subject, Watch, WatchError};
 use rand::SeedableRng;
 use rand_distr::{Distribution, StandardNormal};
@@ -43,23 +44,21 @@ const SOUND: Machine = Machine { damping: |_| 0.06, offset: |_| 0.0, load: |_| 0
 fn run(machine: Machine, seconds: f64, seed: u64) -> Vec<[f64; 3]> {
     let mut rng = rand_pcg::Pcg64::seed_from_u64(seed);
     let mut normal = || -> f64 { StandardNormal.sample(&mut rng) };
-    let (mut angle, mut rate, mut torque) = (0.0f64, 0.0f64, 0.0);
+    let (mut state, mut torque) = ([0.0, 0.0], 0.0);
     let mut out = Vec::new();
     for k in 0..(seconds / DT) as usize {
         let t = DT * k as f64;
         if k % 10 == 0 {
             torque = 0.5 * normal();
         }
-        out.push([t, torque, angle + (machine.offset)(t) + (machine.scatter)(t) * normal()]);
-        for _ in 0..10 {
-            let h = DT / 10.0;
-            let at =
-                |a: f64, r: f64| (torque + (machine.load)(t) - (machine.damping)(t) * r - 0.8 * a) / 0.02;
-            // (Midpoint.)
-            let (am, rm) = (angle + 0.5 * h * rate, rate + 0.5 * h * at(angle, rate));
-            angle += h * rm;
-            rate += h * at(am, rm);
-        }
+        out.push([t, torque, state[0] + (machine.offset)(t) + (machine.scatter)(t) * normal()]);
+        let drive = Throttle {
+            viscous: (machine.damping)(t),
+            coulomb: 0.0,
+            load: (machine.load)(t),
+            ..Throttle::NEW
+        };
+        state = drive.step(state, torque, DT, 10);
     }
     out
 }
@@ -142,7 +141,7 @@ fn a_step_of_the_damping_is_seen_at_once_then_named_and_measured() {
 #[test]
 fn a_ramp_of_the_damping_is_seen() {
     let machine = Machine { damping: |t| 0.06 + 1e-5 * (t - EVENT).max(0.0), ..SOUND };
-    seen(machine, 60.0, |c| c.subject == Subject::Parameter("b".into()) && c.direction == Direction::Up);
+    seen(machine, 30.0, |c| c.subject == Subject::Parameter("b".into()) && c.direction == Direction::Up);
 }
 
 /// At rest a load and an offset are the same to this machine: either is named, and the other beside it.

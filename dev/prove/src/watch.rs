@@ -1,7 +1,7 @@
 //! `cargo xtask prove --watch`: a machine that runs and changes, over seeds; delays, names and false alarms, beside control
 //! charts on the residual of the calibrated model.
 //!
-//! The machine is a spring-loaded throttle with Coulomb friction, integrated here: nothing is shared with what watches it.
+//! The machine is a spring-loaded throttle with Coulomb friction, a virtual rig: it shares nothing with what watches it.
 
 use std::path::Path;
 
@@ -11,6 +11,7 @@ use greybox_model::{Hold, Model, System};
 use greybox_recording::csv::write_csv_file;
 use greybox_recording::{Channel, Recording};
 use greybox_recursive::Chart;
+use greybox_simulate::rigs::Throttle;
 use greybox_simulate::{Environment, Method, Seeds, Signal, Simulation};
 use greybox_watch::{Event, Learned, Options, Subject, Watch};
 use rand::SeedableRng;
@@ -50,23 +51,22 @@ angle = { unit = "rad" }
 plate = "J*angle'' + b*angle' + c*sign(angle') + k*angle = torque"
 "#;
 
-/// What the machine is at one time.
+/// What the machine and its sensor are at one time.
 #[derive(Clone, Copy)]
 struct Now {
-    viscous: f64,
-    coulomb: f64,
-    spring: f64,
-    /// The spring stiffens with the cube of the angle, N·m/rad³: the model does not know.
-    cubic: f64,
-    load: f64,
+    throttle: Throttle,
+    /// Offset and noise of the sensor, rad.
     offset: f64,
     noise: f64,
 }
 
-/// A machine that is not quite what the model says.
-const ODD: Now = Now { cubic: 0.01, ..USUAL };
-const USUAL: Now =
-    Now { viscous: 0.02, coulomb: 0.1, spring: 0.8, cubic: 0.0, load: 0.0, offset: 0.0, noise: 0.002 };
+const USUAL: Now = Now { throttle: Throttle::NEW, offset: 0.0, noise: 0.002 };
+/// A machine that is not quite what the model says: its spring stiffens.
+const ODD: Now = with(Throttle { stiffening: 0.01, ..Throttle::NEW });
+
+const fn with(throttle: Throttle) -> Now {
+    Now { throttle, ..USUAL }
+}
 
 struct Case {
     name: &'static str,
@@ -102,32 +102,32 @@ const CASES: &[Case] = &[
     Case {
         name: "Coulomb friction + 30 %",
         usual: USUAL,
-        at: |_| Now { coulomb: 0.13, ..USUAL },
+        at: |_| with(Throttle { coulomb: 0.13, ..Throttle::NEW }),
         right: &[Name::Parameter("c")],
     },
     Case {
         name: "Coulomb friction + 6 % a minute",
         usual: USUAL,
-        at: |s| Now { coulomb: 0.1 * (1.0 + 0.001 * s), ..USUAL },
+        at: |s| with(Throttle { coulomb: 0.1 * (1.0 + 0.001 * s), ..Throttle::NEW }),
         right: &[Name::Parameter("c")],
     },
     Case {
         name: "viscous friction + 30 %",
         usual: USUAL,
-        at: |_| Now { viscous: 0.026, ..USUAL },
+        at: |_| with(Throttle { viscous: 0.026, ..Throttle::NEW }),
         right: &[Name::Parameter("b")],
     },
     Case {
         name: "spring − 2 %",
         usual: USUAL,
-        at: |_| Now { spring: 0.784, ..USUAL },
+        at: |_| with(Throttle { spring: 0.784, ..Throttle::NEW }),
         right: &[Name::Parameter("k")],
     },
     // A throttle that moves about its rest tells a load from an offset by the friction alone.
     Case {
         name: "load of 2 % of the largest torque",
         usual: USUAL,
-        at: |_| Now { load: 0.02, ..USUAL },
+        at: |_| with(Throttle { load: 0.02, ..Throttle::NEW }),
         right: &[Name::Force, Name::Offset],
     },
     Case {
@@ -146,7 +146,7 @@ const CASES: &[Case] = &[
     Case {
         name: "model lacks a stiffening: Coulomb friction + 30 %",
         usual: ODD,
-        at: |_| Now { coulomb: 0.13, ..ODD },
+        at: |_| with(Throttle { coulomb: 0.13, ..ODD.throttle }),
         right: &[Name::Parameter("c")],
     },
     Case { name: "model lacks a stiffening: nothing", usual: ODD, at: |_| ODD, right: &[] },
@@ -158,7 +158,7 @@ fn record(case: &Case, seed: u64) -> [Vec<f64>; 3] {
     let mut random = Pcg64Mcg::seed_from_u64(seed);
     let mut normal = || -> f64 { StandardNormal.sample(&mut random) };
     let seconds = if case.right.is_empty() { SOUND } else { CHANGE + AFTER };
-    let (mut angle, mut rate, mut torque) = (0.0f64, 0.0f64, 0.0);
+    let (mut state, mut torque) = ([0.0, 0.0], 0.0);
     let mut out = [Vec::new(), Vec::new(), Vec::new()];
     for k in 0..(seconds / STEP) as usize {
         let t = k as f64 * STEP;
@@ -168,34 +168,8 @@ fn record(case: &Case, seed: u64) -> [Vec<f64>; 3] {
         }
         out[0].push(t);
         out[1].push(torque);
-        out[2].push(angle + now.offset + now.noise * normal());
-        let free =
-            |a: f64, v: f64| torque + now.load - now.spring * a - now.cubic * a * a * a - now.viscous * v;
-        for _ in 0..SUBSTEPS {
-            let mut left = STEP / SUBSTEPS as f64;
-            while left > 0.0 {
-                let push = free(angle, 0.0);
-                if rate == 0.0 && push.abs() <= now.coulomb {
-                    break;
-                }
-                let way = if rate == 0.0 { push.signum() } else { rate.signum() };
-                let acceleration = |a: f64, v: f64| (free(a, v) - way * now.coulomb) / 0.02;
-                // (The midpoint rule.)
-                let middle = rate + 0.5 * left * acceleration(angle, rate);
-                let next = rate + left * acceleration(angle + 0.5 * left * rate, middle);
-                if next * way < 0.0 {
-                    // It stops within the step, and the rest of the step is another one.
-                    let taken = left * rate / (rate - next);
-                    angle += 0.5 * taken * rate;
-                    rate = 0.0;
-                    left -= taken;
-                } else {
-                    angle += 0.5 * left * (rate + next);
-                    rate = next;
-                    left = 0.0;
-                }
-            }
-        }
+        out[2].push(state[0] + now.offset + now.noise * normal());
+        state = now.throttle.step(state, torque, STEP, SUBSTEPS);
     }
     out
 }
@@ -490,7 +464,7 @@ mod tests {
             // At rest at the end of a step of the torque: what is left of the push is within the friction.
             if angle[k] == angle[k - 1] {
                 held += 1;
-                assert!((torque[k] - USUAL.spring * angle[k]).abs() <= USUAL.coulomb * 1.001);
+                assert!((torque[k] - Throttle::NEW.spring * angle[k]).abs() <= Throttle::NEW.coulomb * 1.001);
             }
         }
         assert!(held > 21, "{held}");

@@ -6,7 +6,7 @@ use std::path::{Path, PathBuf};
 use std::time::{Duration, Instant};
 
 use clap::Args;
-use greybox_commands::watch::{Said, Session};
+use greybox_commands::watch::{Output, Session};
 use greybox_watch::{Options, Saved};
 
 use crate::answer::{Answer, OutputFormat};
@@ -73,8 +73,8 @@ pub(crate) fn run(arguments: &Arguments, format: OutputFormat) -> Result<Answer,
         if read == 0 {
             break;
         }
-        for said in session.line(&String::from_utf8_lossy(&line))? {
-            if !print(&said, format)? {
+        for output in session.line(&String::from_utf8_lossy(&line))? {
+            if !print(&output, format)? {
                 return Ok(Answer::words(String::new()));
             }
         }
@@ -98,11 +98,11 @@ fn now() -> Instant {
     Instant::now()
 }
 
-/// Prints what is said; `false` where nobody reads any more.
-fn print(said: &Said, format: OutputFormat) -> Result<bool, Failure> {
+/// Prints one line of the answer; `false` where nobody reads any more.
+fn print(output: &Output, format: OutputFormat) -> Result<bool, Failure> {
     let text = match format {
-        OutputFormat::Json => Some(format!("{}\n", said.to_json())),
-        OutputFormat::Text => said.in_words(),
+        OutputFormat::Json => Some(format!("{}\n", output.to_json())),
+        OutputFormat::Text => output.in_words(),
     };
     let Some(text) = text else { return Ok(true) };
     let mut out = io::stdout().lock();

@@ -2,6 +2,8 @@
 
 use std::fmt::Write as _;
 
+use greybox_simulate::rigs::Throttle;
+
 use crate::noise::Noise;
 
 pub(crate) const MODEL: &str = r#"
@@ -24,7 +26,7 @@ pub(crate) fn samples(seconds: f64) -> Vec<[f64; 3]> {
     const DT: f64 = 0.01;
     const STEPS: usize = 20;
     let mut noise = Noise(5);
-    let (mut angle, mut rate, mut torque) = (0.0f64, 0.0f64, 0.0);
+    let (mut state, mut torque) = ([0.0, 0.0], 0.0f64);
     let mut out = Vec::new();
     for k in 0..(seconds / DT).round() as usize {
         let t = (DT * k as f64 * 100.0).round() / 100.0;
@@ -33,31 +35,8 @@ pub(crate) fn samples(seconds: f64) -> Vec<[f64; 3]> {
         }
         let coulomb = if t < 150.0 { 0.1 } else { 0.13 };
         torque = (1e5 * torque).round() / 1e5;
-        out.push([t, torque, angle + 0.002 * noise.normal()]);
-        let free = |a: f64, v: f64| torque - 0.8 * a - 0.02 * v;
-        for _ in 0..STEPS {
-            let mut left = DT / STEPS as f64;
-            while left > 0.0 {
-                let push = free(angle, 0.0);
-                if rate == 0.0 && push.abs() <= coulomb {
-                    break;
-                }
-                let way = if rate == 0.0 { push.signum() } else { rate.signum() };
-                let middle = rate + 0.5 * left * (free(angle, rate) - way * coulomb) / 0.02;
-                let next = rate + left * (free(angle + 0.5 * left * rate, middle) - way * coulomb) / 0.02;
-                if next * way < 0.0 {
-                    // It stops within the step, and the rest of the step is another one.
-                    let taken = left * rate / (rate - next);
-                    angle += 0.5 * taken * rate;
-                    rate = 0.0;
-                    left -= taken;
-                } else {
-                    angle += 0.5 * left * (rate + next);
-                    rate = next;
-                    left = 0.0;
-                }
-            }
-        }
+        out.push([t, torque, state[0] + 0.002 * noise.normal()]);
+        state = Throttle { coulomb, ..Throttle::NEW }.step(state, torque, DT, STEPS);
     }
     out
 }

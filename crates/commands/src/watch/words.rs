@@ -7,14 +7,14 @@ use greybox_report::format;
 use greybox_watch::{Change, Event, Irregular, Parameter, Subject};
 use serde_json::{Value, json};
 
-use super::Said;
+use super::Output;
 
-impl Said {
+impl Output {
     /// One line for machines.
     pub fn to_json(&self) -> Value {
         match self {
-            Said::Event(event) => serde_json::to_value(event).unwrap_or_default(),
-            Said::Unreadable { line, message } => {
+            Output::Event(event) => serde_json::to_value(event).unwrap_or_default(),
+            Output::Unreadable { line, message } => {
                 json!({ "event": "unreadable", "line": line, "message": message })
             }
         }
@@ -23,8 +23,8 @@ impl Said {
     /// In plain language, with its line ends; estimates that come with every block are for machines alone.
     pub fn in_words(&self) -> Option<String> {
         match self {
-            Said::Unreadable { message, .. } => Some(format!("passed over: {message}\n")),
-            Said::Event(event) => in_words(event),
+            Output::Unreadable { message, .. } => Some(format!("passed over: {message}\n")),
+            Output::Event(event) => in_words(event),
         }
     }
 }

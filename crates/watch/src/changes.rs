@@ -20,7 +20,7 @@ impl Watch {
     }
 
     /// The best explanation as a change.
-    pub(crate) fn told(&self, ended: &Ended, explanations: &[Explanation]) -> Change {
+    pub(crate) fn effect_change(&self, ended: &Ended, explanations: &[Explanation]) -> Change {
         let (model, free, nz) = (&self.machine.model, &self.now.usual.free, self.machine.system.nz);
         let best = explanations[0];
         let (before, unit) = match best.effect.checked_sub(free.len()) {
@@ -46,7 +46,7 @@ impl Watch {
 
     /// The parameter that the followed model has moved the most, in its standard deviations, and those beside it whose
     /// likelihood is a twentieth of its or more.
-    pub(crate) fn followed(&self, ended: &Ended) -> Change {
+    pub(crate) fn parameter_change(&self, ended: &Ended) -> Change {
         let now = &self.now;
         let deviations = now.fit.deviations();
         let moved = |k: usize| {
@@ -71,7 +71,7 @@ impl Watch {
     }
 
     /// A channel that scatters more or less than it did, in standard deviations of before.
-    pub(crate) fn scatter_told(&self, ended: &Ended, change: &Settling, channel: usize) -> Change {
+    pub(crate) fn scatter_change(&self, ended: &Ended, change: &Settling, channel: usize) -> Change {
         let mean = change.means[ended.scores.gradient.len() + channel];
         let ratio = (0.5 * (ended.scatter[channel] - mean)).exp();
         Change {
