@@ -13,6 +13,7 @@ its text, or a :class:`Model`. Every result has ``summary`` (plain language), ``
 ``to_json()``.
 """
 
+from . import fleet
 from ._errors import GreyboxError, InputError, InternalError
 from ._inputs import Model, ModelLike, Recording, RecordingLike
 from ._native import __version__
@@ -72,6 +73,7 @@ __all__ = [
     "check",
     "control",
     "diagnose",
+    "fleet",
     "identify",
     "simulate",
 ]

@@ -10,18 +10,31 @@ _Source = Recording | str | PathLike[str]
 _Progress = Callable[[str], object] | None
 
 __all__ = [
+    "EXTENSIONS",
+    "Fleet",
     "Model",
+    "READS_PARQUET",
     "Recording",
     "__version__",
     "calibrate",
     "check",
+    "conclude",
+    "content",
     "control",
     "diagnose",
+    "failed",
     "identify",
+    "mechanisms",
+    "reduce",
     "simulate",
+    "statistics",
 ]
 
 __version__: str
+#: Endings of the files that may hold a recording.
+EXTENSIONS: list[str]
+#: Whether this build reads Parquet files by itself.
+READS_PARQUET: bool
 
 @final
 class Recording:
@@ -46,6 +59,8 @@ class Model:
     def name(self) -> str: ...
     @property
     def file(self) -> str: ...
+    @property
+    def path(self) -> PathLike[str]: ...
     @property
     def text(self) -> str: ...
     @property
@@ -96,3 +111,28 @@ def control(
 ) -> tuple[
     str, str, list[tuple[str, bytes]], tuple[_Floats, _Floats, _Floats, list[tuple[str, _Floats]]]
 ]: ...
+
+@final
+class Fleet:
+    def __new__(
+        cls,
+        model: Model,
+        holdout: Sequence[tuple[str, bytes]],
+        map: Sequence[str],
+        seed: int,
+        work: int | None,
+        mechanisms: Sequence[tuple[str, str]],
+    ) -> Fleet: ...
+    def finished(
+        self, path: str, content: bytes, name: str, folder: str, read: Callable[[str], bytes | None]
+    ) -> str | None: ...
+    def diagnose(
+        self, path: str, content: bytes, name: str, folder: str, recording: Recording | None, threads: int
+    ) -> tuple[list[tuple[str, bytes]], str]: ...
+
+def content(path: str) -> bytes: ...
+def mechanisms(folder: str | PathLike[str]) -> list[tuple[str, str]]: ...
+def statistics(name: str, page: str | None, report: str) -> str: ...
+def failed(name: str, message: str, help: str | None) -> str: ...
+def reduce(parts: Sequence[str]) -> str: ...
+def conclude(parts: Sequence[str], name: str, file: str, seed: int) -> tuple[str, str, str]: ...

@@ -14,7 +14,7 @@ use crate::error::raised;
 
 /// A recording in memory.
 #[pyclass(frozen, module = "greybox._native")]
-pub(crate) struct Recording(greybox_recording::Recording);
+pub(crate) struct Recording(pub(crate) greybox_recording::Recording);
 
 /// Header name, unit and values of a channel.
 type Column<'py> = (String, Option<String>, PyReadonlyArray1<'py, f64>);
@@ -179,7 +179,7 @@ pub(crate) struct Recordings {
 }
 
 /// As `--map` of the command: a symbol that is not built in may be declared by the model.
-fn rename(text: &str) -> Result<Rename, Failure> {
+pub(crate) fn rename(text: &str) -> Result<Rename, Failure> {
     let rename: Rename = text.parse().map_err(|e: RenameError| Failure::input(e.to_string()))?;
     match rename.unit.as_deref().map(Unit::parse) {
         Some(Err(error)) if error.unknown.is_none() => Err(Failure::input(error.to_string())),
@@ -224,6 +224,12 @@ impl Model {
     #[getter]
     fn file(&self) -> &str {
         &self.0.file
+    }
+
+    /// Where it was read, as errors name it.
+    #[getter]
+    fn path(&self) -> &Path {
+        &self.0.path
     }
 
     #[getter]

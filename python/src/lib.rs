@@ -5,6 +5,7 @@
 
 mod control;
 mod error;
+mod fleet;
 mod input;
 mod study;
 mod watch;
@@ -23,5 +24,14 @@ fn _native(module: &Bound<'_, PyModule>) -> PyResult<()> {
     module.add_function(wrap_pyfunction!(study::simulate, module)?)?;
     module.add_function(wrap_pyfunction!(study::check, module)?)?;
     module.add_function(wrap_pyfunction!(control::control, module)?)?;
+    module.add("EXTENSIONS", greybox_recording::EXTENSIONS.to_vec())?;
+    module.add("READS_PARQUET", cfg!(feature = "parquet"))?;
+    module.add_class::<fleet::Fleet>()?;
+    module.add_function(wrap_pyfunction!(fleet::content, module)?)?;
+    module.add_function(wrap_pyfunction!(fleet::mechanisms, module)?)?;
+    module.add_function(wrap_pyfunction!(fleet::statistics, module)?)?;
+    module.add_function(wrap_pyfunction!(fleet::failed, module)?)?;
+    module.add_function(wrap_pyfunction!(fleet::reduce, module)?)?;
+    module.add_function(wrap_pyfunction!(fleet::conclude, module)?)?;
     Ok(())
 }

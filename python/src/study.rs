@@ -18,7 +18,7 @@ use crate::input::{Model, Recordings, Source, Sources, hold};
 use crate::watch::watched;
 
 /// Work is asked for in these.
-const BILLION: u64 = 1_000_000_000;
+pub(crate) const BILLION: u64 = 1_000_000_000;
 
 /// Report, story, page, model and recordings of a study.
 type Studied<'py> = (String, String, Option<String>, String, Bound<'py, PyList>);

@@ -19,7 +19,7 @@ use crate::error::raised;
 const PATIENCE: Duration = Duration::from_millis(50);
 
 /// Stack of the thread that works, bytes: what the main thread of the command has.
-const STACK: usize = 8 << 20;
+pub(crate) const STACK: usize = 8 << 20;
 
 /// What the working thread says.
 enum Word<T> {

@@ -7,7 +7,6 @@ mod answer;
 mod arguments;
 mod case;
 mod commands;
-mod done;
 mod failure;
 mod log;
 mod output;
@@ -20,7 +19,7 @@ use std::process::ExitCode;
 use answer::OutputFormat;
 use arguments::Cli;
 use failure::Failure;
-use greybox_commands::{loading, story};
+use greybox_commands::loading;
 
 fn main() -> ExitCode {
     let arguments: Vec<OsString> = std::env::args_os().collect();

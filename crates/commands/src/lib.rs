@@ -15,6 +15,7 @@ pub mod check;
 pub mod control;
 pub mod diagnose;
 mod failure;
+pub mod fleet;
 mod foreign;
 pub mod identify;
 pub mod loading;

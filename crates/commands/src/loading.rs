@@ -131,8 +131,16 @@ pub fn mechanisms(folder: &Path) -> Result<Mechanisms, Failure> {
     for path in &files {
         texts.push((file_name(path), read_text(path)?));
     }
-    let library = library::combine(&texts).map_err(|e| Failure::mechanism(&e, &texts, folder))?;
+    let library = mechanisms_of(&texts, folder)?;
     Ok(Mechanisms { library, files, texts })
+}
+
+/// Adds mechanisms, each by name and text, to the built-in library; errors say that they stand in `folder`.
+///
+/// # Errors
+/// Bad input: a fault in one.
+pub fn mechanisms_of(texts: &[(String, String)], folder: &Path) -> Result<Library, Failure> {
+    library::combine(texts).map_err(|e| Failure::mechanism(&e, texts, folder))
 }
 
 /// The recordings of a folder, in the order of their names.
@@ -218,6 +226,27 @@ pub fn recordings(paths: &[PathBuf], map: &[Rename]) -> Result<Vec<Recording>, F
         read.push(recording);
     }
     Ok(read)
+}
+
+/// The bytes of the recording at `path`.
+///
+/// # Errors
+/// Bad input: a file that is missing, or a folder or a device in its place.
+pub fn content(path: &Path) -> Result<Vec<u8>, Failure> {
+    greybox_recording::content(path).map_err(|error| unreadable(path, error))
+}
+
+/// The recording in the bytes of the file at `path`, its channels renamed. Nothing need stand there: a path may be that
+/// of another machine, or a URL.
+///
+/// # Errors
+/// Bad input: any fault in it, or a channel to rename that it does not have.
+pub fn recording_of(bytes: Vec<u8>, path: &Path, map: &[Rename]) -> Result<Recording, Failure> {
+    let label = path.display().to_string();
+    let mut recording =
+        greybox_recording::parse(bytes, &label, &file_name(path)).map_err(|error| unreadable(path, error))?;
+    recording.rename(map)?;
+    Ok(recording)
 }
 
 /// An error where a recording is named twice.

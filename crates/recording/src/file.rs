@@ -9,6 +9,14 @@ use std::path::Path;
 #[cfg(any(feature = "mat", feature = "parquet"))]
 pub(crate) const ROOM: u64 = 2 << 30;
 
+/// The content of the file at `path`, for [`parse`](crate::parse).
+///
+/// # Errors
+/// No such file, a folder or a device in its place, or a file that cannot be read.
+pub fn content(path: impl AsRef<Path>) -> Result<Vec<u8>, RecordingError> {
+    bytes(path.as_ref()).map(|(content, ..)| content)
+}
+
 /// The content of the file at `path`, what errors call it, and its name.
 pub(crate) fn bytes(path: &Path) -> Result<(Vec<u8>, String, String), RecordingError> {
     let (label, name) = check_file(path)?;

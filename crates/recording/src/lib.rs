@@ -70,12 +70,12 @@ mod spectrum;
 pub use crate::correlation::Correlation;
 pub use crate::csv::{CsvBlocks, CsvLines, parse_csv, read_csv, write_csv, write_csv_file};
 pub use crate::error::{Place, RecordingError};
-pub use crate::file::is_device;
+pub use crate::file::{content, is_device};
 pub use crate::finding::{Finding, Severity, listed};
 #[cfg(feature = "mat")]
 pub use crate::mat::parse_mat;
 #[cfg(feature = "parquet")]
 pub use crate::parquet::parse_parquet;
-pub use crate::read::{EXTENSIONS, read};
+pub use crate::read::{EXTENSIONS, parse, read};
 pub use crate::recording::{Channel, MIN_SAMPLES, Piece, Recording, SIZES};
 pub use crate::rename::{Rename, RenameError};

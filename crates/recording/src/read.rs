@@ -30,24 +30,31 @@ pub const EXTENSIONS: [&str; 3] = ["csv", "mat", "parquet"];
 pub fn read(path: impl AsRef<Path>) -> Result<Recording, RecordingError> {
     let path = path.as_ref();
     let (bytes, label, name) = bytes(path)?;
-    let ending = path.extension().map(|e| e.to_string_lossy().to_ascii_lowercase()).unwrap_or_default();
-    match ending.as_str() {
+    parse(bytes, &label, &name)
+}
+
+/// The recording in the bytes of a file: what errors call the file, and its name, whose ending says the format as for
+/// [`read`].
+///
+/// # Errors
+/// As [`read`].
+pub fn parse(bytes: Vec<u8>, label: &str, name: &str) -> Result<Recording, RecordingError> {
+    let ending = Path::new(name).extension().map(|e| e.to_string_lossy().to_ascii_lowercase());
+    match ending.unwrap_or_default().as_str() {
         #[cfg(feature = "mat")]
-        "mat" => crate::mat::parse(&bytes, &label, &name),
+        "mat" => crate::mat::parse(&bytes, label, name),
         #[cfg(feature = "parquet")]
-        "parquet" => crate::parquet::parse(bytes, &label, &name),
+        "parquet" => crate::parquet::parse(bytes, label, name),
         #[cfg(not(feature = "mat"))]
-        "mat" => Err(RecordingError::NotBuiltIn {
-            place: Place::file(&label),
-            format: "MAT-files",
-            feature: "mat",
-        }),
+        "mat" => {
+            Err(RecordingError::NotBuiltIn { place: Place::file(label), format: "MAT-files", feature: "mat" })
+        }
         #[cfg(not(feature = "parquet"))]
         "parquet" => Err(RecordingError::NotBuiltIn {
-            place: Place::file(&label),
+            place: Place::file(label),
             format: "Parquet files",
             feature: "parquet",
         }),
-        _ => csv::parse(&bytes, &label, &name, 0),
+        _ => csv::parse(&bytes, label, name, 0),
     }
 }

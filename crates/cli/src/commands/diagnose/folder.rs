@@ -6,36 +6,18 @@ use std::path::{Path, PathBuf};
 use std::sync::atomic::{AtomicUsize, Ordering};
 use std::thread;
 
-use greybox_calibrate::Data;
-use greybox_commands::diagnose::{FILES, Results};
-use greybox_diagnose::{Options, Quiet};
-use greybox_recording::Rename;
-use greybox_report::contract::{ModelId, Producer};
+use greybox_commands::diagnose::FILES;
+use greybox_commands::fleet::{self, DONE, File, Fleet, Member, SUMMARY};
+use greybox_diagnose::Quiet;
 use greybox_report::summary::Statistics;
-use greybox_report::{Report, ReportError, merge};
 use serde_json::json;
 
 use super::{Arguments, tried};
 use crate::answer::Answer;
-use crate::done::{self, Done, Fingerprint, Inputs};
 use crate::failure::Failure;
-use crate::loading::{self, LoadedModel, Mechanisms, same_file};
+use crate::loading::{self, Mechanisms, same_file};
 use crate::output::OutputFolder;
 use crate::progress::Progress;
-use crate::story;
-
-/// The files that tell of all recordings.
-const SUMMARY: [&str; 2] = ["summary.json", "summary.html"];
-
-/// What all diagnoses of a folder share.
-struct Batch<'a> {
-    loaded: LoadedModel,
-    holdout: &'a [PathBuf],
-    map: &'a [Rename],
-    options: Options,
-    /// Those beside the built-in ones.
-    mechanisms: Vec<Fingerprint>,
-}
 
 /// One recording and where its results go.
 struct Task {
@@ -57,33 +39,24 @@ pub(super) fn run(arguments: &Arguments, folder: &Path, own: Option<&Mechanisms>
     let holdout = &arguments.inputs.study.holdout;
     let map = &arguments.inputs.study.channels.map;
     let loaded = loading::model(model)?;
+    loading::no_twins(holdout)?;
+    let held = holdout.iter().map(|path| file(path)).collect::<Result<_, _>>()?;
+    let texts = own.map_or(&[][..], |own| &own.texts);
     // A fault in what judges all recordings is told once.
-    Data::new(&loaded.model, &loading::recordings(holdout, map)?)?;
+    let fleet = Fleet::new(loaded, held, map.clone(), arguments.options(own), texts)?;
     let recordings = recordings(folder, holdout)?;
     let inputs = || [model].into_iter().chain(holdout).chain(own.iter().flat_map(|own| &own.files));
     let out = OutputFolder::prepare(place)?;
     out.spares(&SUMMARY, inputs())?;
     let tasks = tasks(&recordings, place)?;
     for task in &tasks {
-        task.out.spares(&[&FILES as &[&str], &[done::FILE]].concat(), inputs())?;
+        task.out.spares(&[&FILES as &[&str], &[DONE]].concat(), inputs())?;
     }
-    let batch = Batch {
-        loaded,
-        holdout,
-        map,
-        options: arguments.options(own),
-        mechanisms: own
-            .iter()
-            .flat_map(|own| &own.texts)
-            .map(|(name, text)| Fingerprint::of(name, text.as_bytes()))
-            .collect(),
-    };
-
     let kept = out.keep()?;
     let progress = Progress::steps(tasks.len() as u64);
     let outcomes = in_turn(&tasks, |task| {
         progress.stage(format!("diagnosing {}", task.name));
-        let outcome = panic::catch_unwind(AssertUnwindSafe(|| batch.diagnosed(task)));
+        let outcome = panic::catch_unwind(AssertUnwindSafe(|| diagnosed(&fleet, task)));
         progress.advance();
         outcome.unwrap_or_else(|_| Err(Failure::fault()))
     });
@@ -98,7 +71,7 @@ pub(super) fn run(arguments: &Arguments, folder: &Path, own: Option<&Mechanisms>
             }
             Err(failure) => {
                 let name = loading::file_name(&task.recording);
-                parts.push(merge::failed(&name, failure.message(), failure.advice()));
+                parts.push(fleet::failed(&name, &failure));
                 failures.push(failure);
             }
         }
@@ -107,17 +80,13 @@ pub(super) fn run(arguments: &Arguments, folder: &Path, own: Option<&Mechanisms>
         kept.give_up();
         return Err(Failure::all(folder, "no recording of this folder could be diagnosed", &failures));
     }
-    let summary = merge::conclude(
-        merge::reduce(parts).map_err(unwritten)?,
-        Producer { version: env!("CARGO_PKG_VERSION").to_owned(), seed: arguments.seed },
-        ModelId { name: batch.loaded.model.name.clone(), file: batch.loaded.file.clone() },
-    );
-    let text = summary.to_json().map_err(unwritten)?;
-    let html = summary.to_html().map_err(unwritten)?;
+    let model = fleet.model();
+    let summary = fleet::conclude(parts, &model.model.name, &model.file, arguments.seed)?;
     let [json_name, html_name] = SUMMARY;
-    out.write(&[(json_name, text.as_bytes()), (html_name, html.as_bytes())])?;
+    out.write(&[(json_name, summary.json.as_bytes()), (html_name, summary.html.as_bytes())])?;
 
-    let mut json: serde_json::Value = serde_json::from_str(&text).map_err(|e| unwritten(e.into()))?;
+    let mut json: serde_json::Value =
+        serde_json::from_str(&summary.json).map_err(|e| fleet::unwritten(e.into()))?;
     json["done_before"] = json!(before);
     let resumed = match before {
         0 => String::new(),
@@ -125,7 +94,7 @@ pub(super) fn run(arguments: &Arguments, folder: &Path, own: Option<&Mechanisms>
     };
     let words = format!(
         "{}\n{resumed}Written: {1}/{html_name}, {1}/{json_name}, and a folder for each recording in {1}\n",
-        story::summary(&summary) + &own.map(tried).unwrap_or_default(),
+        summary.story + &own.map(tried).unwrap_or_default(),
         place.display()
     );
     Ok(Answer::new(words, json))
@@ -187,62 +156,24 @@ fn in_turn<T: Sync, R: Send>(items: &[T], work: impl Fn(&T) -> R + Sync) -> Vec<
     done.into_iter().map(|(_, result)| result).collect()
 }
 
-impl Batch<'_> {
-    /// Diagnoses a recording and writes its results, unless that was done before.
-    ///
-    /// # Errors
-    /// As a diagnosis of this recording alone.
-    fn diagnosed(&self, task: &Task) -> Result<Diagnosed, Failure> {
-        let inputs = self.inputs(&task.recording)?;
-        let [json_name, html_name, _] = FILES;
-        let reported = |json: &str| {
-            let page = format!("{}/{html_name}", task.name);
-            let name = loading::file_name(&task.recording);
-            Report::from_json(json).map(|report| merge::map(&name, Some(&page), &report))
-        };
-        if let Some(statistics) =
-            Done::read(task.out.path(), &inputs, json_name).and_then(|json| reported(&json).ok())
-        {
-            return Ok(Diagnosed { statistics, before: true });
-        }
-        let (train, holdout) =
-            loading::train_and_holdout(std::slice::from_ref(&task.recording), self.holdout, self.map)?;
-        let diagnosis =
-            greybox_diagnose::diagnose(&self.loaded.model, &train, &holdout, &self.options, &Quiet)
-                .map_err(|e| Failure::diagnosis(&self.loaded.path, e))?;
-        let results = Results::of(&diagnosis, &self.loaded, &train, &holdout)?;
-        let done = serde_json::to_string_pretty(&Done::new(inputs, &results.files()))
-            .map_err(|e| unwritten(e.into()))?;
-        task.out.write(&[&results.files()[..], &[(done::FILE, done.as_bytes())]].concat())?;
-        Ok(Diagnosed { statistics: reported(&results.report_json).map_err(unwritten)?, before: false })
+/// Diagnoses a recording and writes its results, unless that was done before.
+///
+/// # Errors
+/// As a diagnosis of this recording alone.
+fn diagnosed(fleet: &Fleet, task: &Task) -> Result<Diagnosed, Failure> {
+    let file = file(&task.recording)?;
+    let name = loading::file_name(&task.recording);
+    let member = Member { file: &file, name: &name, folder: &task.name };
+    let read = |name: &str| fs::read(task.out.path().join(name)).ok();
+    if let Some(statistics) = fleet.finished(member, read) {
+        return Ok(Diagnosed { statistics, before: true });
     }
-
-    /// What the results of a recording depend on.
-    ///
-    /// # Errors
-    /// Bad input: a file that cannot be read.
-    fn inputs(&self, recording: &Path) -> Result<Inputs, Failure> {
-        let paths: Vec<PathBuf> =
-            [recording].into_iter().map(Path::to_owned).chain(self.holdout.iter().cloned()).collect();
-        let fingerprint = |path: &Path| {
-            let content = fs::read(path).map_err(|e| {
-                Failure::file(path, format!("the file cannot be read: {e}")).help("check its permissions")
-            })?;
-            Ok(Fingerprint::of(loading::called(path, &paths), &content))
-        };
-        Ok(Inputs {
-            greybox: env!("CARGO_PKG_VERSION").to_owned(),
-            seed: self.options.seed,
-            work: self.options.work,
-            model: Fingerprint::of(&self.loaded.file, self.loaded.text.as_bytes()),
-            recording: fingerprint(recording)?,
-            holdout: self.holdout.iter().map(|path| fingerprint(path)).collect::<Result<_, Failure>>()?,
-            map: self.map.iter().map(Rename::to_string).collect(),
-            mechanisms: self.mechanisms.clone(),
-        })
-    }
+    let outcome = fleet.diagnose(member, &Quiet)?;
+    let files: Vec<(&str, &[u8])> = outcome.files.iter().map(|(name, c)| (*name, c.as_slice())).collect();
+    task.out.write(&files)?;
+    Ok(Diagnosed { statistics: outcome.statistics, before: false })
 }
 
-fn unwritten(error: ReportError) -> Failure {
-    Failure::internal(error.to_string())
+fn file(path: &Path) -> Result<File, Failure> {
+    Ok(File { path: path.to_owned(), bytes: loading::content(path)? })
 }

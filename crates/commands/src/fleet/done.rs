@@ -1,12 +1,9 @@
 //! The mark of a finished diagnosis: what it was made from and what it wrote, so that the same work is not done twice.
 
-use std::fs;
-use std::path::Path;
-
 use serde::{Deserialize, Serialize};
 
 /// Name of the mark among the results.
-pub(crate) const FILE: &str = "done.json";
+pub const DONE: &str = "done.json";
 
 /// The content of a mark.
 #[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
@@ -66,16 +63,20 @@ impl Done {
         }
     }
 
-    /// The content of the file `wanted` in a folder whose mark says that it was made from `inputs`, and whose results are
-    /// all as they were written. Anything else, whatever it is, is no finished diagnosis.
-    pub(crate) fn read(folder: &Path, inputs: &Inputs, wanted: &str) -> Option<String> {
-        let done: Done = serde_json::from_slice(&fs::read(folder.join(FILE)).ok()?).ok()?;
+    /// The content of the result `wanted` where `read` gives a mark that says that it was made from `inputs`, and all
+    /// results as they were written. Anything else, whatever it is, is no finished diagnosis.
+    pub(crate) fn read(
+        read: impl Fn(&str) -> Option<Vec<u8>>,
+        inputs: &Inputs,
+        wanted: &str,
+    ) -> Option<String> {
+        let done: Done = serde_json::from_slice(&read(DONE)?).ok()?;
         if done.inputs != *inputs {
             return None;
         }
         let mut found = None;
         for fingerprint in &done.results {
-            let content = fs::read(folder.join(&fingerprint.name)).ok()?;
+            let content = read(&fingerprint.name)?;
             if Fingerprint::of(fingerprint.name.clone(), &content) != *fingerprint {
                 return None;
             }
@@ -113,24 +114,22 @@ mod tests {
 
     #[test]
     fn only_whole_results_of_the_same_inputs_are_taken() {
-        let folder = tempfile::tempdir().unwrap();
-        let path = folder.path();
         let results: [(&str, &[u8]); 2] = [("a", b"1"), ("b", b"2")];
         let mark = serde_json::to_vec(&Done::new(inputs(b"x"), &results)).unwrap();
-        let write = || {
-            results.iter().for_each(|(name, content)| fs::write(path.join(name), content).unwrap());
-            fs::write(path.join(FILE), &mark).unwrap();
+        let read = |files: &[(&str, &[u8])], recording: &[u8]| {
+            let file = |name: &str| files.iter().find(|(n, _)| *n == name).map(|(_, c)| c.to_vec());
+            Done::read(file, &inputs(recording), "b")
         };
-        assert_eq!(Done::read(path, &inputs(b"x"), "b"), None, "nothing is there");
-        write();
-        assert_eq!(Done::read(path, &inputs(b"x"), "b").as_deref(), Some("2"));
-        assert_eq!(Done::read(path, &inputs(b"y"), "b"), None, "another recording");
-        fs::write(path.join("a"), "3").unwrap();
-        assert_eq!(Done::read(path, &inputs(b"x"), "b"), None, "a result was changed");
-        fs::remove_file(path.join("a")).unwrap();
-        assert_eq!(Done::read(path, &inputs(b"x"), "b"), None, "a result is gone");
-        write();
-        fs::write(path.join(FILE), &mark[..mark.len() / 2]).unwrap();
-        assert_eq!(Done::read(path, &inputs(b"x"), "b"), None, "half a mark");
+        let whole = [results[0], results[1], (DONE, &mark)];
+        assert_eq!(read(&[], b"x"), None, "nothing is there");
+        assert_eq!(read(&whole, b"x").as_deref(), Some("2"));
+        assert_eq!(read(&whole, b"y"), None, "another recording");
+        assert_eq!(read(&[("a", b"3"), results[1], (DONE, &mark)], b"x"), None, "a result was changed");
+        assert_eq!(read(&whole[1..], b"x"), None, "a result is gone");
+        assert_eq!(
+            read(&[results[0], results[1], (DONE, &mark[..mark.len() / 2])], b"x"),
+            None,
+            "half a mark"
+        );
     }
 }

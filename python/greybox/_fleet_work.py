@@ -1,0 +1,117 @@
+"""The work of one recording, as a worker does it."""
+
+from __future__ import annotations
+
+import functools
+import io
+from dataclasses import dataclass, field
+from typing import Any
+
+from . import _native
+from ._errors import GreyboxError, InputError
+from ._inputs import Recording
+from ._places import Folder, Options, content, entries, join
+
+#: Columns that may be the time of a frame.
+_TIMES = ("t", "time", "Time", "tout", "timestamp")
+
+
+@dataclass(frozen=True)
+class Plan:
+    """What is the same for all recordings."""
+
+    model_text: str
+    model_path: str
+    holdout: tuple[str, ...]
+    map: tuple[str, ...]
+    seed: int
+    work: int | None
+    mechanisms: tuple[tuple[str, str], ...]
+    threads: int
+    out: str | None
+    options: Options = field(compare=False)
+
+
+@dataclass(frozen=True)
+class Run:
+    """A recording: where it stands, what the summary calls it, and the folder of its results."""
+
+    place: str
+    name: str
+    folder: str
+    #: A folder of Parquet files that hold one recording.
+    partition: bool = False
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """What a worker says of a recording."""
+
+    statistics: str
+    #: It was there from a run before.
+    before: bool = False
+    #: It could not be diagnosed: why.
+    failure: str | None = None
+
+
+@functools.lru_cache(maxsize=4)
+def fleet(plan: Plan) -> _native.Fleet:
+    """The plan, read: once in a process."""
+    held = [(place, content(place, plan.options)) for place in plan.holdout]
+    model = _native.Model(plan.model_text, plan.model_path)
+    return _native.Fleet(model, held, list(plan.map), plan.seed, plan.work, list(plan.mechanisms))
+
+
+def work(plan: Plan, run: Run) -> Outcome:
+    """Diagnoses a recording and writes its results, unless that was done before. What is wrong with a recording, its
+    file or the place of its results is an answer, not an exception."""
+    try:
+        return _work(plan, run)
+    except GreyboxError as error:
+        message, help = error.message, error.help
+    except Exception as error:
+        message, help = f"{run.place}: {type(error).__name__}: {error}", None
+    return Outcome(_native.failed(run.name, message, help), failure=message)
+
+
+def _work(plan: Plan, run: Run) -> Outcome:
+    shared = fleet(plan)
+    parts = [content(place, plan.options) for place in _parts(run, plan.options)]
+    whole = b"".join(parts)
+    results = None if plan.out is None else Folder(join(plan.out, run.folder), plan.options)
+    if results is not None:
+        found = shared.finished(run.place, whole, run.name, run.folder, results.read)
+        if found is not None:
+            return Outcome(found, before=True)
+    recording = None
+    if run.partition or (run.place.endswith(".parquet") and not _native.READS_PARQUET):
+        recording = _frames(parts, run)._inner
+    files, statistics = shared.diagnose(run.place, whole, run.name, run.folder, recording, plan.threads)
+    if results is not None:
+        results.write(files)
+    return Outcome(statistics)
+
+
+def _parts(run: Run, options: Options) -> list[str]:
+    if not run.partition:
+        return [run.place]
+    return [place for place in entries(run.place, options) if place.endswith(".parquet")]
+
+
+def _frames(parts: list[bytes], run: Run) -> Recording:
+    """The recording that Parquet files hold together, sorted by time."""
+    try:
+        import pandas
+    except ImportError:
+        raise ImportError("Parquet files need pandas and pyarrow: pip install pandas pyarrow") from None
+    frame: Any = pandas.concat([pandas.read_parquet(io.BytesIO(part)) for part in parts], ignore_index=True)
+    times = [column for column in frame.columns if str(column).split(" [")[0] in _TIMES]
+    if not times:
+        there = ", ".join(f"`{column}`" for column in frame.columns)
+        raise InputError(f"{run.place}: there is no time among {there}; call the column of times, in s, `t`")
+    time = times[0]
+    frame = frame.sort_values(time, kind="stable")
+    if frame[time].dtype.kind == "M":
+        frame[time] = (frame[time] - frame[time].iloc[0]).dt.total_seconds()
+    plain = frame.select_dtypes(["number", "bool"]).rename(columns={time: str(time).replace(str(time).split(" [")[0], "t", 1)})
+    return Recording(plain, run.name)
