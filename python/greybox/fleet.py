@@ -22,7 +22,8 @@ from ._engines import each, engine
 from ._errors import GreyboxError, InputError, InternalError
 from ._fleet_work import Outcome, Plan, Run, fleet, work as _work
 from ._inputs import ModelLike, model as native, renames
-from ._places import Folder, Options, entries, is_folder, is_url, join, matching
+from ._places import Folder, Options, entries, is_folder, is_url, matching
+from ._tables import RunsLike, table
 from ._records import Named, Record
 from ._results import Diagnosis, _Result, _write
 
@@ -98,8 +99,8 @@ def reduce(parts: Iterable[Statistics]) -> Statistics:
     return Statistics(_native.reduce([part.to_json() for part in parts]))
 
 
-def conclude(statistics: Statistics, model: ModelLike, seed: int = 0) -> Summary:
-    """What the recordings say together.
+def conclude(statistics: Statistics, model: ModelLike, seed: int = 0, runs: RunsLike | None = None) -> Summary:
+    """What the recordings say together; over the machines too, where ``runs`` says which each is of.
 
     >>> import greybox
     >>> from greybox import fleet
@@ -116,7 +117,7 @@ def conclude(statistics: Statistics, model: ModelLike, seed: int = 0) -> Summary
     Summary(1 failed)
     """
     inner = native(model)
-    return Summary(_native.conclude([statistics.to_json()], inner.name, inner.file, seed))
+    return Summary(_native.conclude([statistics.to_json()], table(runs), inner.name, inner.file, seed))
 
 
 def diagnose(
@@ -126,6 +127,7 @@ def diagnose(
     on: Any = None,
     out: Place | None = None,
     holdout: Place | Iterable[Place] | None = None,
+    runs: RunsLike | None = None,
     map: Mapping[str, str] | None = None,
     seed: int = 0,
     work: int | None = None,
@@ -149,6 +151,9 @@ def diagnose(
             process.
         out: folder of the results, as of the command, or its URL; none where only the summary is wanted.
         holdout: files that judge every recording, and are not diagnosed themselves.
+        runs: which machine each recording is of, when it was made and under what conditions: a CSV file, a frame or a dict of
+            columns ``recording`` (its name in the summary), ``machine``, ``date``, and covariates such as
+            ``temperature [degC]``.
         map, seed, work, mechanisms: as of :func:`greybox.diagnose`.
         threads: how many cores the diagnosis of one recording uses.
         storage_options: arguments of the file system behind the URLs.
@@ -176,24 +181,27 @@ def diagnose(
     )
     # A fault in what all share is told once.
     fleet(plan)
-    runs = _runs([place for place in _places(recordings, storage_options) if place not in held], storage_options)
+    told_of = table(runs)
+    work_on = _runs([place for place in _places(recordings, storage_options) if place not in held], storage_options)
+    if told_of is not None:
+        _native.check_table(*told_of, [run.name for run in work_on])
     parts: list[str] = []
     failures: list[str] = []
     before = 0
     with engine(on, threads) as submit:
-        for count, (run, future) in enumerate(each(submit, _work, plan, runs), start=1):
-            outcome = _outcome(run, future, count - 1, len(runs), plan.out)
+        for count, (run, future) in enumerate(each(submit, _work, plan, work_on), start=1):
+            outcome = _outcome(run, future, count - 1, len(work_on), plan.out)
             parts.append(outcome.statistics)
             before += outcome.before
             if outcome.failure is not None:
                 failures.append(outcome.failure)
             if progress is not None:
                 said = "failed" if outcome.failure is not None else "done before" if outcome.before else "done"
-                progress(f"{run.name}: {said} ({count} of {len(runs)})")
-    if len(failures) == len(runs):
+                progress(f"{run.name}: {said} ({count} of {len(work_on)})")
+    if len(failures) == len(work_on):
         reported = "".join(f"\n  {failure}" for failure in sorted(failures))
         raise InputError(f"no recording could be diagnosed:{reported}")
-    told = _native.conclude(parts, inner.name, inner.file, seed)
+    told = _native.conclude(parts, told_of, inner.name, inner.file, seed)
     if plan.out is not None:
         text, _, page = told
         Folder(plan.out, storage_options).write([("summary.json", text.encode()), ("summary.html", page.encode())])

@@ -4,7 +4,7 @@ use std::cell::RefCell;
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
 
-use greybox_commands::fleet::{self, File, Member};
+use greybox_commands::fleet::{self, File, Member, Table};
 use greybox_commands::{Failure, loading};
 use greybox_diagnose::Options;
 use greybox_report::summary::Statistics;
@@ -149,17 +149,29 @@ pub(crate) fn reduce(py: Python<'_>, parts: Vec<String>) -> PyResult<String> {
     text_of(py, &raised(py, joined.map_err(fleet::unwritten))?)
 }
 
-/// The text of summary.json, its story, and the page.
+/// Sees that a table of recordings can be read and has these.
 #[pyfunction]
+pub(crate) fn check_table(py: Python<'_>, text: &str, file: &str, recordings: Vec<String>) -> PyResult<()> {
+    raised(py, Table::new(text, file, recordings.iter().map(String::as_str)).map(drop))
+}
+
+/// The text of summary.json, its story, and the page; `table` is the text of a table of the recordings, and what errors
+/// call it.
+#[pyfunction]
+#[pyo3(signature = (parts, table, name, file, seed))]
 pub(crate) fn conclude(
     py: Python<'_>,
     parts: Vec<String>,
+    table: Option<(String, String)>,
     name: &str,
     file: &str,
     seed: u64,
 ) -> PyResult<(String, String, String)> {
     let parts = statistics_of(py, &parts)?;
-    let concluded = py.detach(|| fleet::conclude(parts, name, file, seed));
+    let concluded = py.detach(|| {
+        let table = table.map(|(text, file)| Table::new(&text, &file, [])).transpose()?;
+        fleet::conclude(parts, table.as_ref(), name, file, seed)
+    });
     raised(py, concluded).map(|c| (c.json, c.story, c.html))
 }
 

@@ -32,6 +32,7 @@ fn _native(module: &Bound<'_, PyModule>) -> PyResult<()> {
     module.add_function(wrap_pyfunction!(fleet::statistics, module)?)?;
     module.add_function(wrap_pyfunction!(fleet::failed, module)?)?;
     module.add_function(wrap_pyfunction!(fleet::reduce, module)?)?;
+    module.add_function(wrap_pyfunction!(fleet::check_table, module)?)?;
     module.add_function(wrap_pyfunction!(fleet::conclude, module)?)?;
     Ok(())
 }

@@ -6,6 +6,7 @@ use std::path::Path;
 
 use greybox_calibrate::DataError;
 use greybox_diagnose::{DiagnoseError, MechanismError};
+use greybox_fleet::RunsError;
 use greybox_identify::IdentifyError;
 use greybox_model::{ModelError, nearest};
 use greybox_recording::{RecordingError, RenameError};
@@ -300,6 +301,12 @@ impl From<RecordingError> for Failure {
 }
 
 /// The message holds its own fix, but for the name that was meant.
+impl From<RunsError> for Failure {
+    fn from(error: RunsError) -> Failure {
+        Failure::input(error.to_string())
+    }
+}
+
 impl From<RenameError> for Failure {
     fn from(error: RenameError) -> Failure {
         let failure = Failure::input(error.to_string());

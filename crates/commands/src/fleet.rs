@@ -10,9 +10,10 @@ use std::path::{Path, PathBuf};
 
 use greybox_calibrate::Data;
 use greybox_diagnose::{Options, ProgressListener};
+use greybox_fleet::Runs;
 use greybox_recording::{Recording, Rename};
 use greybox_report::contract::{ModelId, Producer};
-use greybox_report::summary::{Statistics, Summary};
+use greybox_report::summary::{Run, Statistics, Summary};
 use greybox_report::{Report, ReportError, merge};
 
 use crate::diagnose::{FILES, Results};
@@ -212,13 +213,65 @@ pub fn failed(name: &str, failure: &Failure) -> Statistics {
     merge::failed(name, failure.message(), failure.advice())
 }
 
-/// What the recordings say together of a model called `name`, read from `file`, diagnosed with this seed.
+/// A table of the recordings: machines, dates, covariates.
+#[derive(Debug)]
+pub struct Table {
+    runs: Runs,
+    /// What errors call it.
+    file: String,
+}
+
+impl Table {
+    /// Reads the table in `text`, which errors call `file`, and sees that it has a row for each of these recordings.
+    ///
+    /// # Errors
+    /// Bad input: a fault in the table, or a recording that it does not have.
+    pub fn new<'a>(
+        text: &str,
+        file: &str,
+        recordings: impl IntoIterator<Item = &'a str>,
+    ) -> Result<Table, Failure> {
+        let runs = Runs::parse(text, file)?;
+        for recording in recordings {
+            runs.of(recording, file)?;
+        }
+        Ok(Table { runs, file: file.to_owned() })
+    }
+
+    /// Tells each recording of its row.
+    fn attach(&self, statistics: &mut Statistics) -> Result<(), Failure> {
+        for recording in &mut statistics.recordings {
+            let run = self.runs.of(&recording.recording, &self.file)?;
+            let known =
+                self.runs.covariates.iter().zip(&run.covariates).filter(|(_, value)| value.is_finite());
+            recording.run = Some(Run {
+                machine: run.machine.clone(),
+                date: (!run.date.is_empty()).then(|| run.date.clone()),
+                covariates: known.map(|(covariate, value)| (covariate.header(), *value)).collect(),
+            });
+        }
+        Ok(())
+    }
+}
+
+/// What the recordings say together of a model called `name`, read from `file`, diagnosed with this seed; over the machines
+/// too, where a table says which each is of.
 ///
 /// # Errors
-/// An internal failure where the summary cannot be written.
-pub fn conclude(parts: Vec<Statistics>, name: &str, file: &str, seed: u64) -> Result<Conclusion, Failure> {
+/// Bad input: a recording that the table does not have. An internal failure where the summary cannot be written.
+pub fn conclude(
+    parts: Vec<Statistics>,
+    table: Option<&Table>,
+    name: &str,
+    file: &str,
+    seed: u64,
+) -> Result<Conclusion, Failure> {
+    let mut statistics = merge::reduce(parts).map_err(unwritten)?;
+    if let Some(table) = table {
+        table.attach(&mut statistics)?;
+    }
     let summary: Summary = merge::conclude(
-        merge::reduce(parts).map_err(unwritten)?,
+        statistics,
         Producer { version: env!("CARGO_PKG_VERSION").to_owned(), seed },
         ModelId { name: name.to_owned(), file: file.to_owned() },
     );

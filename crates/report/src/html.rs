@@ -9,6 +9,7 @@
 mod compare;
 mod control;
 mod identified;
+mod machines;
 mod summary;
 
 use std::fmt::Write as _;

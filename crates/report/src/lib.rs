@@ -8,7 +8,7 @@
 //! - [`identified`]: the same for an identification: [`IdentifyReport`]
 //! - [`control`]: what the page of a controller shows; [`ControlPage::to_html`] writes it
 //! - [`merge`]: many reports as one [`Summary`], by [`merge::map`] and [`merge::reduce`]; [`mod@summary`] has its types,
-//!   [`mod@pool`] the statistics
+//!   `greybox-fleet` the statistics
 //! - [`page`]: what the page shows beside it; [`Page::to_html`] writes the file
 //! - [`sentence`]: the conclusion in plain language, to fill [`Report::summary`]
 //! - [`suggest`]: the experiment that separates a mechanism from its alternatives
@@ -48,10 +48,10 @@ pub mod expression;
 pub mod format;
 mod html;
 pub mod identified;
+mod machines;
 pub mod merge;
 pub mod notes;
 pub mod page;
-pub mod pool;
 pub mod sentence;
 pub mod suggest;
 pub mod summary;

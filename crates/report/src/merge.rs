@@ -43,12 +43,13 @@
 
 use std::collections::BTreeMap;
 
+use greybox_fleet::{Effect, pool};
 use serde::Serialize;
 
 use crate::contract::{
     Estimate, FitSet, Mechanism, ModelId, Ordered, Parameter, Producer, Report, Score, Verdict,
 };
-use crate::pool::{Effect, pool};
+use crate::machines::Fleet;
 use crate::summary::{
     ErrorsOver, Heterogeneity, Law, MechanismOver, MechanismResult, Method, ParameterOver, Pooled,
     RecordingEstimate, RecordingFailure, RecordingResult, Spread, Statistics, Summary, Verdicts,
@@ -65,6 +66,7 @@ pub fn map(recording: &str, page: Option<&str>, report: &Report) -> Statistics {
         mechanisms: report.mechanisms.iter().map(mechanism).collect(),
         parameters: report.parameters.clone(),
         holdout: report.fit.holdout.clone(),
+        run: None,
     };
     Statistics { recordings: vec![result], failed: Vec::new() }
 }
@@ -121,14 +123,17 @@ fn set<T: Serialize>(items: Vec<T>, name: impl Fn(&T) -> &String) -> Result<Vec<
 }
 
 /// What recordings of one model say together.
+///
+/// Where a table says which machine was recorded ([`RecordingResult::run`]), over the machines too.
 pub fn conclude(statistics: Statistics, greybox: Producer, model: ModelId) -> Summary {
+    let fleet = Fleet::of(&statistics.recordings);
     let mut summary = Summary {
         greybox,
         model,
         summary: Vec::new(),
         verdicts: verdicts(&statistics),
-        mechanisms: mechanisms(&statistics.recordings),
-        parameters: parameters(&statistics.recordings),
+        mechanisms: mechanisms(&statistics.recordings, &fleet),
+        parameters: parameters(&statistics.recordings, &fleet),
         holdout: holdout(&statistics.recordings),
         statistics,
     };
@@ -146,33 +151,35 @@ fn verdicts(statistics: &Statistics) -> Verdicts {
     }
 }
 
-fn mechanisms(recordings: &[RecordingResult]) -> Vec<MechanismOver> {
+fn mechanisms(recordings: &[RecordingResult], fleet: &Fleet<'_>) -> Vec<MechanismOver> {
     let mut by_law: BTreeMap<&Law, Vec<(&str, &MechanismResult)>> = BTreeMap::new();
     for recording in recordings {
         for mechanism in &recording.mechanisms {
             by_law.entry(&mechanism.law).or_default().push((&recording.recording, mechanism));
         }
     }
-    let mut out: Vec<MechanismOver> = by_law.into_iter().map(|(law, found)| over(law, &found)).collect();
+    let mut out: Vec<MechanismOver> =
+        by_law.into_iter().map(|(law, found)| over(law, &found, fleet)).collect();
     // A stable sort: laws found equally often stay in their own order.
     out.sort_by_key(|m| std::cmp::Reverse(m.found_in.len()));
     out
 }
 
-fn over(law: &Law, found: &[(&str, &MechanismResult)]) -> MechanismOver {
+fn over(law: &Law, found: &[(&str, &MechanismResult)], fleet: &Fleet<'_>) -> MechanismOver {
     let estimates = found.iter().flat_map(|&(recording, m)| {
         m.parameters.iter().map(move |(name, estimate)| (name.as_str(), recording, estimate.clone()))
     });
     MechanismOver {
         law: law.clone(),
         found_in: found.iter().map(|(recording, _)| (*recording).to_owned()).collect(),
+        machines: fleet.share(found.iter().map(|(recording, _)| *recording)),
         share_explained: Spread::of(found.iter().map(|(_, m)| m.share_explained)),
         confidence: Spread::of(found.iter().map(|(_, m)| m.confidence)),
-        parameters: pooled_by_name(estimates),
+        parameters: pooled_by_name(estimates, fleet),
     }
 }
 
-fn parameters(recordings: &[RecordingResult]) -> Ordered<ParameterOver> {
+fn parameters(recordings: &[RecordingResult], fleet: &Fleet<'_>) -> Ordered<ParameterOver> {
     let free = || {
         recordings.iter().flat_map(|r| {
             r.parameters
@@ -184,7 +191,7 @@ fn parameters(recordings: &[RecordingResult]) -> Ordered<ParameterOver> {
     let estimate =
         |p: &Parameter| Estimate { value: p.value, ci95: p.ci95, unit: p.unit.clone().unwrap_or_default() };
     let nominal: BTreeMap<&str, f64> = free().map(|(name, _, p)| (name, p.nominal)).collect();
-    pooled_by_name(free().map(|(name, recording, p)| (name, recording, estimate(p))))
+    pooled_by_name(free().map(|(name, recording, p)| (name, recording, estimate(p))), fleet)
         .into_iter()
         .map(|(name, pooled)| {
             let nominal = nominal.get(name.as_str()).copied().unwrap_or(f64::NAN);
@@ -194,21 +201,30 @@ fn parameters(recordings: &[RecordingResult]) -> Ordered<ParameterOver> {
 }
 
 /// Pools (name, recording, estimate) by name, in the order in which the names first come.
-fn pooled_by_name<'a>(all: impl Iterator<Item = (&'a str, &'a str, Estimate)>) -> Ordered<Pooled> {
+fn pooled_by_name<'a>(
+    all: impl Iterator<Item = (&'a str, &'a str, Estimate)>,
+    fleet: &Fleet<'_>,
+) -> Ordered<Pooled> {
     let mut by_name: Ordered<Vec<(&str, Estimate)>> = Ordered::new();
     for (name, recording, estimate) in all {
         by_name.entry(name.to_owned()).or_default().push((recording, estimate));
     }
-    by_name.into_iter().map(|(name, estimates)| (name, pooled(&estimates))).collect()
+    by_name.into_iter().map(|(name, estimates)| (name, pooled(&estimates, fleet))).collect()
 }
 
-fn pooled(estimates: &[(&str, Estimate)]) -> Pooled {
-    let effects: Vec<Effect> = estimates.iter().filter_map(|(_, e)| Effect::of(e.value, e.ci95)).collect();
+fn pooled(estimates: &[(&str, Estimate)], fleet: &Fleet<'_>) -> Pooled {
+    let named: Vec<(&str, Effect)> = estimates
+        .iter()
+        .filter_map(|(recording, e)| {
+            Some((*recording, Effect::of(e.value, e.ci95.map(|i| [i.low, i.high]))?))
+        })
+        .collect();
+    let effects: Vec<Effect> = named.iter().map(|(_, effect)| *effect).collect();
     let pool = pool(&effects);
     let heterogeneity = pool.and_then(|p| p.heterogeneity);
     Pooled {
         value: pool.map_or(f64::NAN, |p| p.value),
-        ci95: pool.map(|p| p.ci95()),
+        ci95: pool.map(|p| p.ci95().into()),
         unit: estimates.first().map(|(_, e)| e.unit.clone()).unwrap_or_default(),
         method: match (pool, heterogeneity) {
             (None, _) => Method::None,
@@ -231,6 +247,7 @@ fn pooled(estimates: &[(&str, Estimate)]) -> Pooled {
                 ci95: e.ci95,
             })
             .collect(),
+        machines: fleet.over(&named),
     }
 }
 

@@ -1,9 +1,10 @@
 //! The conclusion in plain language, worded from the numbers of a [`Report`]; [`identified`] does the same
-//! for an identification, [`recordings`] for many recordings.
+//! for an identification, [`recordings`] for many recordings, [`machines`] for many machines.
 
 pub mod comparison;
 pub mod control;
 pub mod identified;
+pub mod machines;
 pub mod recordings;
 
 use crate::contract::{

@@ -40,6 +40,22 @@ pub struct RecordingResult {
     pub parameters: Ordered<Parameter>,
     /// The three models on data held out.
     pub holdout: FitSet,
+    /// Which machine was recorded, when and under what conditions; absent where no table says so.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub run: Option<Run>,
+}
+
+/// Which machine was recorded, when and under what conditions.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize, JsonSchema)]
+pub struct Run {
+    /// Name of the machine.
+    pub machine: String,
+    /// Date, as the table has it.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub date: Option<String>,
+    /// Values by the header of their column, `name` or `name [unit]`, those that are known; `date [a]` is the date in
+    /// Julian years since 1970.
+    pub covariates: Ordered<f64>,
 }
 
 /// A recording that could not be diagnosed.
@@ -146,6 +162,9 @@ pub struct MechanismOver {
     pub law: Law,
     /// Names of the recordings in which it is found.
     pub found_in: Vec<String>,
+    /// In how many machines it is found; absent where no table says which machine was recorded.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub machines: Option<ShareOver>,
     /// Share explained, over those recordings.
     pub share_explained: Spread,
     /// Confidence, over those recordings.
@@ -184,6 +203,81 @@ pub struct Pooled {
     pub heterogeneity: Option<Heterogeneity>,
     /// The estimates, in the order of the recordings.
     pub estimates: Vec<RecordingEstimate>,
+    /// Over the machines; absent where no table says which machine was recorded, or fewer than three give an interval.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub machines: Option<MachinesOver>,
+}
+
+/// The share of machines in which a mechanism is found ([`greybox_fleet::share()`]).
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize, JsonSchema)]
+pub struct ShareOver {
+    /// Names of the machines in which it is found: in at least half of their recordings.
+    pub found_in: Vec<String>,
+    /// How many machines have a diagnosed recording.
+    pub of: usize,
+    /// 95 % confidence interval of the share among all machines of the kind.
+    pub ci95: Interval,
+}
+
+/// A number over machines, by a mixed-effects model ([`greybox_fleet::machines`]).
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize, JsonSchema)]
+pub struct MachinesOver {
+    /// Mean over the machines that do not differ, at the mean of the covariates.
+    pub value: f64,
+    /// 95 % confidence interval of `value`.
+    pub ci95: Interval,
+    /// Standard deviation of the true value from machine to machine.
+    pub between: f64,
+    /// Standard deviation of the true value from recording to recording of one machine; absent where no machine has two.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub within: Option<f64>,
+    /// How it depends on the covariates.
+    pub slopes: Vec<SlopeOver>,
+    /// Each machine, in the order of the names.
+    pub machines: Vec<MachineEstimate>,
+}
+
+/// How a number depends on a covariate.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize, JsonSchema)]
+pub struct SlopeOver {
+    /// Header of the covariate's column.
+    pub covariate: String,
+    /// From recording to recording of one machine, or from machine to machine.
+    pub level: Level,
+    /// Change per unit of the covariate.
+    pub value: f64,
+    /// 95 % confidence interval of `value`.
+    pub ci95: Interval,
+    /// Probability of so steep a slope where there is none.
+    pub p_value: f64,
+    /// Whether it is taken for real: the probability is below 0.05 over the number of slopes.
+    pub significant: bool,
+}
+
+/// What a slope is of.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize, JsonSchema)]
+#[serde(rename_all = "snake_case")]
+pub enum Level {
+    /// One machine changes with the covariate.
+    Within,
+    /// Machines of other covariates are other machines.
+    Between,
+}
+
+/// The value of one machine.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize, JsonSchema)]
+pub struct MachineEstimate {
+    /// Name of the machine.
+    pub machine: String,
+    /// How many of its recordings give an interval.
+    pub recordings: usize,
+    /// Best estimate, drawn towards the other machines unless it differs from them.
+    pub value: f64,
+    /// 95 % confidence interval of `value`.
+    pub ci95: Interval,
+    /// Probability of so large a difference from the others; present where the machine is taken to differ.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub differs: Option<f64>,
 }
 
 /// How estimates are pooled.

@@ -676,6 +676,7 @@ mod tests {
                 estimate("<a>.csv", 1.0, Some(Interval::new(0.5, 1.5))),
                 estimate("a_recording_of_monday_morning.csv", 3.0, None),
             ],
+            machines: None,
         };
         let svg = forest_plot(&pooled, "fc [N]", "a \"forest\"").unwrap();
         assert_eq!((svg.matches("class=\"mark\"").count(), svg.matches("class=\"whisker\"").count()), (2, 1));

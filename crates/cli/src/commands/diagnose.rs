@@ -23,6 +23,7 @@ use crate::study::{BILLION, ModelStudy, Study, whole};
   greybox diagnose link.toml run1.csv --mechanisms mine --out result
   greybox diagnose link.toml run1.mat --map \"theta=sensor_3 [deg]\" --out result
   greybox diagnose link.toml recordings --out results
+  greybox diagnose link.toml recordings --runs runs.csv --out results
   greybox diagnose link.toml run1.csv --out result --save-case case
 
 DIR receives report.json, report.html (self-contained, with plots) and improved.toml. With no --holdout, the
@@ -30,7 +31,9 @@ last fifth of each recording is held out. The same seed and inputs give the same
 
 A folder in the place of TRAIN.csv stands alone: each of its recordings (*.csv, *.mat, *.parquet) that is not held out
 is diagnosed by itself, into a folder of its own in DIR, and summary.html and summary.json say what all say together. The
-same command resumes an interrupted run: what is done is not done again.
+same command resumes an interrupted run: what is done is not done again. With --runs they also say in which share of the
+machines something is found, what each machine has of its own, what changes with date and temperature, and which machines
+differ.
 
 Something wrong? --save-case packs what another needs to see why, without one value of the recordings; with --with-data
 they are in it, and it runs again by the command in its README.md.")]
@@ -45,6 +48,10 @@ pub(crate) struct Arguments {
     /// Folder of mechanisms of your own (*.toml), tried beside the built-in ones
     #[arg(long, value_name = "DIR")]
     mechanisms: Option<PathBuf>,
+
+    /// Table of a folder's recordings (CSV): `recording`, `machine`, `date`, and covariates such as `temperature [degC]`
+    #[arg(long, value_name = "RUNS.csv")]
+    runs: Option<PathBuf>,
 
     /// Most work of the search, in billions of operations; the report says when it was not enough
     #[arg(long, value_name = "N", value_parser = whole, default_value_t = Options::default().work / BILLION, allow_negative_numbers = true)]
@@ -81,6 +88,10 @@ fn work(arguments: &Arguments) -> Result<Answer, Failure> {
             .help("name the folder alone, or every recording by its own name"));
         }
         (_, None) => {}
+    }
+    if let Some(runs) = &arguments.runs {
+        return Err(Failure::file(runs, "`--runs` tells of the recordings of a folder, but there is none")
+            .help("name the folder that holds the recordings, or leave `--runs` out"));
     }
     let ModelStudy { model, study } = &arguments.inputs;
     let [.., improved] = FILES;

@@ -2,6 +2,7 @@
 
 use askama::Template;
 
+use super::machines::{MachinesView, Runs, runs};
 use super::{Assets, Common};
 use crate::contract::Verdict;
 use crate::sentence::recordings::{place, probability};
@@ -43,6 +44,8 @@ struct View {
     mechanisms: Vec<MechanismView>,
     parameters: Vec<ParameterView>,
     errors: Vec<ErrorView>,
+    /// A table says which machine was recorded.
+    has_machines: bool,
 }
 
 struct RecordingView {
@@ -60,6 +63,8 @@ struct MechanismView {
     expression_html: String,
     place: String,
     found: String,
+    /// In how many machines, and the interval of the share.
+    machines: Option<[String; 2]>,
     share: String,
     confidence: String,
     parameters: Vec<PooledView>,
@@ -79,9 +84,10 @@ struct PooledView {
     /// Q, degrees of freedom and p; I²; τ.
     heterogeneity: Option<[String; 3]>,
     plot: Option<Forest>,
+    machines: Option<MachinesView>,
 }
 
-struct Forest {
+pub(super) struct Forest {
     svg: String,
     /// How many estimates are not drawn.
     left_out: usize,
@@ -105,6 +111,7 @@ impl View {
         let headline = if sentences.is_empty() { String::new() } else { sentences.remove(0) };
         let (name, file) = (&summary.model.name, &summary.model.file);
         let statistics = &summary.statistics;
+        let runs = runs(&statistics.recordings);
         View {
             common: Common {
                 product: "greybox diagnosis of many recordings",
@@ -118,6 +125,7 @@ impl View {
             verdict_class,
             headline,
             sentences,
+            has_machines: !runs.is_empty(),
             channels: summary.holdout.keys().map(|c| expression::text(c)).collect(),
             recordings: statistics.recordings.iter().map(|r| recording(r, summary.holdout.keys())).collect(),
             failed: statistics
@@ -125,8 +133,8 @@ impl View {
                 .iter()
                 .map(|f| [f.recording.clone(), f.message.clone(), f.help.clone().unwrap_or_default()])
                 .collect(),
-            mechanisms: summary.mechanisms.iter().map(|m| mechanism(m, counts.diagnosed())).collect(),
-            parameters: summary.parameters.iter().map(|(name, p)| parameter(name, p)).collect(),
+            mechanisms: summary.mechanisms.iter().map(|m| mechanism(m, counts.diagnosed(), &runs)).collect(),
+            parameters: summary.parameters.iter().map(|(name, p)| parameter(name, p, &runs)).collect(),
             errors: summary
                 .holdout
                 .iter()
@@ -160,23 +168,27 @@ fn recording<'a>(of: &RecordingResult, channels: impl Iterator<Item = &'a String
     }
 }
 
-fn mechanism(over: &MechanismOver, diagnosed: usize) -> MechanismView {
+fn mechanism(over: &MechanismOver, diagnosed: usize, runs: &Runs<'_>) -> MechanismView {
     MechanismView {
         title: format::kind(&over.law.kind),
         expression_html: expression::html(&over.law.expression),
         place: place(&over.law),
         found: format!("{} of {diagnosed}", over.found_in.len()),
+        machines: over.machines.as_ref().map(|share| {
+            let ends = [share.ci95.low, share.ci95.high].map(format::percent_short);
+            [format!("{} of {}", share.found_in.len(), share.of), format!("{} to {}", ends[0], ends[1])]
+        }),
         share: format::probability(over.share_explained.median),
         confidence: format::probability(over.confidence.median),
-        parameters: over.parameters.iter().map(|(name, p)| pooled(name, p)).collect(),
+        parameters: over.parameters.iter().map(|(name, p)| pooled(name, p, runs)).collect(),
     }
 }
 
-fn parameter(name: &str, over: &ParameterOver) -> ParameterView {
-    ParameterView { nominal: format::number(over.nominal), pooled: pooled(name, &over.pooled) }
+fn parameter(name: &str, over: &ParameterOver, runs: &Runs<'_>) -> ParameterView {
+    ParameterView { nominal: format::number(over.nominal), pooled: pooled(name, &over.pooled, runs) }
 }
 
-fn pooled(name: &str, over: &Pooled) -> PooledView {
+fn pooled(name: &str, over: &Pooled, runs: &Runs<'_>) -> PooledView {
     let heterogeneity = over.heterogeneity.map(|h| {
         [
             format!("{} on {}, {}", format::number(h.q), h.degrees_of_freedom, probability(h.p_value)),
@@ -196,19 +208,30 @@ fn pooled(name: &str, over: &Pooled) -> PooledView {
         },
         changes: over.method == Method::RandomEffects,
         heterogeneity,
-        plot: forest(name, over),
+        plot: forest(name, over, "recording"),
+        machines: MachinesView::of(name, over, runs),
     }
 }
 
+/// `name` or `name [unit]`.
+pub(super) fn labelled(name: &str, unit: &str) -> String {
+    if unit.is_empty() { name.to_owned() } else { format!("{name} [{unit}]") }
+}
+
 /// Drawn from two estimates on.
-fn forest(name: &str, over: &Pooled) -> Option<Forest> {
+pub(super) fn forest(name: &str, over: &Pooled, of: &str) -> Option<Forest> {
     if over.estimates.len() < 2 {
         return None;
     }
     let left_out = over.estimates.len().saturating_sub(MAX_ROWS);
-    let shown = Pooled { estimates: over.estimates.iter().take(MAX_ROWS).cloned().collect(), ..over.clone() };
-    let label = if over.unit.is_empty() { name.to_owned() } else { format!("{name} [{}]", over.unit) };
-    let alt = format!("{} in each recording, with 95 % intervals, and pooled", expression::text(name));
+    let shown = Pooled {
+        estimates: over.estimates.iter().take(MAX_ROWS).cloned().collect(),
+        unit: over.unit.clone(),
+        machines: None,
+        ..*over
+    };
+    let label = labelled(name, &over.unit);
+    let alt = format!("{} of each {of}, with 95 % intervals, and pooled", expression::text(name));
     Some(Forest { svg: svg::forest_plot(&shown, &label, &alt)?, left_out })
 }
 

@@ -3,18 +3,23 @@
 use crate::summary::{Law, MechanismOver, Method, Pooled, Spread, Summary, Verdicts};
 use crate::{expression, format};
 
-use super::{equations, joined};
+use super::{equations, joined, machines};
 
-/// The conclusion, most important first: how many recordings ended how, each mechanism with its pooled parameters,
-/// the model's parameters that change, the held-out error.
+/// The conclusion, most important first: how many recordings ended how, each mechanism with its parameters pooled and over
+/// the machines, the model's parameters that change, the held-out error.
 pub fn summary(summary: &Summary) -> Vec<String> {
     let mut out = vec![counts(&summary.verdicts)];
     let diagnosed = summary.verdicts.diagnosed();
-    out.extend(summary.mechanisms.iter().map(|m| mechanism(m, diagnosed)));
+    for over in &summary.mechanisms {
+        out.push(mechanism(over, diagnosed));
+        out.extend(over.parameters.iter().flat_map(|(name, pooled)| machines::sentences(name, pooled)));
+    }
     for (name, parameter) in &summary.parameters {
-        if parameter.pooled.method == Method::RandomEffects {
+        let of_machines = machines::sentences(name, &parameter.pooled);
+        if parameter.pooled.method == Method::RandomEffects && of_machines.is_empty() {
             out.push(format!("{}.", estimate(name, &parameter.pooled)));
         }
+        out.extend(of_machines);
     }
     for (channel, errors) in &summary.holdout {
         out.push(format!(
@@ -65,7 +70,16 @@ fn mechanism(over: &MechanismOver, diagnosed: usize) -> String {
         expression::text(&over.law.expression),
         over.found_in.len()
     );
-    for (name, pooled) in over.parameters.iter().filter(|(_, p)| p.method != Method::None) {
+    if let Some(share) = &over.machines {
+        text.push_str(&format!(" recordings, {}", machines::share(share)));
+    }
+    // What changes is told over the machines.
+    let told = |p: &Pooled| match p.method {
+        Method::None => false,
+        Method::RandomEffects => p.machines.is_none(),
+        Method::Single | Method::FixedEffect => true,
+    };
+    for (name, pooled) in over.parameters.iter().filter(|(_, p)| told(p)) {
         text.push_str(&format!("; {}", estimate(name, pooled)));
     }
     text.push('.');

@@ -7,7 +7,7 @@ use std::sync::atomic::{AtomicUsize, Ordering};
 use std::thread;
 
 use greybox_commands::diagnose::FILES;
-use greybox_commands::fleet::{self, DONE, File, Fleet, Member, SUMMARY};
+use greybox_commands::fleet::{self, DONE, File, Fleet, Member, SUMMARY, Table};
 use greybox_diagnose::Quiet;
 use greybox_report::summary::Statistics;
 use serde_json::json;
@@ -44,11 +44,14 @@ pub(super) fn run(arguments: &Arguments, folder: &Path, own: Option<&Mechanisms>
     let texts = own.map_or(&[][..], |own| &own.texts);
     // A fault in what judges all recordings is told once.
     let fleet = Fleet::new(loaded, held, map.clone(), arguments.options(own), texts)?;
-    let recordings = recordings(folder, holdout)?;
-    let inputs = || [model].into_iter().chain(holdout).chain(own.iter().flat_map(|own| &own.files));
+    let recordings = recordings(folder, holdout, arguments.runs.as_deref())?;
+    let inputs = || {
+        [model].into_iter().chain(holdout).chain(&arguments.runs).chain(own.iter().flat_map(|own| &own.files))
+    };
     let out = OutputFolder::prepare(place)?;
     out.spares(&SUMMARY, inputs())?;
     let tasks = tasks(&recordings, place)?;
+    let table = arguments.runs.as_deref().map(|path| table(path, &recordings)).transpose()?;
     for task in &tasks {
         task.out.spares(&[&FILES as &[&str], &[DONE]].concat(), inputs())?;
     }
@@ -81,7 +84,7 @@ pub(super) fn run(arguments: &Arguments, folder: &Path, own: Option<&Mechanisms>
         return Err(Failure::all(folder, "no recording of this folder could be diagnosed", &failures));
     }
     let model = fleet.model();
-    let summary = fleet::conclude(parts, &model.model.name, &model.file, arguments.seed)?;
+    let summary = fleet::conclude(parts, table.as_ref(), &model.model.name, &model.file, arguments.seed)?;
     let [json_name, html_name] = SUMMARY;
     out.write(&[(json_name, summary.json.as_bytes()), (html_name, summary.html.as_bytes())])?;
 
@@ -100,15 +103,22 @@ pub(super) fn run(arguments: &Arguments, folder: &Path, own: Option<&Mechanisms>
     Ok(Answer::new(words, json))
 }
 
-/// The recordings of the folder that are not held out.
-fn recordings(folder: &Path, holdout: &[PathBuf]) -> Result<Vec<PathBuf>, Failure> {
+/// The recordings of the folder that are not held out; a table of them is none.
+fn recordings(folder: &Path, holdout: &[PathBuf], table: Option<&Path>) -> Result<Vec<PathBuf>, Failure> {
     let mut recordings = loading::recordings_of(folder)?;
+    recordings.retain(|path| !table.is_some_and(|table| same_file(table, path)));
     recordings.retain(|path| !holdout.iter().any(|held| same_file(held, path)));
     if recordings.is_empty() {
         return Err(Failure::file(folder, "every recording of this folder is held out")
             .help("leave at least one of them to learn from"));
     }
     Ok(recordings)
+}
+
+/// The table of the recordings.
+fn table(path: &Path, recordings: &[PathBuf]) -> Result<Table, Failure> {
+    let names: Vec<String> = recordings.iter().map(|path| loading::file_name(path)).collect();
+    Table::new(&loading::text(path)?, &path.display().to_string(), names.iter().map(String::as_str))
 }
 
 /// A folder of results for each recording, called as the file without its ending.

@@ -26,10 +26,8 @@
 
 use statrs::distribution::{ChiSquared, ContinuousCDF};
 
-use crate::contract::Interval;
-
 /// Half the width of a 95 % interval of a normal distribution, in standard deviations.
-const NORMAL_95: f64 = 1.959_963_984_540_054;
+pub(crate) const NORMAL_95: f64 = 1.959_963_984_540_054;
 
 /// Below this probability of so large a Q, the recordings disagree.
 pub const DISAGREE: f64 = 0.05;
@@ -46,8 +44,9 @@ pub struct Effect {
 impl Effect {
     /// The estimate whose 95 % interval this is, if it were normally distributed; `None` where value or width is not
     /// a finite number, or the width is zero, as of a number that is known exactly.
-    pub fn of(value: f64, ci95: Option<Interval>) -> Option<Effect> {
-        let effect = Effect { value, error: ci95?.half_width() / NORMAL_95 };
+    pub fn of(value: f64, ci95: Option<[f64; 2]>) -> Option<Effect> {
+        let [low, high] = ci95?;
+        let effect = Effect { value, error: 0.5 * (high - low) / NORMAL_95 };
         (value.is_finite() && effect.weight(0.0).is_finite() && effect.weight(0.0) > 0.0).then_some(effect)
     }
 
@@ -91,16 +90,16 @@ pub struct Pool {
 
 impl Pool {
     /// The 95 % interval of the value.
-    pub fn ci95(&self) -> Interval {
+    pub fn ci95(&self) -> [f64; 2] {
         let half = NORMAL_95 * self.error;
-        Interval::new(self.value - half, self.value + half)
+        [self.value - half, self.value + half]
     }
 }
 
 /// Pools estimates of one number; `None` where there are none.
 ///
 /// ```
-/// use greybox_report::pool::{Effect, pool};
+/// use greybox_fleet::pool::{Effect, pool};
 /// // Weights 1, 1 and 1/4: θ = (1 + 3 + 4/4)/2.25 = 20/9, and Q = (11/9)² + (7/9)² + (16/9)²/4 = 26/9.
 /// let effects = [(1.0, 1.0), (3.0, 1.0), (4.0, 2.0)].map(|(value, error)| Effect { value, error });
 /// let pooled = pool(&effects).unwrap();
@@ -181,7 +180,7 @@ mod tests {
         close(h.q, 0.8, 1e-15);
         assert_eq!((h.between, h.i_squared), (0.0, 0.0));
         assert!(!h.disagrees());
-        close(pooled.ci95().half_width(), NORMAL_95 / 5f64.sqrt(), 1e-15);
+        close(pooled.ci95()[1] - 1.2, NORMAL_95 / 5f64.sqrt(), 1e-15);
     }
 
     /// Thirteen trials of the BCG vaccine (G. A. Colditz et al., JAMA 271(9), 1994, 698–702), log risk ratios, as
@@ -232,9 +231,9 @@ mod tests {
     #[test]
     fn what_has_no_width_or_is_no_number_is_no_estimate() {
         assert_eq!(Effect::of(1.0, None), None);
-        assert_eq!(Effect::of(1.0, Some(Interval::new(1.0, 1.0))), None);
-        assert_eq!(Effect::of(f64::NAN, Some(Interval::new(0.0, 1.0))), None);
-        assert_eq!(Effect::of(1.0, Some(Interval::new(f64::NEG_INFINITY, 1.0))), None);
-        close(Effect::of(1.0, Some(Interval::new(0.0, 2.0))).unwrap().error, 1.0 / NORMAL_95, 1e-15);
+        assert_eq!(Effect::of(1.0, Some([1.0, 1.0])), None);
+        assert_eq!(Effect::of(f64::NAN, Some([0.0, 1.0])), None);
+        assert_eq!(Effect::of(1.0, Some([f64::NEG_INFINITY, 1.0])), None);
+        close(Effect::of(1.0, Some([0.0, 2.0])).unwrap().error, 1.0 / NORMAL_95, 1e-15);
     }
 }
