@@ -205,6 +205,40 @@ def test_map_reduce_and_conclude_give_the_command_s_summary(recordings):
     assert fleet.Statistics(joined.to_json()) == joined
 
 
+def test_a_table_says_which_machine_a_recording_is_of(recordings, command, tmp_path):
+    names = [f"run{k:03}.csv" for k in range(SIZE)] + ["bad.csv"]
+    columns = {
+        "recording": names,
+        "machine": [f"M{k // 2}" for k in range(len(names))],
+        "date": [f"2026-01-{k % 28 + 1:02}" for k in range(len(names))],
+        "temperature [degC]": [20.0 + k % 5 for k in range(len(names) - 1)] + [None],
+    }
+    text = [",".join(columns)] + [",".join("" if v is None else str(v) for v in row) for row in zip(*columns.values())]
+    (tmp_path / "runs.csv").write_text("\n".join(text) + "\n")
+    out = tmp_path / "out"
+    shutil.copytree(recordings.folder / "command", out)
+    told = command("diagnose", recordings.model, recordings.place, "--out", out, "--runs", tmp_path / "runs.csv").stdout
+    assert "machines (" in told
+    wanted = (out / "summary.json").read_text()
+    given = [columns, tmp_path / "runs.csv"]
+    if (pandas := pytest.importorskip("pandas")) is not None:
+        frame = pandas.DataFrame(columns)
+        given.append(frame.assign(date=pandas.to_datetime(frame["date"]).dt.date))
+    for runs in given:
+        summary = fleet.diagnose(recordings.model, recordings.place, out=out, runs=runs)
+        assert summary.to_json() == wanted
+    assert summary.recordings[0].run.machine == "M0"
+    part = json.loads(wanted)
+    plain = fleet.Statistics(json.dumps({key: part[key] for key in ("recordings", "failed")}))
+    assert fleet.conclude(plain, recordings.model, runs=columns).to_json() == wanted
+    with pytest.raises(greybox.InputError, match="runs: there is no row for the recording `run001.csv`"):
+        fleet.diagnose(recordings.model, recordings.place, runs={"recording": ["run000.csv", "bad.csv"]})
+    with pytest.raises(greybox.InputError, match="its columns have 1 and 2 rows"):
+        fleet.conclude(plain, recordings.model, runs={"recording": ["a", "b"], "machine": ["A"]})
+    with pytest.raises(greybox.InputError, match="no such file"):
+        fleet.conclude(plain, recordings.model, runs=tmp_path / "gone.csv")
+
+
 def test_machines_in_folders_of_their_own_are_told_apart(recordings, tmp_path):
     for machine in ("one", "two"):
         (tmp_path / machine).mkdir()

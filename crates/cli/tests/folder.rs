@@ -234,6 +234,46 @@ fn folders_that_cannot_be_worked_through() {
     );
 }
 
+/// Each of three machines was recorded twice; the table lies among the recordings.
+#[test]
+fn a_table_says_which_machine_a_recording_is_of() {
+    let bench = bench();
+    let mut table = String::from("recording,machine,date,temperature [degC]\n");
+    for (k, name) in ["a1", "a2", "b1", "b2", "friday", "monday"].iter().enumerate() {
+        if k < 4 {
+            bench.write(&format!("runs/{name}.csv"), &recording(400, 2.0 + k as f64));
+        }
+        table += &format!("{name}.csv,{},2026-0{}-01,2{k}.5\n", ["A", "B", "C"][k / 2], k + 1);
+    }
+    bench.write("runs/machines.csv", &table);
+    let runs = [&DIAGNOSE as &[&str], &["out", "--runs", "runs/machines.csv"]].concat();
+    let outcome = bench.greybox(&runs);
+    assert_eq!(outcome.code, 0, "{}", outcome.stderr);
+    assert!(
+        outcome.stdout.contains(" is found in 6 of 6 recordings, in 3 of 3 machines ("),
+        "{}",
+        outcome.stdout
+    );
+    let summary: Value = serde_json::from_str(&bench.read("out/summary.json")).unwrap();
+    let first = &summary["recordings"][0]["run"];
+    assert_eq!((&first["machine"], &first["date"]), (&json!("A"), &json!("2026-01-01")));
+    assert_eq!(first["covariates"]["temperature [degC]"], 20.5);
+    let stiffness = &summary["parameters"]["k"]["machines"];
+    assert!((stiffness["value"].as_f64().unwrap() - spring::TRUTH.1).abs() < 0.2, "{stiffness}");
+    assert_eq!(stiffness["machines"][2]["machine"], "C");
+    // The table changes the summary alone: nothing is diagnosed again, and without it the summary is the one without.
+    let again = bench.greybox(&runs);
+    assert!(again.stdout.contains("\n6 of 6 done before.\n"), "{}", again.stdout);
+    assert_eq!(serde_json::from_str::<Value>(&bench.read("out/summary.json")).unwrap(), summary);
+
+    bench.write("short.csv", "recording,machine\nmonday.csv,A\n");
+    let short = [&DIAGNOSE as &[&str], &["new", "--runs", "short.csv"]].concat();
+    bench.refuses(&short, &["error: short.csv: there is no row for the recording `a1.csv`"]);
+    assert!(!bench.path("new").exists());
+    let alone = ["diagnose", "model.toml", "runs/a1.csv", "--runs", "runs/machines.csv", "--out", "new"];
+    bench.refuses(&alone, &["runs/machines.csv", "`--runs` tells of the recordings of a folder", "help:"]);
+}
+
 #[test]
 fn where_no_recording_can_be_diagnosed_nothing_is_written() {
     let bench = bench();

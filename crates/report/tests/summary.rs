@@ -3,7 +3,7 @@
 
 use greybox_report::contract::{Interval, ModelId, Producer, Report, Verdict};
 use greybox_report::merge::{conclude, failed, map, reduce};
-use greybox_report::summary::{Method, Statistics, Summary, schema};
+use greybox_report::summary::{Level, Method, Run, Statistics, Summary, schema};
 
 #[path = "common/browser.rs"]
 mod browser;
@@ -208,4 +208,101 @@ fn a_browser_shows_the_page() {
 fn the_page_keeps_nobody_out() {
     let Some(faults) = browser::faults(&summary().to_html().unwrap()) else { return };
     assert!(faults.is_empty(), "{faults:#?}");
+}
+
+/// Machines that were recorded `each` times: friction falls with the temperature, every tenth machine has none, and
+/// machine 3 has twice as much.
+fn fleet(machines: usize, each: usize) -> Summary {
+    let mut parts = Vec::new();
+    let wave = |k: usize, speed: f64| (speed * k as f64).sin();
+    for k in 0..machines * each {
+        let (machine, kelvin) = (k / each, 8.0 * wave(k, 1.7));
+        let own = 0.06 * if machine == 3 { 2.0 } else { 1.0 + 0.1 * wave(machine, 2.3) };
+        let mut one = report(own - 0.0005 * kelvin + 0.0003 * wave(k, 5.1), 0.0004);
+        one.parameters["J"].value = 0.002 * (1.0 + 0.001 * wave(k, 3.3));
+        if machine % 10 == 9 {
+            one.mechanisms.clear();
+        }
+        let name = format!("run{k:05}.csv");
+        let mut statistics = map(&name, Some(&format!("run{k:05}/report.html")), &one);
+        statistics.recordings[0].run = Some(Run {
+            machine: format!("M<{machine:04}>"),
+            date: None,
+            covariates: [("temperature [degC]".to_owned(), 20.0 + kelvin)].into_iter().collect(),
+        });
+        parts.push(statistics);
+    }
+    conclude(reduce(parts).unwrap(), Producer::default(), ModelId::default())
+}
+
+#[test]
+fn machines_are_told_of_where_a_table_says_which_they_are() {
+    let summary = fleet(20, 3);
+    let friction = &summary.mechanisms[0];
+    let share = friction.machines.as_ref().unwrap();
+    assert_eq!((share.found_in.len(), share.of), (18, 20));
+    assert!(share.ci95.low > 0.65 && share.ci95.high < 0.99);
+    let fc = friction.parameters["fc"].machines.as_ref().unwrap();
+    assert_eq!(fc.machines.len(), 18);
+    let different: Vec<&str> =
+        fc.machines.iter().filter(|m| m.differs.is_some()).map(|m| m.machine.as_str()).collect();
+    assert_eq!(different, ["M<0003>"]);
+    let slope = &fc.slopes[0];
+    assert_eq!((slope.covariate.as_str(), slope.level), ("temperature [degC]", Level::Within));
+    assert!(slope.significant && (slope.value + 0.0005).abs() < 5e-5, "{slope:?}");
+    let told = summary.summary.join(" ");
+    for text in [
+        "is found in 54 of 60 recordings, in 18 of 20 machines",
+        "N m from machine to machine and by",
+        "N m for each degC of temperature, on one machine (p < 0.001).",
+        "M<0003> (0.12",
+    ] {
+        assert!(told.contains(text), "{told}");
+    }
+    documents::assert_valid(&summary.to_json().unwrap(), &schema());
+    // Two machines are no fleet; the share is told nevertheless.
+    let two = fleet(2, 3);
+    assert_eq!(two.mechanisms[0].parameters["fc"].machines, None);
+    assert_eq!(two.mechanisms[0].machines.as_ref().unwrap().of, 2);
+}
+
+/// A machine has what is found in half of its recordings.
+#[test]
+fn a_machine_has_what_is_found_in_half_of_its_recordings() {
+    let mut parts = Vec::new();
+    for (machine, found) in [("a", [true, false, false]), ("b", [true, true, false]), ("c", [false; 3])] {
+        for (k, found) in found.iter().enumerate() {
+            let mut one = report(0.06, 0.001);
+            if !found {
+                one.mechanisms.clear();
+            }
+            let mut statistics = map(&format!("{machine}{k}"), None, &one);
+            statistics.recordings[0].run =
+                Some(Run { machine: machine.to_owned(), date: None, covariates: Default::default() });
+            parts.push(statistics);
+        }
+    }
+    let summary = conclude(reduce(parts).unwrap(), Producer::default(), ModelId::default());
+    assert_eq!(summary.mechanisms[0].machines.as_ref().unwrap().found_in, ["b"]);
+}
+
+#[test]
+fn the_page_of_machines_keeps_nobody_out() {
+    let html = fleet(20, 3).to_html().unwrap();
+    for text in ["over the machines", "M&lt;0003", "on one machine", "18 of 20", "class=\"law\"", "Slopes"] {
+        assert!(html.contains(text), "the page lacks {text:?}");
+    }
+    let Some(faults) = browser::faults(&html) else { return };
+    assert!(faults.is_empty(), "{faults:#?}");
+}
+/// What a browser need not lay out is not in the page: it says how much that is.
+#[test]
+fn a_page_of_many_recordings_stays_small() {
+    let html = fleet(600, 2).to_html().unwrap();
+    assert_eq!(html.matches("<th scope=\"row\"><a href=\"run").count(), 1000);
+    assert!(
+        html.contains("200 more recordings are not listed")
+            && html.contains("480 more machines are not drawn")
+    );
+    assert!((300_000..600_000).contains(&html.len()), "{}", html.len());
 }

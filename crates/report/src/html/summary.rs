@@ -9,6 +9,9 @@ use crate::sentence::recordings::{place, probability};
 use crate::summary::{MechanismOver, Method, ParameterOver, Pooled, RecordingResult, Spread, Summary};
 use crate::{ReportError, expression, format, svg};
 
+/// Most recordings that are listed: a table that a browser still scrolls at once.
+const MAX_LISTED: usize = 1000;
+
 /// Most forest rows that are drawn; a longer plot is no overview.
 const MAX_ROWS: usize = 60;
 
@@ -41,6 +44,9 @@ struct View {
     channels: Vec<String>,
     recordings: Vec<RecordingView>,
     failed: Vec<[String; 3]>,
+    /// Recordings that are not listed, and failures.
+    left_out: usize,
+    failed_left_out: usize,
     mechanisms: Vec<MechanismView>,
     parameters: Vec<ParameterView>,
     errors: Vec<ErrorView>,
@@ -127,10 +133,18 @@ impl View {
             sentences,
             has_machines: !runs.is_empty(),
             channels: summary.holdout.keys().map(|c| expression::text(c)).collect(),
-            recordings: statistics.recordings.iter().map(|r| recording(r, summary.holdout.keys())).collect(),
+            left_out: statistics.recordings.len().saturating_sub(MAX_LISTED),
+            failed_left_out: statistics.failed.len().saturating_sub(MAX_LISTED),
+            recordings: statistics
+                .recordings
+                .iter()
+                .take(MAX_LISTED)
+                .map(|r| recording(r, summary.holdout.keys()))
+                .collect(),
             failed: statistics
                 .failed
                 .iter()
+                .take(MAX_LISTED)
                 .map(|f| [f.recording.clone(), f.message.clone(), f.help.clone().unwrap_or_default()])
                 .collect(),
             mechanisms: summary.mechanisms.iter().map(|m| mechanism(m, counts.diagnosed(), &runs)).collect(),
