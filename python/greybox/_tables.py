@@ -28,7 +28,8 @@ def table(runs: RunsLike | None) -> tuple[str, str] | None:
             return _native.content(place).decode("utf-8-sig"), place
         except UnicodeDecodeError as error:
             raise InputError(f"{place}: the table is not UTF-8 text: {error}") from None
-    columns = {str(name): list(runs[name]) for name in runs}
+    frame: Any = runs
+    columns = {str(name): list(frame[name]) for name in frame}
     lengths = {len(values) for values in columns.values()}
     if len(lengths) > 1:
         raise InputError(f"runs: its columns have {' and '.join(map(str, sorted(lengths)))} rows; give one row a recording")

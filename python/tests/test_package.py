@@ -215,7 +215,7 @@ def test_what_was_given_up_ends():
     assert now - given_up < 0.5 * whole, (now - given_up, whole)
 
 
-@pytest.mark.parametrize("module", ["_inputs", "_studies"])
+@pytest.mark.parametrize("module", ["_inputs", "_studies", "fleet"])
 def test_the_examples_of_the_docstrings_run(module):
     outcome = doctest.testmod(importlib.import_module(f"greybox.{module}"))
     assert outcome.attempted > 3
