@@ -51,6 +51,31 @@ fn a_friction_that_grows_is_seen_and_named() {
     assert!(estimates.len() > 20 && estimates.iter().all(|e| e["covariance"].as_array().unwrap().len() == 9));
 }
 
+/// What Telegraf writes: nanoseconds, other measurements between the samples, tags.
+#[test]
+fn influx_lines_say_the_same() {
+    let bench = bench();
+    let samples = throttle::samples(190.0);
+    let from_csv = bench.greybox_fed(&["watch", "throttle.toml", "--json"], &throttle::csv(&samples));
+    let mut text = String::from("# written by Telegraf\n");
+    for (k, [t, torque, angle]) in samples.iter().enumerate() {
+        let ns = (t * 1e9).round() as i64;
+        let _ = writeln!(text, "throttle,host=rig\\ 2 angle={angle:.6},torque={torque:.5},state=\"on\" {ns}");
+        if k % 100 == 0 {
+            let _ = writeln!(text, "cpu,cpu=cpu0 usage_idle=93.2 {ns}");
+        }
+    }
+    let from_influx = bench.greybox_fed(&["watch", "throttle.toml", "--json"], &text);
+    assert_eq!(from_influx.code, 0, "{}", from_influx.stderr);
+    let (a, b) = (events(&from_csv.stdout), events(&from_influx.stdout));
+    assert!(of(&b, "unreadable").is_empty());
+    for kind in ["changed", "settled"] {
+        let (a, b) = (of(&a, kind), of(&b, kind));
+        assert_eq!((a.len(), b.len()), (1, 1));
+        assert_eq!((&a[0]["name"], &a[0]["since"]), (&b[0]["name"], &b[0]["since"]));
+    }
+}
+
 /// JSON lines, keys within objects, other names and units, lines that cannot be read: the same events.
 #[test]
 fn json_lines_say_the_same() {

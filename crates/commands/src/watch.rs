@@ -7,6 +7,7 @@ use greybox_watch::{Clock, Event, Options, Saved, Watch, WatchError};
 use crate::failure::Failure;
 use crate::loading::LoadedModel;
 
+mod influx;
 mod lines;
 mod words;
 

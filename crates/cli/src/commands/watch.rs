@@ -24,8 +24,8 @@ const SAVED_EVERY: Duration = Duration::from_secs(1);
   greybox watch drive.toml --learn 120 --alarms-per-day 0.1 --state drive.state < samples.csv
   tail -f log.csv | greybox watch drive.toml --map \"theta=sensor_3 [deg]\" --json
 
-Samples come on standard input, one a line: CSV with a header (first column `t` in seconds), or JSON objects such as
-{\"t\": 0.01, \"angle\": 1.25}. The first seconds tell what is usual; while they last, nothing is watched. With --json,
+Samples come on standard input, one a line: CSV with a header (first column `t` in seconds), JSON objects such as
+{\"t\": 0.01, \"angle\": 1.25}, or the Influx line protocol. The first seconds tell what is usual; while they last, nothing is watched. With --json,
 every event and, after every block of samples, the estimates with their covariance are JSON objects, one a line.")]
 pub(crate) struct Arguments {
     /// Model of the machine (TOML): calibrated, or improved by `diagnose`

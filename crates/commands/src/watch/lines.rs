@@ -5,6 +5,7 @@ use greybox_model::{Expr, Model, Unit};
 use greybox_recording::{CsvLines, Rename, listed};
 use serde_json::Value;
 
+use super::influx;
 use crate::failure::Failure;
 
 /// What the samples are called in messages.
@@ -23,6 +24,8 @@ enum Format {
     Csv(CsvLines),
     /// Keys of the channels, in the order of the columns.
     Json(Vec<String>),
+    /// The same.
+    Influx(Vec<String>),
 }
 
 /// Where a channel stands in a line.
@@ -37,12 +40,13 @@ pub(super) struct Column {
 }
 
 impl Lines {
-    /// Reads the first line: the header of a CSV file, or a JSON object.
+    /// Reads the first line: the header of a CSV file, a JSON object, or a line of the Influx protocol.
     ///
     /// # Errors
     /// Bad input: a header without the model's channels, or a unit that does not fit.
     pub(super) fn new(model: &Model, map: &[Rename], text: &str, line: u64) -> Result<Lines, Failure> {
-        let csv = match is_json(text) {
+        let influx = influx::is_influx(text);
+        let csv = match influx || is_json(text) {
             true => None,
             false => Some(CsvLines::new(text, LABEL, line)?),
         };
@@ -64,12 +68,17 @@ impl Lines {
             keys.push(name.to_owned());
             columns.push(Column { channel, index, unit });
         }
-        Ok(Lines { format: csv.map_or(Format::Json(keys), Format::Csv), columns })
+        let format = match csv {
+            Some(csv) => Format::Csv(csv),
+            None if influx => Format::Influx(keys),
+            None => Format::Json(keys),
+        };
+        Ok(Lines { format, columns })
     }
 
     /// Whether the first line was a sample already.
     pub(super) fn begins_with_a_sample(&self) -> bool {
-        matches!(self.format, Format::Json(_))
+        !matches!(self.format, Format::Csv(_))
     }
 
     /// Whether a line may be the header again, of a log that is written on.
@@ -77,7 +86,8 @@ impl Lines {
         matches!(self.format, Format::Csv(_)) && text.trim_start_matches(['"', ' ']).starts_with('t')
     }
 
-    /// Time and columns of a line, SI; `None` for a blank one.
+    /// Time and columns of a line, SI; `None` for one that has nothing of the model: a blank one, a comment, a line of
+    /// another measurement.
     ///
     /// # Errors
     /// What is wrong with the line, and where.
@@ -87,6 +97,14 @@ impl Lines {
                 Some(values) => values,
                 None => return Ok(None),
             },
+            Format::Influx(_) if text.trim().is_empty() || text.starts_with('#') => return Ok(None),
+            Format::Influx(keys) => {
+                let row = influx::parse(text).and_then(|found| found.row(keys));
+                match row.map_err(|e| format!("{LABEL}:{line}: {e}"))? {
+                    Some(values) => values,
+                    None => return Ok(None),
+                }
+            }
             Format::Json(keys) => from_json(text, keys).map_err(|e| format!("{LABEL}:{line}: {e}"))?,
         };
         let columns = self.columns.iter().map(|c| c.unit.to_si(values[c.index + 1]));
