@@ -1,23 +1,24 @@
 //! Files to recordings: the format by the ending of the name.
 
 use crate::csv;
-#[cfg(not(all(feature = "mat", feature = "parquet")))]
+#[cfg(not(all(feature = "mat", feature = "mcap", feature = "parquet")))]
 use crate::error::Place;
 use crate::error::RecordingError;
 use crate::file::bytes;
 use crate::recording::Recording;
+use crate::selection::Selection;
 use std::path::Path;
 
 /// Endings of the files that may hold a recording. Whether this build reads all of them, its features say
-/// (`mat`, `parquet`); [`read`] tells which is missing.
-pub const EXTENSIONS: [&str; 3] = ["csv", "mat", "parquet"];
+/// (`mat`, `mcap`, `parquet`); [`read`] tells which is missing.
+pub const EXTENSIONS: [&str; 4] = ["csv", "mat", "mcap", "parquet"];
 
-/// Reads the recording in the file at `path`: a MAT-file where the name ends in `.mat`, a Parquet file where it ends
-/// in `.parquet`, CSV else.
+/// Reads the recording in the file at `path`: a MAT-file where the name ends in `.mat`, an MCAP log where it ends in
+/// `.mcap`, a Parquet file where it ends in `.parquet`, CSV else.
 ///
 /// # Errors
 /// Any [`RecordingError`]; its place names the file as given. [`RecordingError::NotBuiltIn`] where this build lacks the
-/// feature `mat` or `parquet`.
+/// feature `mat`, `mcap` or `parquet`.
 ///
 /// ```
 /// let path = std::env::temp_dir().join(format!("read_{}.csv", std::process::id()));
@@ -28,12 +29,25 @@ pub const EXTENSIONS: [&str; 3] = ["csv", "mat", "parquet"];
 /// # Ok::<(), greybox_recording::RecordingError>(())
 /// ```
 pub fn read(path: impl AsRef<Path>) -> Result<Recording, RecordingError> {
+    read_selected(path, &Selection::default())
+}
+
+/// As [`read`], of a file whose signals have several clocks only what is selected; [`Recording::select`] takes care of the
+/// others.
+///
+/// # Errors
+/// As [`read`]. A channel that the file lacks is no error here: then all of them are read.
+pub fn read_selected(path: impl AsRef<Path>, selection: &Selection) -> Result<Recording, RecordingError> {
     let path = path.as_ref();
+    #[cfg(not(feature = "mcap"))]
+    let _ = selection;
     let (bytes, label, name) = bytes(path)?;
     let ending = path.extension().map(|e| e.to_string_lossy().to_ascii_lowercase()).unwrap_or_default();
     match ending.as_str() {
         #[cfg(feature = "mat")]
         "mat" => crate::mat::parse(&bytes, &label, &name),
+        #[cfg(feature = "mcap")]
+        "mcap" => crate::mcap::parse(&bytes, &label, &name, selection),
         #[cfg(feature = "parquet")]
         "parquet" => crate::parquet::parse(bytes, &label, &name),
         #[cfg(not(feature = "mat"))]
@@ -41,6 +55,12 @@ pub fn read(path: impl AsRef<Path>) -> Result<Recording, RecordingError> {
             place: Place::file(&label),
             format: "MAT-files",
             feature: "mat",
+        }),
+        #[cfg(not(feature = "mcap"))]
+        "mcap" => Err(RecordingError::NotBuiltIn {
+            place: Place::file(&label),
+            format: "MCAP logs",
+            feature: "mcap",
         }),
         #[cfg(not(feature = "parquet"))]
         "parquet" => Err(RecordingError::NotBuiltIn {
