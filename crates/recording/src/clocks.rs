@@ -19,7 +19,7 @@
 
 use crate::error::{Place, RecordingError};
 use crate::finding::{Finding, Severity, listed, number};
-use crate::recording::{Channel, Recording};
+use crate::recording::{Channel, Recording, SIZES};
 
 /// Most that an instant may be away from a sample, in steps: half of one, and the jitter at which times are a grid.
 const NEAREST: f64 = 0.51;
@@ -57,7 +57,8 @@ pub(crate) fn recording(
     for clock in &mut clocks {
         notes.extend(clock.tidy());
     }
-    clocks.retain(|clock| !clock.time.is_empty());
+    notes.extend(lone(&clocks));
+    clocks.retain(|clock| !clock.is_lone());
     unique(label, &clocks)?;
     let (from, to) = overlap(label, &clocks)?;
     let inside = |clock: &Clock| clock.time.iter().filter(|t| (from..=to).contains(*t)).count();
@@ -153,6 +154,13 @@ fn cut(clocks: &[Clock], from: f64, to: f64) -> Option<Finding> {
     Some(Finding::new(Severity::Info, "clocks", message).help(help))
 }
 
+/// The clocks that are left out because one sample says nothing of what moves, in words.
+fn lone(clocks: &[Clock]) -> Option<Finding> {
+    let lone: Vec<String> = clocks.iter().filter(|c| c.is_lone()).map(|c| format!("`{}`", c.name)).collect();
+    let message = || format!("Left out, having less than two samples: {}.", listed(lone.clone()));
+    (!lone.is_empty()).then(|| Finding::new(Severity::Info, "left_out", message()))
+}
+
 fn unique(label: &str, clocks: &[Clock]) -> Result<(), RecordingError> {
     let mut seen = std::collections::BTreeMap::new();
     for (c, series) in clocks.iter().flat_map(|clock| &clock.series).enumerate() {
@@ -186,7 +194,7 @@ struct Carried {
 }
 
 impl Clock {
-    /// Puts the times in order, the last of those that repeat alone; an infinite value is missing.
+    /// Puts the times in order, the last of those that repeat alone; a value that cannot be computed with is missing.
     fn tidy(&mut self) -> Option<Finding> {
         let mut order: Vec<usize> = (0..self.time.len()).filter(|&k| self.time[k].is_finite()).collect();
         let timeless = self.time.len() - order.len();
@@ -201,12 +209,12 @@ impl Clock {
             }
         }
         let repeated = all - kept.len();
-        let mut infinite = 0;
+        let mut beyond = 0;
         for series in &mut self.series {
             series.values = kept.iter().map(|&k| series.values.get(k).copied().unwrap_or(f64::NAN)).collect();
-            for value in series.values.iter_mut().filter(|value| value.is_infinite()) {
+            for value in series.values.iter_mut().filter(|value| value.abs() > *SIZES.end()) {
                 *value = f64::NAN;
-                infinite += 1;
+                beyond += 1;
             }
         }
         self.time = kept.iter().map(|&k| self.time[k]).collect();
@@ -214,7 +222,7 @@ impl Clock {
             (timeless, "without a time left out"),
             (repeated, "left out whose time repeats"),
             (back, "put in order whose time goes back"),
-            (infinite, "that are infinite taken as missing"),
+            (beyond, "taken as missing whose value is infinite or beyond 1e100"),
         ]
         .into_iter()
         .filter(|(count, _)| *count > 0)
@@ -222,6 +230,11 @@ impl Clock {
         .collect();
         let message = || format!("Of the samples of `{}`: {}.", self.name, listed(told.clone()));
         (!told.is_empty()).then(|| Finding::new(Severity::Info, "clocks", message()))
+    }
+
+    /// Whether it has no sample, or one of something that moves.
+    fn is_lone(&self) -> bool {
+        self.time.is_empty() || (self.time.len() == 1 && self.series.iter().any(|series| !series.held))
     }
 
     /// The part from `from` to `to`, s.

@@ -44,6 +44,7 @@
 #[doc = include_str!("../README.md")]
 struct Readme;
 
+mod character;
 #[cfg(any(feature = "mcap", test))]
 mod clocks;
 mod columns;
@@ -72,6 +73,7 @@ mod selection;
 pub mod smooth;
 mod spectrum;
 
+pub use crate::character::{Character, character};
 pub use crate::correlation::Correlation;
 pub use crate::csv::{CsvBlocks, CsvLines, parse_csv, read_csv, write_csv, write_csv_file};
 pub use crate::error::{Place, RecordingError};

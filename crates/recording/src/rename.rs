@@ -1,6 +1,7 @@
 //! Channels under the names that a model uses.
 
 use crate::finding::listed;
+use crate::header::parts;
 use crate::recording::Recording;
 use std::fmt;
 use std::str::FromStr;
@@ -110,29 +111,13 @@ impl FromStr for Rename {
         let wrong = || RenameError::Syntax { found: text.to_owned() };
         let (name, channel) = text.split_once('=').ok_or_else(wrong)?;
         let (name, written) = (name.trim(), channel.trim());
-        let (channel, unit) = parts(written).ok_or_else(wrong)?;
+        let (channel, unit) = parts(written).map_err(|_| wrong())?;
         if name.is_empty() || name.contains(['[', ']']) {
             return Err(wrong());
         }
         let (channel, unit) = (channel.to_owned(), unit.map(str::to_owned));
         Ok(Rename { name: name.to_owned(), channel, unit, written: written.to_owned() })
     }
-}
-
-/// A name and the unit in the bracket at its end; `None` where brackets do not close, or nothing stands before them.
-fn parts(text: &str) -> Option<(&str, Option<&str>)> {
-    let mut open = false;
-    for c in text.chars().filter(|c| matches!(c, '[' | ']')) {
-        if open == (c == '[') {
-            return None;
-        }
-        open = c == '[';
-    }
-    let (name, unit) = match text.strip_suffix(']').and_then(|text| text.rsplit_once('[')) {
-        Some((name, unit)) => (name.trim(), Some(unit.trim()).filter(|unit| !unit.is_empty())),
-        None => (text, None),
-    };
-    (!open && !name.is_empty()).then_some((name, unit))
 }
 
 /// As [`FromStr`] reads it.

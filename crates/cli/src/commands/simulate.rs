@@ -31,7 +31,7 @@ pub(crate) struct Arguments {
     #[arg(value_name = "MODEL.toml")]
     model: PathBuf,
 
-    /// Recording whose inputs drive the model (CSV, MAT-file or Parquet)
+    /// Recording whose inputs drive the model (CSV, MAT-file, MCAP or Parquet)
     #[arg(value_name = "INPUT.csv")]
     input: PathBuf,
 
@@ -45,7 +45,8 @@ pub(crate) struct Arguments {
 
 pub(crate) fn run(arguments: &Arguments) -> Result<Answer, Failure> {
     let loaded = loading::model(&arguments.model)?;
-    let recordings = loading::recordings(std::slice::from_ref(&arguments.input), &arguments.channels.map)?;
+    let wanted = arguments.channels.wanted().of_model(&loaded.model);
+    let recordings = loading::recordings(std::slice::from_ref(&arguments.input), &wanted)?;
     let [recording] = recordings.as_slice() else {
         return Err(Failure::internal("one recording was named, but not read"));
     };

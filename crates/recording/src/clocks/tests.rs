@@ -143,7 +143,12 @@ fn times_that_repeat_or_go_back_are_put_in_order_and_told() {
     assert_eq!(together.channels[0].values[19], 20.0, "the last of two");
     assert!(together.channels[0].values.iter().all(|v| !v.is_infinite()));
     let told = told(&together);
-    for part in ["1 without a time", "1 left out whose time repeats", "put in order", "1 that are infinite"] {
+    for part in [
+        "1 without a time",
+        "1 left out whose time repeats",
+        "put in order",
+        "1 taken as missing whose value is infinite",
+    ] {
         assert!(told.contains(part), "{told}");
     }
 }
@@ -166,6 +171,20 @@ fn a_jittering_grid_keeps_the_samples_of_others() {
         .collect();
     assert!(slow.len() >= 197, "{}", slow.len());
     assert!(slow.iter().all(|(t, v)| (t - v).abs() < 1e-9));
+}
+
+/// What was sent once is known from then on; what was sampled once says nothing, and shortens nothing.
+#[test]
+fn one_sample_is_a_setting_or_nothing() {
+    let state = clock("state", times(0.0, 100.0, 100), false, f64::sin);
+    let payload = clock("payload", vec![-3.0], true, |_| 2.5);
+    let fix = clock("fix", vec![0.5], false, |_| 7.0);
+    let together = put_together(vec![payload, fix, state]);
+    assert_eq!(together.time.len(), 100);
+    assert!(together.channel("fix.x").is_none());
+    assert_eq!(together.channel("payload.x").unwrap().values[0], 2.5);
+    assert_eq!(together.warnings[0].code, "left_out");
+    assert!(together.warnings[0].message.contains("less than two samples: `fix`"), "{}", told(&together));
 }
 
 #[test]

@@ -56,12 +56,42 @@ pub(super) fn content(bytes: &[u8], wanted: &dyn Fn(&str) -> bool) -> Result<Con
                 rest = left;
             }
             LinearReadEvent::Record { opcode: opcode @ (op::SCHEMA | op::CHANNEL | op::MESSAGE), data } => {
+                if !texts_fit(opcode, data) {
+                    return Err(McapError::UnexpectedEoc.into());
+                }
                 read.record(parse_record(opcode, data)?)?;
             }
             LinearReadEvent::Record { .. } => {}
         }
     }
     Ok(read.content)
+}
+
+/// Whether the texts of a schema or a channel lie within the record: the library makes room for what their lengths say.
+fn texts_fit(opcode: u8, record: &[u8]) -> bool {
+    match opcode {
+        op::SCHEMA => record.get(2..).and_then(behind_text).and_then(behind_text).is_some(),
+        op::CHANNEL => {
+            let metadata = record.get(4..).and_then(behind_text).and_then(behind_text);
+            let mut pairs = metadata.and_then(|bytes| bytes.get(4..)?.get(..length(bytes)?));
+            while let Some(bytes) = pairs.filter(|bytes| !bytes.is_empty()) {
+                pairs = behind_text(bytes);
+            }
+            pairs.is_some()
+        }
+        _ => true,
+    }
+}
+
+/// The length with which bytes begin.
+fn length(bytes: &[u8]) -> Option<usize> {
+    let length = bytes.get(..4)?.try_into().ok()?;
+    usize::try_from(u32::from_le_bytes(length)).ok()
+}
+
+/// What stands behind the text with which bytes begin.
+fn behind_text(bytes: &[u8]) -> Option<&[u8]> {
+    bytes.get(4..)?.get(length(bytes)?..)
 }
 
 /// The state of the reading.

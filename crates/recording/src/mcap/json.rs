@@ -4,23 +4,28 @@ use super::fields::{Column, MOST, Row, bracket, is_names};
 use serde_json::Value;
 use std::collections::BTreeMap;
 
-/// The numbers of a message of `topic`, and their names; and what is left out of it, with the reason.
+/// The numbers of a message and their names, and what is left out of it, with the reason.
+#[derive(Debug, Default)]
+pub(super) struct Numbers {
+    pub(super) row: Row,
+    pub(super) columns: Vec<Column>,
+    pub(super) left_out: BTreeMap<String, String>,
+}
+
+/// Reads the numbers of a message of `topic`.
 ///
 /// # Errors
 /// What is no JSON, in words.
-pub(super) fn numbers(
-    message: &[u8],
-    topic: &str,
-) -> Result<(Row, Vec<Column>, BTreeMap<String, String>), String> {
+pub(super) fn numbers(message: &[u8], topic: &str) -> Result<Numbers, String> {
     let value: Value = serde_json::from_slice(message).map_err(|e| format!("it is no JSON: {e}"))?;
     let stamp = value.get("header").and_then(|header| stamp(header.get("stamp")?));
-    let mut walk = Walk { row: Row { stamp, ..Row::default() }, ..Walk::default() };
-    walk.value(&value, topic.to_owned(), &mut Vec::new());
-    for column in &walk.columns {
-        walk.row.shape.extend(column.name.as_bytes());
-        walk.row.shape.push(0);
+    let mut found = Numbers { row: Row { stamp, ..Row::default() }, ..Numbers::default() };
+    found.value(&value, topic.to_owned(), &mut Vec::new());
+    for column in &found.columns {
+        found.row.shape.extend(column.name.as_bytes());
+        found.row.shape.push(0);
     }
-    Ok((walk.row, walk.columns, walk.left_out))
+    Ok(found)
 }
 
 /// A stamp as the bridges of ROS 2 (`sec`, `nanosec`) and ROS 1 (`secs`, `nsecs`) write it, ns.
@@ -31,14 +36,7 @@ fn stamp(value: &Value) -> Option<i64> {
     seconds.checked_mul(1_000_000_000)?.checked_add(rest)
 }
 
-#[derive(Default)]
-struct Walk {
-    row: Row,
-    columns: Vec<Column>,
-    left_out: BTreeMap<String, String>,
-}
-
-impl Walk {
+impl Numbers {
     fn value(&mut self, value: &Value, path: String, names: &mut Vec<Vec<String>>) {
         match value {
             Value::Null | Value::String(_) => {}
@@ -84,7 +82,7 @@ mod tests {
     use super::*;
 
     fn read(text: &str) -> (Row, Vec<String>, BTreeMap<String, String>) {
-        let (row, columns, left_out) = numbers(text.as_bytes(), "/t").unwrap();
+        let Numbers { row, columns, left_out } = numbers(text.as_bytes(), "/t").unwrap();
         (row, columns.into_iter().map(|c| c.name).collect(), left_out)
     }
 

@@ -89,7 +89,7 @@ impl Topic {
             Encoding::Cdr(types) => (fields::numbers(types, Bytes::cdr(message)?)?, None),
             Encoding::Ros1(types) => (fields::numbers(types, Bytes::packed(message))?, None),
             Encoding::Json => {
-                let (row, columns, left_out) = json::numbers(message, &self.name)?;
+                let json::Numbers { row, columns, left_out } = json::numbers(message, &self.name)?;
                 (row, Some((columns, left_out)))
             }
         };
@@ -147,12 +147,12 @@ mod tests {
     fn state(sec: i32, joints: &[(&str, f64)]) -> Vec<u8> {
         let mut bytes = vec![0, 1, 0, 0];
         let pad = |bytes: &mut Vec<u8>, n: usize| {
-            while (bytes.len() - 4) % n > 0 {
+            while !(bytes.len() - 4).is_multiple_of(n) {
                 bytes.push(0);
             }
         };
         let text = |bytes: &mut Vec<u8>, text: &str| {
-            while (bytes.len() - 4) % 4 > 0 {
+            while !(bytes.len() - 4).is_multiple_of(4) {
                 bytes.push(0);
             }
             bytes.extend((text.len() as u32 + 1).to_le_bytes());
@@ -208,6 +208,32 @@ mod tests {
         assert_eq!(topic.stamps(), None);
         topic.take(2, &[0, 1, 0, 0, 5]);
         assert_eq!(topic.fault.as_deref(), Some("message 2: it ends too early"));
+    }
+
+    /// The same in ROS 1: no gaps before numbers, no zero behind a text.
+    #[test]
+    fn messages_of_ros_1_are_packed() {
+        let text = "Header header\nstring frame\nfloat64[] x\nbool on\nint16 n\n===\nMSG: std_msgs/Header\n\
+                    uint32 seq\ntime stamp\nstring frame_id\n";
+        let mut topic =
+            Topic::new("/r".to_owned(), Encoding::of("ros1", "ros1msg", "a/R", text.as_bytes()).unwrap());
+        let words = [7u32, 5, 9, 1].map(u32::to_le_bytes).concat();
+        let message = [
+            &words[..],
+            b"b",
+            &3u32.to_le_bytes(),
+            b"odd",
+            &1u32.to_le_bytes(),
+            &2.5f64.to_le_bytes(),
+            &[1],
+            &(-3i16).to_le_bytes(),
+        ]
+        .concat();
+        topic.take(1, &message);
+        assert_eq!(topic.fault, None);
+        let found: Vec<(&str, f64)> = topic.columns.iter().map(|(c, v)| (c.name.as_str(), v[0])).collect();
+        assert_eq!(found, [("/r.x[0]", 2.5), ("/r.on", 1.0), ("/r.n", -3.0)]);
+        assert_eq!(topic.stamps(), Some(&[5_000_000_009][..]));
     }
 
     #[test]

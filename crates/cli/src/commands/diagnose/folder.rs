@@ -19,10 +19,11 @@ use super::{Arguments, tried};
 use crate::answer::Answer;
 use crate::done::{self, Done, Fingerprint, Inputs};
 use crate::failure::Failure;
-use crate::loading::{self, LoadedModel, Mechanisms, same_file};
+use crate::loading::{self, LoadedModel, Mechanisms, Wanted, same_file};
 use crate::output::OutputFolder;
 use crate::progress::Progress;
 use crate::story;
+use crate::study::Channels;
 
 /// The files that tell of all recordings.
 const SUMMARY: [&str; 2] = ["summary.json", "summary.html"];
@@ -31,7 +32,8 @@ const SUMMARY: [&str; 2] = ["summary.json", "summary.html"];
 struct Batch<'a> {
     loaded: LoadedModel,
     holdout: &'a [PathBuf],
-    map: &'a [Rename],
+    read: &'a Channels,
+    wanted: Wanted,
     options: Options,
     /// Those beside the built-in ones.
     mechanisms: Vec<Fingerprint>,
@@ -55,10 +57,11 @@ struct Diagnosed {
 pub(super) fn run(arguments: &Arguments, folder: &Path, own: Option<&Mechanisms>) -> Result<Answer, Failure> {
     let (model, place) = (&arguments.inputs.model, &arguments.inputs.study.out);
     let holdout = &arguments.inputs.study.holdout;
-    let map = &arguments.inputs.study.channels.map;
+    let read = &arguments.inputs.study.channels;
     let loaded = loading::model(model)?;
+    let wanted = read.wanted().of_model(&loaded.model);
     // A fault in what judges all recordings is told once.
-    Data::new(&loaded.model, &loading::recordings(holdout, map)?)?;
+    Data::new(&loaded.model, &loading::recordings(holdout, &wanted)?)?;
     let recordings = recordings(folder, holdout)?;
     let inputs = || [model].into_iter().chain(holdout).chain(own.iter().flat_map(|own| &own.files));
     let out = OutputFolder::prepare(place)?;
@@ -70,7 +73,8 @@ pub(super) fn run(arguments: &Arguments, folder: &Path, own: Option<&Mechanisms>
     let batch = Batch {
         loaded,
         holdout,
-        map,
+        read,
+        wanted,
         options: arguments.options(own),
         mechanisms: own
             .iter()
@@ -206,7 +210,7 @@ impl Batch<'_> {
             return Ok(Diagnosed { statistics, before: true });
         }
         let (train, holdout) =
-            loading::train_and_holdout(std::slice::from_ref(&task.recording), self.holdout, self.map)?;
+            loading::train_and_holdout(std::slice::from_ref(&task.recording), self.holdout, &self.wanted)?;
         let diagnosis =
             greybox_diagnose::diagnose(&self.loaded.model, &train, &holdout, &self.options, &Quiet)
                 .map_err(|e| Failure::diagnosis(&self.loaded.path, e))?;
@@ -237,7 +241,8 @@ impl Batch<'_> {
             model: Fingerprint::of(&self.loaded.file, self.loaded.text.as_bytes()),
             recording: fingerprint(recording)?,
             holdout: self.holdout.iter().map(|path| fingerprint(path)).collect::<Result<_, Failure>>()?,
-            map: self.map.iter().map(Rename::to_string).collect(),
+            map: self.read.names.map.iter().map(Rename::to_string).collect(),
+            channels: self.read.only.clone(),
             mechanisms: self.mechanisms.clone(),
         })
     }
