@@ -347,3 +347,25 @@ pub fn same_file(a: &Path, b: &Path) -> bool {
         _ => false,
     }
 }
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    /// A model names the columns of its inputs and measurements; of the derivative of an input the one or the other; and what
+    /// `--map` gives a name to under the name in the file.
+    #[test]
+    fn a_model_names_what_is_read() {
+        let text = "[inputs]\nf = { unit = \"N\" }\nw = { unit = \"m\" }\ndw = { unit = \"m/s\", channel = \"w'\" }\n\
+                    [states]\nx = { unit = \"m\", channel = \"/j.position[a]\" }\n\
+                    [parameters]\nm = { value = 1, unit = \"kg\" }\nk = { value = 1, unit = \"N/m\" }\n\
+                    b = { value = 1, unit = \"N s/m\" }\n\
+                    [equations]\nbody = \"m*x'' + k*(x - w) + b*(x' - dw) = f\"\n";
+        let model = Model::from_toml(text, "m.toml").map_err(|e| e.to_string());
+        let model = model.unwrap_or_else(|e| panic!("{e}"));
+        let map: Vec<Rename> = vec!["f=/cmd.data[N]".parse().unwrap_or_else(|e| panic!("{e}"))];
+        let wanted = Wanted::new(&map, &[]).of_model(&model);
+        let named: Vec<String> = wanted.selection.named.iter().map(|names| names.join(" or ")).collect();
+        assert_eq!(named, ["/cmd.data[N] or /cmd.data", "w", "w' or w", "/j.position[a]"]);
+    }
+}

@@ -75,7 +75,7 @@ pub(crate) fn recording(
         base.warnings.splice(0..0, notes);
         return Ok(base);
     }
-    let (time, mut own, jitter) = instants(base);
+    let (time, mut own, resampled) = instants(base);
     let step = median_step(&time);
     let mut channels = Vec::new();
     for (k, clock) in clocks.iter().enumerate() {
@@ -88,16 +88,16 @@ pub(crate) fn recording(
         channels.extend(columns);
     }
     let mut all = Recording::checked(label, name, time, channels, 0.0)?;
-    notes.extend(jitter);
+    notes.extend(resampled);
     all.warnings.splice(0..0, notes);
     Ok(all)
 }
 
 /// The instants of the grid and the channels on it: those of the recording, or of its pieces where it was resampled, then
-/// with the warning that says so.
-fn instants(base: Recording) -> (Vec<f64>, Vec<Channel>, Option<Finding>) {
+/// with the warnings that say so.
+fn instants(base: Recording) -> (Vec<f64>, Vec<Channel>, Vec<Finding>) {
     if !base.pieces.iter().any(|piece| piece.resampled) {
-        return (base.time, base.channels, None);
+        return (base.time, base.channels, Vec::new());
     }
     let origin = base.time.first().copied().unwrap_or(0.0);
     let time = base.pieces.iter().flat_map(|piece| (0..piece.len).map(|k| origin + piece.time(k))).collect();
@@ -105,7 +105,8 @@ fn instants(base: Recording) -> (Vec<f64>, Vec<Channel>, Option<Finding>) {
         values: base.pieces.iter().filter_map(|piece| piece.columns.get(c)).flatten().copied().collect(),
         ..channel
     });
-    (time, channels.collect(), base.warnings.into_iter().find(|warning| warning.code == "jitter"))
+    let told = |warning: &Finding| matches!(warning.code, "jitter" | "short_piece");
+    (time, channels.collect(), base.warnings.into_iter().filter(told).collect())
 }
 
 fn median_step(time: &[f64]) -> f64 {
@@ -136,7 +137,12 @@ fn overlap(label: &str, clocks: &[Clock]) -> Result<(f64, f64), RecordingError> 
 /// What lies outside of what all clocks cover, in words.
 fn cut(clocks: &[Clock], from: f64, to: f64) -> Option<Finding> {
     let samples: usize = clocks.iter().map(|clock| clock.time.len()).sum();
-    let outside = |clock: &Clock| clock.time.iter().filter(|t| !(from..=to).contains(*t)).count();
+    let outside = |clock: &Clock| {
+        let before = clock.time.partition_point(|t| *t < from);
+        // Of what is held, the last value before the first instant counts.
+        let known = usize::from(before > 0 && clock.series.iter().all(|series| series.held));
+        before - known + clock.time.iter().filter(|t| **t > to).count()
+    };
     let left_out: usize = clocks.iter().map(outside).sum();
     if left_out == 0 {
         return None;

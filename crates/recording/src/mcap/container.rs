@@ -172,3 +172,29 @@ impl<'a> Reading<'a> {
         }
     }
 }
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    /// A record as the library writes it fits; one whose lengths were changed asks for no memory.
+    #[test]
+    fn texts_beyond_their_record_are_seen() {
+        let text = |text: &str| [&(text.len() as u32).to_le_bytes()[..], text.as_bytes()].concat();
+        let schema = [&[1, 0][..], &text("a/B"), &text("ros2msg"), &text("float64 x")].concat();
+        let pairs = [text("key"), text("value")].concat();
+        let metadata = [&(pairs.len() as u32).to_le_bytes()[..], &pairs].concat();
+        let channel = [&[1, 0, 1, 0][..], &text("/topic"), &text("cdr"), &metadata, &[9; 3]].concat();
+        for (opcode, record, last) in [(op::SCHEMA, schema, 20), (op::CHANNEL, channel, 41)] {
+            assert!(texts_fit(opcode, &record) && parse_record(opcode, &record).is_ok());
+            for end in 0..last {
+                assert!(!texts_fit(opcode, &record[..end]), "{opcode} cut at {end}");
+            }
+            assert!(texts_fit(opcode, &record[..last]));
+            let mut huge = record.clone();
+            let first = if opcode == op::SCHEMA { 5 } else { 7 };
+            huge[first] = 0xff;
+            assert!(!texts_fit(opcode, &huge));
+        }
+    }
+}
