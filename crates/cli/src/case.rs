@@ -13,10 +13,10 @@ use greybox_recording::{Finding, Recording, health};
 use serde_json::{Value, json};
 
 use crate::answer::Answer;
+use crate::channels::Channels;
 use crate::failure::Failure;
 use crate::loading;
 use crate::output::{Content, OutputFolder};
-use crate::study::Channels;
 
 /// What is packed to report a fault.
 #[derive(Debug, Args)]

@@ -5,12 +5,12 @@ use std::path::{Path, PathBuf};
 use clap::Args;
 
 use crate::case::{CaseOptions, Subject};
+use crate::channels::Channels;
 use crate::failure::Failure;
 use crate::loading::{self, LoadedModel, Wanted};
 use crate::output::OutputFolder;
 use greybox_calibrate::Data;
-use greybox_model::Unit;
-use greybox_recording::{Recording, Rename, RenameError};
+use greybox_recording::Recording;
 
 /// The unit of `--work`, in operations.
 pub(crate) const BILLION: u64 = 1_000_000_000;
@@ -18,48 +18,6 @@ pub(crate) const BILLION: u64 = 1_000_000_000;
 /// A seed, or an amount of work.
 pub(crate) fn whole(text: &str) -> Result<u64, String> {
     text.parse().map_err(|_| format!("write a whole number from 0 to {}, such as 7", u64::MAX))
-}
-
-/// What the model calls the channels.
-#[derive(Debug, Args)]
-pub(crate) struct Names {
-    // (Not a doc comment: rustdoc takes a unit in brackets for a link.)
-    #[arg(
-        long,
-        value_name = "NAME=CHANNEL",
-        value_parser = rename,
-        help = "Name of the model for a channel of the recordings, with its unit where they state none, such as \
-                \"theta=sensor_3 [deg]\"; may be repeated"
-    )]
-    pub(crate) map: Vec<Rename>,
-}
-
-/// The channels of the recordings: which are read, and what the model calls them.
-#[derive(Debug, Args)]
-pub(crate) struct Channels {
-    #[command(flatten)]
-    pub(crate) names: Names,
-
-    /// Channel to read, such as "/joint_states.position[elbow]", and no other but those of --map; may be repeated
-    /// [default: what model and --map name, of a log with several clocks]
-    #[arg(id = "channels", long = "channels", value_name = "CHANNEL")]
-    pub(crate) only: Vec<String>,
-}
-
-impl Channels {
-    /// What is read of the recordings.
-    pub(crate) fn wanted(&self) -> Wanted {
-        Wanted::new(&self.names.map, &self.only)
-    }
-}
-
-/// A [`Rename`] whose unit, if it has one, is written as one; a symbol that is not built in may be declared by the model.
-fn rename(text: &str) -> Result<Rename, String> {
-    let rename: Rename = text.parse().map_err(|e: RenameError| e.to_string())?;
-    match rename.unit.as_deref().map(Unit::parse) {
-        Some(Err(error)) if error.unknown.is_none() && rename.states_unit() => Err(error.to_string()),
-        _ => Ok(rename),
-    }
 }
 
 /// The recordings of a command that learns from some and is judged on others, and where its results go.

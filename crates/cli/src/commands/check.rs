@@ -6,9 +6,9 @@ use clap::Args;
 use greybox_commands::check;
 
 use crate::answer::Answer;
+use crate::channels::Channels;
 use crate::failure::Failure;
 use crate::loading;
-use crate::study::Channels;
 
 /// Check the health of recordings: sampling, gaps, clipping, quantisation, outliers, excitation, delay, clocks
 #[derive(Debug, Args)]

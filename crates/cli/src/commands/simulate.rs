@@ -9,11 +9,11 @@ use greybox_recording::write_csv;
 use serde_json::json;
 
 use crate::answer::Answer;
+use crate::channels::Channels;
 use crate::failure::Failure;
 use crate::loading;
 use crate::output::OutputFile;
 use crate::progress::Progress;
-use crate::study::Channels;
 
 /// Simulate a model on the inputs of a recording, from the initial state estimated on its first quarter
 #[derive(Debug, Args)]

@@ -10,9 +10,9 @@ use greybox_commands::watch::{Output, Session};
 use greybox_watch::{Options, Saved};
 
 use crate::answer::{Answer, OutputFormat};
+use crate::channels::Names;
 use crate::failure::Failure;
 use crate::loading;
-use crate::study::Names;
 
 /// How often the state is saved.
 const SAVED_EVERY: Duration = Duration::from_secs(1);

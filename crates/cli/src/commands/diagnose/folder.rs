@@ -17,13 +17,13 @@ use serde_json::json;
 
 use super::{Arguments, tried};
 use crate::answer::Answer;
+use crate::channels::Channels;
 use crate::done::{self, Done, Fingerprint, Inputs};
 use crate::failure::Failure;
 use crate::loading::{self, LoadedModel, Mechanisms, Wanted, same_file};
 use crate::output::OutputFolder;
 use crate::progress::Progress;
 use crate::story;
-use crate::study::Channels;
 
 /// The files that tell of all recordings.
 const SUMMARY: [&str; 2] = ["summary.json", "summary.html"];
