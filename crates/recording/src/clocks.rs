@@ -84,7 +84,8 @@ pub(crate) fn recording(
             continue;
         }
         let (columns, carried) = clock.carry(&time, step);
-        notes.extend(carried.told(clock, &clocks[fastest]));
+        let told = carried.told(clock, &clocks[fastest]);
+        notes.extend(told.iter().flat_map(|told| columns.iter().map(|column| told.clone().on(&column.name))));
         channels.extend(columns);
     }
     let mut all = Recording::checked(label, name, time, channels, 0.0)?;
