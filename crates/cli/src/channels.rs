@@ -26,9 +26,13 @@ pub(crate) struct Channels {
     #[command(flatten)]
     pub(crate) names: Names,
 
-    /// Channel to read, such as "/joint_states.position[elbow]", and no other but those of --map; may be repeated
-    /// [default: what model and --map name, of a log with several clocks]
-    #[arg(id = "channels", long = "channels", value_name = "CHANNEL")]
+    #[arg(
+        id = "channels",
+        long = "channels",
+        value_name = "CHANNEL",
+        help = "Channel to read, such as \"/joint_states.position[elbow]\", and no other but those of --map; may be repeated \
+                [default: what model and --map name, of a log with several clocks]"
+    )]
     pub(crate) only: Vec<String>,
 }
 
