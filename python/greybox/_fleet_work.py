@@ -24,6 +24,7 @@ class Plan:
     model_path: str
     holdout: tuple[str, ...]
     map: tuple[str, ...]
+    channels: tuple[str, ...]
     seed: int
     work: int | None
     mechanisms: tuple[tuple[str, str], ...]
@@ -59,7 +60,7 @@ def fleet(plan: Plan) -> _native.Fleet:
     """The plan, read: once in a process."""
     held = [(place, content(place, plan.options)) for place in plan.holdout]
     model = _native.Model(plan.model_text, plan.model_path)
-    return _native.Fleet(model, held, list(plan.map), plan.seed, plan.work, list(plan.mechanisms))
+    return _native.Fleet(model, held, list(plan.map), list(plan.channels), plan.seed, plan.work, list(plan.mechanisms))
 
 
 def work(plan: Plan, run: Run) -> Outcome:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 import re
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from typing import TYPE_CHECKING, Any, Union
 
 import numpy as np
@@ -261,3 +261,8 @@ def recordings(
 def renames(map: Mapping[str, str] | None) -> list[str]:
     """``map`` as the command has it."""
     return [f"{name}={channel}" for name, channel in (map or {}).items()]
+
+
+def names(channels: str | Sequence[str]) -> list[str]:
+    """``channels`` as the command has it."""
+    return [channels] if isinstance(channels, str) else list(channels)

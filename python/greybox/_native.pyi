@@ -81,6 +81,7 @@ def diagnose(
     train: Sequence[_Source],
     holdout: Sequence[_Source],
     map: Sequence[str],
+    channels: Sequence[str],
     seed: int,
     work: int | None,
     mechanisms: str | PathLike[str] | None,
@@ -91,6 +92,7 @@ def identify(
     train: Sequence[_Source],
     holdout: Sequence[_Source],
     map: Sequence[str],
+    channels: Sequence[str],
     wanted: dict[str, Any],
     progress: _Progress,
 ) -> _Studied: ...
@@ -99,13 +101,18 @@ def calibrate(
     train: Sequence[_Source],
     holdout: Sequence[_Source],
     map: Sequence[str],
+    channels: Sequence[str],
     progress: _Progress,
 ) -> _Studied: ...
 def simulate(
-    model: Model, recording: _Source, map: Sequence[str], progress: _Progress
+    model: Model, recording: _Source, map: Sequence[str], channels: Sequence[str], progress: _Progress
 ) -> tuple[str, str, _Floats, list[tuple[str, _Floats]]]: ...
 def check(
-    recordings: Sequence[_Source], model: Model | None, inputs: Sequence[str], map: Sequence[str]
+    recordings: Sequence[_Source],
+    model: Model | None,
+    inputs: Sequence[str],
+    map: Sequence[str],
+    channels: Sequence[str],
 ) -> tuple[str, str]: ...
 def control(
     model: Model, wanted: dict[str, Any], report: tuple[str, str] | None, progress: _Progress
@@ -120,6 +127,7 @@ class Fleet:
         model: Model,
         holdout: Sequence[tuple[str, bytes]],
         map: Sequence[str],
+        channels: Sequence[str],
         seed: int,
         work: int | None,
         mechanisms: Sequence[tuple[str, str]],

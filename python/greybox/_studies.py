@@ -7,7 +7,7 @@ from collections.abc import Callable, Iterable, Mapping, Sequence
 from typing import Union
 
 from . import _native
-from ._inputs import ModelLike, RecordingLike, model as native, recordings, renames
+from ._inputs import ModelLike, RecordingLike, model as native, names, recordings, renames
 from ._results import Calibration, Control, Diagnosis, Health, Identification, Simulation
 
 Recordings = Union[RecordingLike, Iterable[RecordingLike]]
@@ -22,6 +22,7 @@ def diagnose(
     *,
     units: Mapping[str, str] | None = None,
     map: Mapping[str, str] | None = None,
+    channels: str | Sequence[str] = (),
     seed: int = 0,
     work: int | None = None,
     mechanisms: str | os.PathLike[str] | None = None,
@@ -36,6 +37,8 @@ def diagnose(
         holdout: recordings that only judge the result; without any, the last fifth of each recording is held out.
         units: unit of each channel that states none, such as ``{"theta": "deg"}``.
         map: channel for a name of the model, such as ``{"theta": "sensor_3 [deg]"}``.
+        channels: channels to read, and no other but those of ``map``; without any, of a log with several clocks those
+            that the model and ``map`` name.
         seed: echoed into the report; the same seed and inputs give the same result.
         work: most work of the search, in billions of operations.
         mechanisms: folder of mechanisms of your own (``*.toml``), tried beside the built-in ones.
@@ -81,6 +84,7 @@ def diagnose(
             recordings(train, "train", units),
             recordings(holdout, "holdout", units),
             renames(map),
+            names(channels),
             seed,
             work,
             mechanisms,
@@ -98,6 +102,7 @@ def identify(
     *,
     units: Mapping[str, str] | None = None,
     map: Mapping[str, str] | None = None,
+    channels: str | Sequence[str] = (),
     order: int | None = None,
     library: Sequence[str] = (),
     terms: Sequence[str] = (),
@@ -113,7 +118,7 @@ def identify(
     """Finds the governing equations from recordings alone: which terms, their values, and how sure each is.
 
     Args:
-        train, holdout, units, map, progress: as of :func:`diagnose`.
+        train, holdout, units, map, channels, progress: as of :func:`diagnose`.
         states: channels that are the coordinates, one equation each.
         inputs: channels that drive the machine; which of them enters which equation is found.
         order: highest order of the library; 6 for one state, 4 for several.
@@ -148,6 +153,7 @@ def identify(
             recordings(train, "train", units),
             recordings(holdout, "holdout", units),
             renames(map),
+            names(channels),
             wanted,
             progress,
         )
@@ -161,6 +167,7 @@ def calibrate(
     *,
     units: Mapping[str, str] | None = None,
     map: Mapping[str, str] | None = None,
+    channels: str | Sequence[str] = (),
     progress: Progress | None = None,
 ) -> Calibration:
     """Refits the parameters of a model, its equations unchanged, with uncertainties.
@@ -173,6 +180,7 @@ def calibrate(
             recordings(train, "train", units),
             recordings(holdout, "holdout", units),
             renames(map),
+            names(channels),
             progress,
         )
     )
@@ -184,11 +192,12 @@ def simulate(
     *,
     units: Mapping[str, str] | None = None,
     map: Mapping[str, str] | None = None,
+    channels: str | Sequence[str] = (),
     progress: Progress | None = None,
 ) -> Simulation:
     """Simulates a model on the inputs of a recording, from the initial state estimated on its first quarter."""
     (one,) = recordings([recording], "recording", units)
-    return Simulation(_native.simulate(native(model), one, renames(map), progress))
+    return Simulation(_native.simulate(native(model), one, renames(map), names(channels), progress))
 
 
 def check(
@@ -198,6 +207,7 @@ def check(
     inputs: str | Sequence[str] = (),
     units: Mapping[str, str] | None = None,
     map: Mapping[str, str] | None = None,
+    channels: str | Sequence[str] = (),
 ) -> Health:
     """Checks the health of recordings: sampling, gaps, clipping, quantisation, outliers, excitation, delay, clocks.
 
@@ -211,7 +221,8 @@ def check(
     """
     named = [inputs] if isinstance(inputs, str) else list(inputs)
     given = None if model is None else native(model)
-    return Health(*_native.check(recordings(data, "recording", units), given, named, renames(map)))
+    read = recordings(data, "recording", units)
+    return Health(*_native.check(read, given, named, renames(map), names(channels)))
 
 
 def control(

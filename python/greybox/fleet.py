@@ -13,7 +13,7 @@ from __future__ import annotations
 
 import os
 import posixpath
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from concurrent.futures import BrokenExecutor
 from typing import Any, Union
 
@@ -21,7 +21,7 @@ from . import _native
 from ._engines import each, engine
 from ._errors import GreyboxError, InputError, InternalError
 from ._fleet_work import Outcome, Plan, Run, fleet, work as _work
-from ._inputs import ModelLike, model as native, renames
+from ._inputs import ModelLike, model as native, names, renames
 from ._places import Folder, Options, entries, is_folder, is_url, matching
 from ._tables import RunsLike, table
 from ._records import Named, Record
@@ -129,6 +129,7 @@ def diagnose(
     holdout: Place | Iterable[Place] | None = None,
     runs: RunsLike | None = None,
     map: Mapping[str, str] | None = None,
+    channels: str | Sequence[str] = (),
     seed: int = 0,
     work: int | None = None,
     mechanisms: str | os.PathLike[str] | None = None,
@@ -154,7 +155,7 @@ def diagnose(
         runs: which machine each recording is of, when it was made and under what conditions: a CSV file, a frame or a dict of
             columns ``recording`` (its name in the summary), ``machine``, ``date``, and covariates such as
             ``temperature [degC]``.
-        map, seed, work, mechanisms: as of :func:`greybox.diagnose`.
+        map, channels, seed, work, mechanisms: as of :func:`greybox.diagnose`.
         threads: how many cores the diagnosis of one recording uses.
         storage_options: arguments of the file system behind the URLs.
         progress: hears of every recording that is done.
@@ -172,6 +173,7 @@ def diagnose(
         model_path=os.fspath(inner.path),
         holdout=held,
         map=tuple(renames(map)),
+        channels=tuple(names(channels)),
         seed=seed,
         work=work,
         mechanisms=tuple(_native.mechanisms(mechanisms)) if mechanisms is not None else (),

@@ -4,7 +4,7 @@ use std::cell::RefCell;
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
 
-use greybox_commands::fleet::{self, File, Member, Table};
+use greybox_commands::fleet::{self, Channels, File, Member, Table};
 use greybox_commands::{Failure, loading};
 use greybox_diagnose::Options;
 use greybox_report::summary::Statistics;
@@ -34,6 +34,7 @@ impl Fleet {
         model: &Model,
         holdout: Vec<(PathBuf, Vec<u8>)>,
         map: Vec<String>,
+        channels: Vec<String>,
         seed: u64,
         work: Option<u64>,
         mechanisms: Vec<(String, String)>,
@@ -52,7 +53,8 @@ impl Fleet {
                 terms_only: false,
             };
             let holdout = holdout.into_iter().map(|(path, bytes)| File { path, bytes }).collect();
-            fleet::Fleet::new(loaded, holdout, map, options, &mechanisms)
+            let channels = Channels { map, only: channels };
+            fleet::Fleet::new(loaded, holdout, channels, options, &mechanisms)
         });
         raised(py, made).map(|fleet| Fleet(Arc::new(fleet)))
     }

@@ -3,7 +3,7 @@
 use std::path::{Path, PathBuf};
 
 use greybox_commands::Failure;
-use greybox_commands::loading::{self, LoadedModel};
+use greybox_commands::loading::{self, LoadedModel, Wanted};
 use greybox_model::{Hold, Unit, WriteOptions, nearest};
 use greybox_recording::{Channel, Rename, RenameError};
 use numpy::{PyArray1, PyReadonlyArray1};
@@ -48,7 +48,7 @@ impl Recording {
     /// What is in a file.
     #[staticmethod]
     fn read(py: Python<'_>, path: PathBuf) -> PyResult<Recording> {
-        let read = py.detach(|| loading::recordings(&[path], &[]));
+        let read = py.detach(|| loading::recordings(&[path], &Wanted::default()));
         raised(py, read.and_then(only)).map(Recording)
     }
 
@@ -89,7 +89,7 @@ pub(crate) enum Source {
 pub(crate) struct Sources {
     train: Vec<Place>,
     holdout: Vec<Place>,
-    map: Vec<Rename>,
+    wanted: Wanted,
 }
 
 enum Place {
@@ -104,7 +104,9 @@ impl Sources {
         train: Vec<Source>,
         holdout: Vec<Source>,
         map: Vec<String>,
+        channels: &[String],
     ) -> Result<Sources, Failure> {
+        let map = map.iter().map(|text| rename(text)).collect::<Result<Vec<_>, _>>()?;
         let place = |source| match source {
             Source::Memory(recording) => Place::Memory(recording.get().0.clone()),
             Source::File(path) => Place::File(path),
@@ -112,8 +114,18 @@ impl Sources {
         Ok(Sources {
             train: train.into_iter().map(place).collect(),
             holdout: holdout.into_iter().map(place).collect(),
-            map: map.iter().map(|text| rename(text)).collect::<Result<_, _>>()?,
+            wanted: Wanted::new(&map, channels),
         })
+    }
+
+    /// Of a file with several clocks only what the model names.
+    pub(crate) fn of_model(self, model: &greybox_model::Model) -> Sources {
+        Sources { wanted: self.wanted.of_model(model), ..self }
+    }
+
+    /// Of a file with several clocks only these channels.
+    pub(crate) fn of_names(self, names: impl Iterator<Item = String>) -> Sources {
+        Sources { wanted: self.wanted.of_names(names.map(|name| vec![name])), ..self }
     }
 
     /// The same with the recordings of every folder in its place.
@@ -133,7 +145,7 @@ impl Sources {
             }
             Ok(files)
         };
-        Ok(Sources { train: spread(self.train)?, holdout: spread(self.holdout)?, map: self.map })
+        Ok(Sources { train: spread(self.train)?, holdout: spread(self.holdout)?, wanted: self.wanted })
     }
 
     /// Reads the files; recordings to learn from, then those held out.
@@ -150,12 +162,12 @@ impl Sources {
                 Place::Memory(_) => None,
             })
             .collect();
-        let mut read = loading::recordings(&paths, &self.map)?.into_iter();
+        let mut read = loading::recordings(&paths, &self.wanted)?.into_iter();
         let mut train = Vec::with_capacity(all.len());
         for place in all {
             train.push(match place {
                 Place::Memory(mut recording) => {
-                    recording.rename(&self.map)?;
+                    self.wanted.apply(&mut recording)?;
                     recording
                 }
                 Place::File(_) => only(read.by_ref().take(1).collect())?,
@@ -182,7 +194,9 @@ pub(crate) struct Recordings {
 pub(crate) fn rename(text: &str) -> Result<Rename, Failure> {
     let rename: Rename = text.parse().map_err(|e: RenameError| Failure::input(e.to_string()))?;
     match rename.unit.as_deref().map(Unit::parse) {
-        Some(Err(error)) if error.unknown.is_none() => Err(Failure::input(error.to_string())),
+        Some(Err(error)) if error.unknown.is_none() && rename.states_unit() => {
+            Err(Failure::input(error.to_string()))
+        }
         _ => Ok(rename),
     }
 }

@@ -25,20 +25,21 @@ type Studied<'py> = (String, String, Option<String>, String, Bound<'py, PyList>)
 
 /// Reads the recordings and sees that they fit the model, as the command does.
 fn fitting(sources: Sources, model: &Equations) -> Result<Recordings, Failure> {
-    let recordings = sources.read()?;
+    let recordings = sources.of_model(model).read()?;
     Data::new(model, &recordings.train)?;
     Data::new(model, &recordings.holdout)?;
     Ok(recordings)
 }
 
 #[pyfunction]
-#[pyo3(signature = (model, train, holdout, map, seed, work, mechanisms, terms_only, progress))]
+#[pyo3(signature = (model, train, holdout, map, channels, seed, work, mechanisms, terms_only, progress))]
 pub(crate) fn diagnose<'py>(
     py: Python<'py>,
     model: &Model,
     train: Vec<Source>,
     holdout: Vec<Source>,
     map: Vec<String>,
+    channels: Vec<String>,
     seed: u64,
     work: Option<u64>,
     mechanisms: Option<PathBuf>,
@@ -46,7 +47,7 @@ pub(crate) fn diagnose<'py>(
     progress: Option<&Bound<'py, PyAny>>,
 ) -> PyResult<Studied<'py>> {
     let loaded = model.loaded();
-    let sources = raised(py, Sources::new(train, holdout, map))?;
+    let sources = raised(py, Sources::new(train, holdout, map, &channels))?;
     let results = watched(py, progress, move |watch| {
         let own = mechanisms.as_deref().map(loading::mechanisms).transpose()?;
         let Recordings { train, holdout } = fitting(sources, &loaded.model)?;
@@ -156,19 +157,21 @@ impl Wanted {
 }
 
 #[pyfunction]
-#[pyo3(signature = (train, holdout, map, wanted, progress))]
+#[pyo3(signature = (train, holdout, map, channels, wanted, progress))]
 pub(crate) fn identify<'py>(
     py: Python<'py>,
     train: Vec<Source>,
     holdout: Vec<Source>,
     map: Vec<String>,
+    channels: Vec<String>,
     wanted: Wanted,
     progress: Option<&Bound<'py, PyAny>>,
 ) -> PyResult<Studied<'py>> {
     let options = raised(py, wanted.options())?;
-    let sources = raised(py, Sources::new(train, holdout, map))?;
+    let sources = raised(py, Sources::new(train, holdout, map, &channels))?;
     let results = watched(py, progress, move |watch| {
-        let Recordings { train, holdout } = sources.read()?;
+        let names = wanted.states.iter().chain(&wanted.inputs).cloned();
+        let Recordings { train, holdout } = sources.of_names(names).read()?;
         let found = greybox_identify::identify(&train, &holdout, &options, watch)?;
         watch.stage("writing the report");
         let told = Told { train: &train, holdout: &holdout, hold: options.hold };
@@ -179,17 +182,18 @@ pub(crate) fn identify<'py>(
 }
 
 #[pyfunction]
-#[pyo3(signature = (model, train, holdout, map, progress))]
+#[pyo3(signature = (model, train, holdout, map, channels, progress))]
 pub(crate) fn calibrate<'py>(
     py: Python<'py>,
     model: &Model,
     train: Vec<Source>,
     holdout: Vec<Source>,
     map: Vec<String>,
+    channels: Vec<String>,
     progress: Option<&Bound<'py, PyAny>>,
 ) -> PyResult<Studied<'py>> {
     let loaded = model.loaded();
-    let sources = raised(py, Sources::new(train, holdout, map))?;
+    let sources = raised(py, Sources::new(train, holdout, map, &channels))?;
     let results = watched(py, progress, move |watch| {
         let Recordings { train, holdout } = fitting(sources, &loaded.model)?;
         calibration::has_free_parameter(&loaded)?;
@@ -206,18 +210,19 @@ pub(crate) fn calibrate<'py>(
 type Simulated<'py> = (String, String, Bound<'py, PyArray1<f64>>, Vec<(String, Bound<'py, PyArray1<f64>>)>);
 
 #[pyfunction]
-#[pyo3(signature = (model, recording, map, progress))]
+#[pyo3(signature = (model, recording, map, channels, progress))]
 pub(crate) fn simulate<'py>(
     py: Python<'py>,
     model: &Model,
     recording: Source,
     map: Vec<String>,
+    channels: Vec<String>,
     progress: Option<&Bound<'py, PyAny>>,
 ) -> PyResult<Simulated<'py>> {
     let loaded = model.loaded();
-    let sources = raised(py, Sources::new(vec![recording], Vec::new(), map))?;
+    let sources = raised(py, Sources::new(vec![recording], Vec::new(), map, &channels))?;
     let (simulated, time) = watched(py, progress, move |watch| {
-        let Recordings { train, .. } = sources.read()?;
+        let Recordings { train, .. } = sources.of_model(&loaded.model).read()?;
         let recording = train.into_iter().next().ok_or_else(Failure::fault)?;
         let simulated = simulation::simulate(&loaded, &recording, &|what| watch.stage(what))?;
         Ok((simulated, recording.time))
@@ -229,19 +234,24 @@ pub(crate) fn simulate<'py>(
 }
 
 #[pyfunction]
-#[pyo3(signature = (recordings, model, inputs, map))]
+#[pyo3(signature = (recordings, model, inputs, map, channels))]
 pub(crate) fn check(
     py: Python<'_>,
     recordings: Vec<Source>,
     model: Option<&Model>,
     inputs: Vec<String>,
     map: Vec<String>,
+    channels: Vec<String>,
 ) -> PyResult<(String, String)> {
     let loaded = model.map(Model::loaded);
-    let sources = raised(py, Sources::new(recordings, Vec::new(), map))?;
+    let sources = raised(py, Sources::new(recordings, Vec::new(), map, &channels))?;
     watched(py, None, move |_| {
-        let Recordings { train, .. } = sources.without_folders()?.read()?;
         let model = loaded.as_ref().map(|l| &l.model);
+        let sources = match model {
+            Some(model) => sources.of_model(model),
+            None => sources,
+        };
+        let Recordings { train, .. } = sources.without_folders()?.read()?;
         let checked = checks::check(&train, model, &inputs)?;
         Ok((checks::to_json(model, &checked).to_string(), checks::story(&checked)))
     })

@@ -9,10 +9,11 @@ use clap::Args;
 use greybox_commands::case::{Values, masked, statistics};
 use greybox_commands::check::check_for_model;
 use greybox_model::Model;
-use greybox_recording::{Finding, Recording, Rename, health};
+use greybox_recording::{Finding, Recording, health};
 use serde_json::{Value, json};
 
 use crate::answer::Answer;
+use crate::channels::Channels;
 use crate::failure::Failure;
 use crate::loading;
 use crate::output::{Content, OutputFolder};
@@ -35,7 +36,7 @@ pub(crate) struct Subject<'a> {
     pub(crate) model: Option<&'a Path>,
     pub(crate) train: &'a [PathBuf],
     pub(crate) holdout: &'a [PathBuf],
-    pub(crate) map: &'a [Rename],
+    pub(crate) read: &'a Channels,
     /// Folder of mechanisms beside the built-in ones.
     pub(crate) mechanisms: Option<&'a Path>,
     /// The channels that drive the machine and those that follow, where no model says so.
@@ -87,7 +88,7 @@ impl CaseOptions {
         let model = subject.model.and_then(|path| loading::model(path).ok()).map(|loaded| loaded.model);
         let files = Inputs::of(subject);
         let read: Vec<Result<Recording, Failure>> =
-            files.recordings.iter().map(|(path, _)| recording(path, subject.map)).collect();
+            files.recordings.iter().map(|(path, _)| recording(path, subject, model.as_ref())).collect();
         let values = match self.with_data {
             true => Values::default(),
             false => Values::of(read.iter().flatten()),
@@ -209,9 +210,15 @@ fn prepare(path: &Path, subject: &Subject<'_>) -> Result<OutputFolder, Failure> 
 }
 
 /// The recording as the command sees it.
-fn recording(path: &Path, map: &[Rename]) -> Result<Recording, Failure> {
+fn recording(path: &Path, subject: &Subject<'_>, model: Option<&Model>) -> Result<Recording, Failure> {
+    let wanted = subject.read.wanted();
+    let (inputs, states) = subject.channels;
+    let wanted = match model {
+        Some(model) => wanted.of_model(model),
+        None => wanted.of_names(inputs.iter().chain(states).map(|name| vec![name.clone()])),
+    };
     // Whatever the reader does to this file, the case is written.
-    let read = panic::catch_unwind(AssertUnwindSafe(|| loading::recordings(&[path.to_owned()], map)));
+    let read = panic::catch_unwind(AssertUnwindSafe(|| loading::recordings(&[path.to_owned()], &wanted)));
     read.unwrap_or_else(|_| Err(Failure::fault()))?.pop().ok_or_else(Failure::fault)
 }
 
@@ -227,10 +234,15 @@ fn findings(recording: &Recording, model: Option<&Model>, subject: &Subject<'_>)
 
 /// Formats of recordings that this build reads.
 fn formats() -> Vec<&'static str> {
-    [("csv", true), ("mat", cfg!(feature = "mat")), ("parquet", cfg!(feature = "parquet"))]
-        .into_iter()
-        .filter_map(|(name, built)| built.then_some(name))
-        .collect()
+    [
+        ("csv", true),
+        ("mat", cfg!(feature = "mat")),
+        ("mcap", cfg!(feature = "mcap")),
+        ("parquet", cfg!(feature = "parquet")),
+    ]
+    .into_iter()
+    .filter_map(|(name, built)| built.then_some(name))
+    .collect()
 }
 
 /// What a panic says.

@@ -6,6 +6,7 @@
 mod answer;
 mod arguments;
 mod case;
+mod channels;
 mod commands;
 mod failure;
 mod log;

@@ -5,12 +5,12 @@ use std::path::{Path, PathBuf};
 use clap::Args;
 
 use crate::case::{CaseOptions, Subject};
+use crate::channels::Channels;
 use crate::failure::Failure;
-use crate::loading::{self, LoadedModel};
+use crate::loading::{self, LoadedModel, Wanted};
 use crate::output::OutputFolder;
 use greybox_calibrate::Data;
-use greybox_model::Unit;
-use greybox_recording::{Recording, Rename, RenameError};
+use greybox_recording::Recording;
 
 /// The unit of `--work`, in operations.
 pub(crate) const BILLION: u64 = 1_000_000_000;
@@ -20,33 +20,10 @@ pub(crate) fn whole(text: &str) -> Result<u64, String> {
     text.parse().map_err(|_| format!("write a whole number from 0 to {}, such as 7", u64::MAX))
 }
 
-/// What the model calls the channels of the recordings.
-#[derive(Debug, Args)]
-pub(crate) struct Channels {
-    // (Not a doc comment: rustdoc takes a unit in brackets for a link.)
-    #[arg(
-        long,
-        value_name = "NAME=CHANNEL",
-        value_parser = rename,
-        help = "Name of the model for a channel of the recordings, with its unit where they state none, such as \
-                \"theta=sensor_3 [deg]\"; may be repeated"
-    )]
-    pub(crate) map: Vec<Rename>,
-}
-
-/// A [`Rename`] whose unit, if it has one, is written as one; a symbol that is not built in may be declared by the model.
-fn rename(text: &str) -> Result<Rename, String> {
-    let rename: Rename = text.parse().map_err(|e: RenameError| e.to_string())?;
-    match rename.unit.as_deref().map(Unit::parse) {
-        Some(Err(error)) if error.unknown.is_none() => Err(error.to_string()),
-        _ => Ok(rename),
-    }
-}
-
 /// The recordings of a command that learns from some and is judged on others, and where its results go.
 #[derive(Debug, Args)]
 pub(crate) struct Study {
-    /// Recordings to choose and fit with (CSV, MAT-file or Parquet)
+    /// Recordings to choose and fit with (CSV, MAT-file, MCAP or Parquet)
     #[arg(value_name = "TRAIN.csv", required = true)]
     pub(crate) train: Vec<PathBuf>,
 
@@ -73,12 +50,12 @@ pub(crate) struct Recordings {
 }
 
 impl Study {
-    /// Reads the recordings.
+    /// Reads what is wanted of the recordings.
     ///
     /// # Errors
     /// As [`loading::train_and_holdout`].
-    pub(crate) fn recordings(&self) -> Result<Recordings, Failure> {
-        let (train, holdout) = loading::train_and_holdout(&self.train, &self.holdout, &self.channels.map)?;
+    pub(crate) fn recordings(&self, wanted: &Wanted) -> Result<Recordings, Failure> {
+        let (train, holdout) = loading::train_and_holdout(&self.train, &self.holdout, wanted)?;
         Ok(Recordings { train, holdout })
     }
 
@@ -88,7 +65,7 @@ impl Study {
     /// Bad input: a file that cannot be read, or a recording that lacks what the model needs.
     pub(crate) fn read(&self, model: &Path) -> Result<(LoadedModel, Recordings), Failure> {
         let loaded = loading::model(model)?;
-        let recordings = self.recordings()?;
+        let recordings = self.recordings(&self.channels.wanted().of_model(&loaded.model))?;
         Data::new(&loaded.model, &recordings.train)?;
         Data::new(&loaded.model, &recordings.holdout)?;
         Ok((loaded, recordings))
@@ -100,7 +77,7 @@ impl Study {
             model: None,
             train: &self.train,
             holdout: &self.holdout,
-            map: &self.channels.map,
+            read: &self.channels,
             mechanisms: None,
             channels: (&[], &[]),
             out: &self.out,

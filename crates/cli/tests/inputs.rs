@@ -106,6 +106,47 @@ fn a_map_is_part_of_what_a_folder_was_made_from() {
     assert_eq!(run("cm")["done_before"], 0, "another unit is another diagnosis");
 }
 
+/// `--channels` reads these alone, and what `--map` and the model name.
+#[test]
+fn channels_are_read_alone() {
+    let bench = bench();
+    let names = |arguments: &[&str]| -> Vec<String> {
+        let json = bench.json(&[&["check", "raw.csv"], arguments].concat());
+        let channels = json["recordings"][0]["channels"].as_array().unwrap();
+        channels.iter().map(|c| c["name"].as_str().unwrap().to_owned()).collect()
+    };
+    assert_eq!(names(&[]), ["force", "sensor_3"]);
+    assert_eq!(names(&["--channels", "sensor_3"]), ["sensor_3"]);
+    assert_eq!(names(&["--channels", "force", "--map", "x=sensor_3 [mm]"]), ["force", "x"]);
+    bench.refuses(
+        &["check", "raw.csv", "--channels", "sensor3"],
+        &[
+            "raw.csv: there is no channel `sensor3`; the file has `force`, `sensor_3`",
+            "did you mean `sensor_3`?",
+        ],
+    );
+    let calibrated = |arguments: &[&str]| {
+        let all = [&["calibrate", "model.toml", "run.csv", "--out", "out"], arguments].concat();
+        bench.json(&all)["parameters"].clone()
+    };
+    assert_eq!(calibrated(&["--channels", "x"]), calibrated(&[]), "the model's input is read as well");
+    bench.refuses(&["watch", "model.toml", "--channels", "x"], &["--channels"]);
+}
+
+#[test]
+fn channels_are_part_of_what_a_folder_was_made_from() {
+    let bench = bench();
+    fs::create_dir(bench.path("runs")).unwrap();
+    fs::rename(bench.path("run.csv"), bench.path("runs/run.csv")).unwrap();
+    let run = |more: &[&str]| {
+        let arguments = ["diagnose", "model.toml", "runs", "--work", "1", "--out", "out"];
+        bench.json(&[&arguments as &[&str], more].concat())["done_before"].clone()
+    };
+    assert_eq!(run(&[]), 0);
+    assert_eq!(run(&["--channels", "x"]), 0, "other channels are another diagnosis");
+    assert_eq!(run(&["--channels", "x"]), 1);
+}
+
 #[test]
 fn a_map_that_does_not_fit_is_refused() {
     let bench = bench();
@@ -233,7 +274,7 @@ fn check_takes_folders_and_finds_clocks_that_disagree() {
     fs::create_dir(bench.path("empty")).unwrap();
     bench.refuses(
         &["check", "empty"],
-        &["empty: this folder holds no recording (`*.csv`, `*.mat`, `*.parquet`)"],
+        &["empty: this folder holds no recording (`*.csv`, `*.mat`, `*.mcap`, `*.parquet`)"],
     );
     bench
         .refuses(&["check", "runs", "runs/one_clock.csv"], &["one_clock.csv: this recording is named twice"]);

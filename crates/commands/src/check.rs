@@ -5,7 +5,7 @@ use std::path::Path;
 
 use greybox_calibrate::Data;
 use greybox_model::{Model, Unit};
-use greybox_recording::{Finding, Recording, Severity, health, listed};
+use greybox_recording::{Channel, Character, Finding, Recording, Severity, character, health, listed};
 use greybox_report::convert::health_finding;
 use greybox_report::notes::{Note, grouped};
 use greybox_report::{contract, format};
@@ -34,6 +34,14 @@ struct ChannelUse {
     unit: Option<String>,
     /// In plain language; `null` where the model does not use the channel, or none was given.
     feeds: Option<String>,
+    /// Samples that are not missing.
+    samples: usize,
+    /// Samples per second, from the first to the last of them.
+    rate_hz: Option<f64>,
+    /// Places where the next sample comes after more than 1.5 of its usual steps.
+    gaps: usize,
+    /// How it moves; what is smooth may be a state, anything else that moves an input.
+    character: Option<Character>,
 }
 
 /// Checks recordings, with the roles that a model gives their channels, or with `inputs` as what drives them.
@@ -187,17 +195,51 @@ fn describe(
         channels: recording
             .channels
             .iter()
-            .map(|c| ChannelUse {
-                name: c.name.clone(),
-                unit: c.unit.clone(),
-                feeds: feeds(&c.name, c.unit.as_deref()),
-            })
+            .map(|c| ChannelUse::of(c, &recording.time, feeds(&c.name, c.unit.as_deref())))
             .collect(),
         findings,
     }
 }
 
+impl ChannelUse {
+    fn of(channel: &Channel, time: &[f64], feeds: Option<String>) -> ChannelUse {
+        let there = time.iter().zip(&channel.values).filter(|(_, value)| !value.is_nan());
+        let times: Vec<f64> = there.map(|(t, _)| *t).collect();
+        let steps: Vec<f64> = times.windows(2).map(|w| w[1] - w[0]).collect();
+        let usual = greybox_recording::noise::median(&steps);
+        let span: f64 = steps.iter().sum();
+        ChannelUse {
+            name: channel.name.clone(),
+            unit: channel.unit.clone(),
+            feeds,
+            samples: times.len(),
+            rate_hz: (span > 0.0).then(|| steps.len() as f64 / span),
+            gaps: steps.iter().filter(|step| **step > 1.5 * usual).count(),
+            character: character(&channel.values),
+        }
+    }
+
+    /// Rate, samples, gaps and what it may be, in words.
+    fn in_a_log(&self) -> String {
+        let rate = self.rate_hz.map_or(String::new(), |rate| format!("{} Hz, ", format::number(rate)));
+        let gaps = if self.gaps > 0 { format!(", {}", plural(self.gaps, "gap")) } else { String::new() };
+        let moves = match self.character {
+            Some(Character::Constant) => "; constant",
+            Some(Character::Steps) => "; in steps: an input?",
+            Some(Character::Broadband) => "; broadband: an input?",
+            Some(Character::Smooth) => "; smooth: a state?",
+            None => "",
+        };
+        format!("{rate}{}{gaps}{moves}", plural(self.samples, "sample"))
+    }
+}
+
 impl Health {
+    /// Whether its channels come from clocks of their own.
+    fn is_a_log(&self) -> bool {
+        self.findings.iter().any(|finding| finding.code == "clocks")
+    }
+
     /// The findings as those of a study of several recordings.
     fn findings(&self) -> impl Iterator<Item = contract::Finding> {
         self.findings.iter().map(|f| health_finding(f.clone(), Some(self.file.clone())))
@@ -221,7 +263,11 @@ fn table(health: &Health) -> String {
     let width = health.channels.iter().map(|c| c.name.chars().count()).max().unwrap_or(0);
     for channel in &health.channels {
         let unit = channel.unit.as_deref().map_or(String::new(), |u| format!("[{}]", format::unit(u)));
-        let feeds = channel.feeds.as_deref().unwrap_or_default();
+        let feeds = match &channel.feeds {
+            Some(feeds) => feeds.clone(),
+            None if health.is_a_log() => channel.in_a_log(),
+            None => String::new(),
+        };
         let line = format!("  {:width$}  {unit:10}  {feeds}", channel.name);
         let _ = writeln!(text, "{}", line.trim_end());
     }

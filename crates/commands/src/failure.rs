@@ -314,7 +314,7 @@ impl From<RenameError> for Failure {
             RenameError::Unknown { file, channel, available } => {
                 let help = match nearest(&channel, available.iter().map(String::as_str)) {
                     Some(near) => format!("did you mean `{near}`?"),
-                    None => "name one of these after the `=` of `--map`".to_owned(),
+                    None => "name one of these with `--channels`, or after the `=` of `--map`".to_owned(),
                 };
                 failure.at("file", file).at("channel", channel).help(help)
             }

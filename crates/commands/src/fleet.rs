@@ -18,7 +18,7 @@ use greybox_report::{Report, ReportError, merge};
 
 use crate::diagnose::{FILES, Results};
 use crate::failure::Failure;
-use crate::loading::{self, LoadedModel};
+use crate::loading::{self, LoadedModel, Wanted};
 use crate::story;
 use done::{Done, Fingerprint, Inputs};
 
@@ -42,10 +42,20 @@ pub struct Fleet {
     loaded: LoadedModel,
     /// What judges all of them; each has its path for a name until a recording is called the same.
     holdout: Vec<(PathBuf, Recording)>,
-    map: Vec<Rename>,
+    channels: Channels,
+    wanted: Wanted,
     options: Options,
     /// What the results depend on beside the recording.
     shared: Shared,
+}
+
+/// Which channels of the recordings are read, and what the model calls them.
+#[derive(Debug, Clone, Default)]
+pub struct Channels {
+    /// Names of the model for channels.
+    pub map: Vec<Rename>,
+    /// These alone are read beside those of `map`; all, if there are none.
+    pub only: Vec<String>,
 }
 
 /// The fingerprints of what is the same for all recordings.
@@ -96,7 +106,7 @@ impl Fleet {
     pub fn new(
         loaded: LoadedModel,
         holdout: Vec<File>,
-        map: Vec<Rename>,
+        channels: Channels,
         options: Options,
         mechanisms: &[(String, String)],
     ) -> Result<Fleet, Failure> {
@@ -108,14 +118,15 @@ impl Fleet {
                 .map(|(name, text)| Fingerprint::of(name, text.as_bytes()))
                 .collect(),
         };
+        let wanted = Wanted::new(&channels.map, &channels.only).of_model(&loaded.model);
         let read = |file: File| {
-            let recording = loading::recording_of(file.bytes, &file.path, &map)?;
+            let recording = loading::recording_of(file.bytes, &file.path, &wanted)?;
             Ok((file.path, recording))
         };
         let holdout = holdout.into_iter().map(read).collect::<Result<Vec<_>, Failure>>()?;
         let recordings: Vec<Recording> = holdout.iter().map(|(_, recording)| recording.clone()).collect();
         Data::new(&loaded.model, &recordings)?;
-        Ok(Fleet { loaded, holdout, map, options, shared })
+        Ok(Fleet { loaded, holdout, channels, wanted, options, shared })
     }
 
     /// The model.
@@ -136,8 +147,8 @@ impl Fleet {
     /// # Errors
     /// As a diagnosis of this recording alone.
     pub fn diagnose(&self, member: Member<'_>, listener: &dyn ProgressListener) -> Result<Outcome, Failure> {
-        let recording = loading::recording_of(member.file.bytes.clone(), &member.file.path, &[])?;
-        self.diagnose_read(member, recording, listener)
+        let recording = loading::recording_of(member.file.bytes.clone(), &member.file.path, &self.wanted)?;
+        self.diagnose_prepared(member, recording, listener)
     }
 
     /// As [`diagnose`](Self::diagnose), of a file that was read elsewhere.
@@ -150,7 +161,16 @@ impl Fleet {
         mut recording: Recording,
         listener: &dyn ProgressListener,
     ) -> Result<Outcome, Failure> {
-        recording.rename(&self.map)?;
+        self.wanted.apply(&mut recording)?;
+        self.diagnose_prepared(member, recording, listener)
+    }
+
+    fn diagnose_prepared(
+        &self,
+        member: Member<'_>,
+        mut recording: Recording,
+        listener: &dyn ProgressListener,
+    ) -> Result<Outcome, Failure> {
         let paths = self.paths(&member.file.path);
         recording.name = loading::called(&member.file.path, &paths);
         let train = [recording];
@@ -195,7 +215,8 @@ impl Fleet {
                 .zip(&self.shared.holdout)
                 .map(|((path, _), bytes)| fingerprint(path, bytes))
                 .collect(),
-            map: self.map.iter().map(Rename::to_string).collect(),
+            map: self.channels.map.iter().map(Rename::to_string).collect(),
+            channels: self.channels.only.clone(),
             mechanisms: self.shared.mechanisms.clone(),
         }
     }

@@ -6,7 +6,7 @@ use std::path::{Path, PathBuf};
 
 use greybox_diagnose::library::{self, Library};
 use greybox_model::{Model, Problem};
-use greybox_recording::{CsvBlocks, EXTENSIONS, Recording, RecordingError, Rename};
+use greybox_recording::{CsvBlocks, EXTENSIONS, Recording, RecordingError, Rename, Selection, read_selected};
 
 use crate::failure::Failure;
 use crate::foreign;
@@ -210,19 +210,61 @@ pub fn file_name(path: &Path) -> String {
     path.file_name().map_or_else(|| path.display().to_string(), |n| n.to_string_lossy().into_owned())
 }
 
-/// Reads the recordings at `paths` and renames their channels. Recordings that share a file name are called by their
-/// paths.
+/// Which channels of recordings are read, and what they are called.
+#[derive(Debug, Clone, Default)]
+pub struct Wanted {
+    map: Vec<Rename>,
+    selection: Selection,
+}
+
+impl Wanted {
+    /// The channels called `channels` alone, all if there are none, under the names of `map`.
+    pub fn new(map: &[Rename], channels: &[String]) -> Wanted {
+        Wanted { map: map.to_vec(), selection: Selection::of(channels, map) }
+    }
+
+    /// Of a file with several clocks only what the model names.
+    #[must_use]
+    pub fn of_model(self, model: &Model) -> Wanted {
+        let inputs = model.inputs.iter().map(|input| {
+            let base = input.derivative_of().map(str::to_owned);
+            std::iter::once(input.channel.clone()).chain(base).collect()
+        });
+        let measured = model.measurements.iter().map(|measurement| vec![measurement.channel.clone()]);
+        self.of_names(inputs.chain(measured))
+    }
+
+    /// Of a file with several clocks only these, of each list the first one that is there.
+    #[must_use]
+    pub fn of_names(mut self, names: impl IntoIterator<Item = Vec<String>>) -> Wanted {
+        self.selection = self.selection.with(&self.map, names);
+        self
+    }
+
+    /// Keeps and renames channels of a recording.
+    ///
+    /// # Errors
+    /// Bad input: a channel that it does not have, or a name that is taken.
+    pub fn apply(&self, recording: &mut Recording) -> Result<(), Failure> {
+        recording.select(&self.selection)?;
+        Ok(recording.rename(&self.map)?)
+    }
+}
+
+/// Reads the recordings at `paths`, of their channels those that are wanted. Recordings that share a file name are called by
+/// their paths.
 ///
 /// # Errors
 /// Bad input: a file that is missing, a model or a folder in its place, one named twice, any fault in it, or a channel
-/// to rename that it does not have.
-pub fn recordings(paths: &[PathBuf], map: &[Rename]) -> Result<Vec<Recording>, Failure> {
+/// that is wanted and that it does not have.
+pub fn recordings(paths: &[PathBuf], wanted: &Wanted) -> Result<Vec<Recording>, Failure> {
     no_twins(paths)?;
     let mut read = Vec::with_capacity(paths.len());
     for path in paths {
-        let mut recording = greybox_recording::read(path).map_err(|error| unreadable(path, error))?;
+        let mut recording =
+            read_selected(path, &wanted.selection).map_err(|error| unreadable(path, error))?;
         recording.name = called(path, paths);
-        recording.rename(map)?;
+        wanted.apply(&mut recording)?;
         read.push(recording);
     }
     Ok(read)
@@ -236,16 +278,16 @@ pub fn content(path: &Path) -> Result<Vec<u8>, Failure> {
     greybox_recording::content(path).map_err(|error| unreadable(path, error))
 }
 
-/// The recording in the bytes of the file at `path`, its channels renamed. Nothing need stand there: a path may be that
+/// The recording in the bytes of the file at `path`, of its channels those that are wanted. Nothing need stand there: a path may be that
 /// of another machine, or a URL.
 ///
 /// # Errors
-/// Bad input: any fault in it, or a channel to rename that it does not have.
-pub fn recording_of(bytes: Vec<u8>, path: &Path, map: &[Rename]) -> Result<Recording, Failure> {
+/// Bad input: any fault in it, or a channel that is wanted and that it does not have.
+pub fn recording_of(bytes: Vec<u8>, path: &Path, wanted: &Wanted) -> Result<Recording, Failure> {
     let label = path.display().to_string();
-    let mut recording =
-        greybox_recording::parse(bytes, &label, &file_name(path)).map_err(|error| unreadable(path, error))?;
-    recording.rename(map)?;
+    let mut recording = greybox_recording::parse(bytes, &label, &file_name(path), &wanted.selection)
+        .map_err(|error| unreadable(path, error))?;
+    wanted.apply(&mut recording)?;
     Ok(recording)
 }
 
@@ -286,7 +328,7 @@ fn unreadable(path: &Path, error: RecordingError) -> Failure {
 pub fn blocks(
     paths: &[PathBuf],
     rows: usize,
-    map: &[Rename],
+    wanted: &Wanted,
 ) -> Result<impl Iterator<Item = Result<Recording, Failure>>, Failure> {
     let open = |path: &PathBuf| {
         if EXTENSIONS.iter().any(|e| *e != "csv" && has_extension(path, e)) {
@@ -298,7 +340,7 @@ pub fn blocks(
     let files = paths.iter().map(open).collect::<Result<Vec<_>, _>>()?;
     Ok(files.into_iter().flatten().map(move |block| {
         let mut block = block?;
-        block.rename(map)?;
+        wanted.apply(&mut block)?;
         Ok(block)
     }))
 }
@@ -319,10 +361,10 @@ pub fn called(path: &Path, paths: &[PathBuf]) -> String {
 pub fn train_and_holdout(
     train: &[PathBuf],
     holdout: &[PathBuf],
-    map: &[Rename],
+    wanted: &Wanted,
 ) -> Result<(Vec<Recording>, Vec<Recording>), Failure> {
     let paths: Vec<PathBuf> = train.iter().chain(holdout).cloned().collect();
-    let mut train_recordings = recordings(&paths, map)?;
+    let mut train_recordings = recordings(&paths, wanted)?;
     let held = train_recordings.split_off(train.len());
     Ok((train_recordings, held))
 }
@@ -332,5 +374,27 @@ pub fn same_file(a: &Path, b: &Path) -> bool {
     match (fs::canonicalize(a), fs::canonicalize(b)) {
         (Ok(a), Ok(b)) => a == b,
         _ => false,
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    /// A model names the columns of its inputs and measurements; of the derivative of an input the one or the other; and what
+    /// `--map` gives a name to under the name in the file.
+    #[test]
+    fn a_model_names_what_is_read() {
+        let text = "[inputs]\nf = { unit = \"N\" }\nw = { unit = \"m\" }\ndw = { unit = \"m/s\", channel = \"w'\" }\n\
+                    [states]\nx = { unit = \"m\", channel = \"/j.position[a]\" }\n\
+                    [parameters]\nm = { value = 1, unit = \"kg\" }\nk = { value = 1, unit = \"N/m\" }\n\
+                    b = { value = 1, unit = \"N s/m\" }\n\
+                    [equations]\nbody = \"m*x'' + k*(x - w) + b*(x' - dw) = f\"\n";
+        let model = Model::from_toml(text, "m.toml").map_err(|e| e.to_string());
+        let model = model.unwrap_or_else(|e| panic!("{e}"));
+        let map: Vec<Rename> = vec!["f=/cmd.data[N]".parse().unwrap_or_else(|e| panic!("{e}"))];
+        let wanted = Wanted::new(&map, &[]).of_model(&model);
+        let named: Vec<String> = wanted.selection.named.iter().map(|names| names.join(" or ")).collect();
+        assert_eq!(named, ["/cmd.data[N] or /cmd.data", "w", "w' or w", "/j.position[a]"]);
     }
 }

@@ -334,6 +334,34 @@ pub enum RecordingError {
         /// The variables that are times.
         times: Vec<String>,
     },
+    /// No topic or group of the file holds numbers that can be read.
+    #[error(
+        "{place}: the file holds no series of numbers that can be read ({found}); record topics of numbers, as ROS 2 (CDR), \
+         ROS 1 or JSON write them"
+    )]
+    NoSeries {
+        /// The file.
+        place: Place,
+        /// What there is instead, in words.
+        found: String,
+    },
+    /// Signals of the file were recorded at different times.
+    #[error(
+        "{place}: `{late}` begins at {begin} s, after `{early}` has ended at {end} s, so that no instant has a value of both; \
+         name those that belong together with `--channels`"
+    )]
+    NoOverlap {
+        /// The file.
+        place: Place,
+        /// The clock that begins last.
+        late: String,
+        /// Its first time, s after the first of the file.
+        begin: f64,
+        /// The clock that ends first.
+        early: String,
+        /// Its last time, s after the first of the file.
+        end: f64,
+    },
     /// There is a time, and no variable or column has a value for each.
     #[error(
         "{place}: no other variable has the {rows} values of the time `{time}` ({found}); save signals and time with one \
@@ -392,6 +420,8 @@ impl RecordingError {
             | Self::TooLarge { place, .. }
             | Self::NoTime { place, .. }
             | Self::SeveralTimes { place, .. }
+            | Self::NoSeries { place, .. }
+            | Self::NoOverlap { place, .. }
             | Self::NoSignals { place, .. }
             | Self::ColumnLength { place, .. } => place,
         }

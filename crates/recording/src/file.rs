@@ -6,7 +6,7 @@ use std::io::ErrorKind;
 use std::path::Path;
 
 /// Most bytes that the values of a file may need, unpacked. A variable of a MAT-file has at most so many anyway.
-#[cfg(any(feature = "mat", feature = "parquet"))]
+#[cfg(any(feature = "mat", feature = "mcap", feature = "parquet"))]
 pub(crate) const ROOM: u64 = 2 << 30;
 
 /// The content of the file at `path`, for [`parse`](crate::parse).

@@ -32,7 +32,7 @@ pub struct Finding {
     pub severity: Severity,
     /// Stable machine name of the check: `sampling`, `jitter`, `gap`, `short_piece`, `missing`, `clipping`,
     /// `quantisation`, `outliers`, `flat`, `excitation`, `noise`, `record_length`, `bandwidth`, `delay`,
-    /// `constant_input`, `clock_offset`, `unknown_channel`; of files that are no CSV `time_column`, `left_out`; beside a
+    /// `constant_input`, `clock_offset`, `unknown_channel`; of files that are no CSV `time_column`, `left_out`, `clocks`; beside a
     /// model `nominal_diverges`, `nominal_sign`, `nominal_size`, `input_noise`.
     pub code: &'static str,
     /// The channel it is about; `None` when it concerns the whole recording.

@@ -17,22 +17,41 @@ pub(crate) fn seconds(unit: Option<&str>) -> Option<f64> {
     }
 }
 
-/// `name` or `name [unit]`.
+/// `name` or `name [unit]`. A bracket before the last one belongs to the name.
 pub(crate) fn header_cell(
     cell: &str,
     place: impl Fn() -> Place,
 ) -> Result<(String, Option<String>), RecordingError> {
-    let refuse = |help| RecordingError::HeaderCell { place: place(), found: cell.to_owned(), help };
-    let (name, unit) = match cell.split_once('[') {
-        Some((name, rest)) if !name.contains(']') => match rest.strip_suffix(']') {
-            Some(unit) if !unit.contains(['[', ']']) => (name.trim(), Some(unit.trim())),
-            _ => return Err(refuse("close the unit's bracket at the end of the cell")),
-        },
-        _ if cell.contains(']') => return Err(refuse("open the unit's bracket with `[`")),
-        _ => (cell, None),
-    };
-    if name.is_empty() {
-        return Err(refuse("give the column a name, or delete it"));
+    let (name, unit) = parts(cell).map_err(|help| RecordingError::HeaderCell {
+        place: place(),
+        found: cell.to_owned(),
+        help,
+    })?;
+    Ok((name.to_owned(), unit.map(str::to_owned)))
+}
+
+/// A name, and the unit in the bracket at its end.
+///
+/// # Errors
+/// What to do where brackets do not close, or nothing stands before them.
+pub(crate) fn parts(text: &str) -> Result<(&str, Option<&str>), &'static str> {
+    let mut open = false;
+    for c in text.chars().filter(|c| matches!(c, '[' | ']')) {
+        match (open, c) {
+            (false, ']') => return Err("open the unit's bracket with `[`"),
+            (true, '[') => return Err("close the unit's bracket at the end of the cell"),
+            _ => open = !open,
+        }
     }
-    Ok((name.to_owned(), unit.filter(|unit| !unit.is_empty()).map(str::to_owned)))
+    if open {
+        return Err("close the unit's bracket at the end of the cell");
+    }
+    let (name, unit) = match text.strip_suffix(']').and_then(|text| text.rsplit_once('[')) {
+        Some((name, unit)) => (name.trim(), Some(unit.trim()).filter(|unit| !unit.is_empty())),
+        None => (text, None),
+    };
+    match name.is_empty() {
+        true => Err("give the column a name, or delete it"),
+        false => Ok((name, unit)),
+    }
 }

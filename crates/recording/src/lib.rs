@@ -14,7 +14,7 @@
 //! | module | what it answers |
 //! |---|---|
 //! | [`csv`](mod@csv) | what stands in the file, or exactly which cell is wrong and how to fix it |
-//! | `mat`, `parquet` | the same for MAT-files and Parquet files, each behind a feature of its name |
+//! | `mat`, `mcap`, `parquet` | the same for MAT-files, MCAP logs and Parquet files, each behind a feature of its name |
 //! | [`noise`] | how large the measurement noise is, and whether a channel is quantised |
 //! | [`smooth`] | value, first and second derivative of a noisy channel (Savitzky–Golay) |
 //! | [`interpolate`] | what an input did between its samples (band-limited, linear) |
@@ -44,6 +44,9 @@
 #[doc = include_str!("../README.md")]
 struct Readme;
 
+mod character;
+#[cfg(any(feature = "mcap", test))]
+mod clocks;
 mod columns;
 mod correlation;
 pub mod csv;
@@ -56,6 +59,8 @@ pub mod health;
 pub mod interpolate;
 #[cfg(feature = "mat")]
 pub mod mat;
+#[cfg(feature = "mcap")]
+pub mod mcap;
 mod median;
 pub mod noise;
 mod outliers;
@@ -64,9 +69,11 @@ pub mod parquet;
 mod read;
 mod recording;
 mod rename;
+mod selection;
 pub mod smooth;
 mod spectrum;
 
+pub use crate::character::{Character, character};
 pub use crate::correlation::Correlation;
 pub use crate::csv::{CsvBlocks, CsvLines, parse_csv, read_csv, write_csv, write_csv_file};
 pub use crate::error::{Place, RecordingError};
@@ -74,8 +81,11 @@ pub use crate::file::{content, is_device};
 pub use crate::finding::{Finding, Severity, listed};
 #[cfg(feature = "mat")]
 pub use crate::mat::parse_mat;
+#[cfg(feature = "mcap")]
+pub use crate::mcap::parse_mcap;
 #[cfg(feature = "parquet")]
 pub use crate::parquet::parse_parquet;
-pub use crate::read::{EXTENSIONS, parse, read};
+pub use crate::read::{EXTENSIONS, parse, read, read_selected};
 pub use crate::recording::{Channel, MIN_SAMPLES, Piece, Recording, SIZES};
 pub use crate::rename::{Rename, RenameError};
+pub use crate::selection::Selection;

@@ -1,23 +1,24 @@
 //! Files to recordings: the format by the ending of the name.
 
 use crate::csv;
-#[cfg(not(all(feature = "mat", feature = "parquet")))]
+#[cfg(not(all(feature = "mat", feature = "mcap", feature = "parquet")))]
 use crate::error::Place;
 use crate::error::RecordingError;
 use crate::file::bytes;
 use crate::recording::Recording;
+use crate::selection::Selection;
 use std::path::Path;
 
 /// Endings of the files that may hold a recording. Whether this build reads all of them, its features say
-/// (`mat`, `parquet`); [`read`] tells which is missing.
-pub const EXTENSIONS: [&str; 3] = ["csv", "mat", "parquet"];
+/// (`mat`, `mcap`, `parquet`); [`read`] tells which is missing.
+pub const EXTENSIONS: [&str; 4] = ["csv", "mat", "mcap", "parquet"];
 
-/// Reads the recording in the file at `path`: a MAT-file where the name ends in `.mat`, a Parquet file where it ends
-/// in `.parquet`, CSV else.
+/// Reads the recording in the file at `path`: a MAT-file where the name ends in `.mat`, an MCAP log where it ends in
+/// `.mcap`, a Parquet file where it ends in `.parquet`, CSV else.
 ///
 /// # Errors
 /// Any [`RecordingError`]; its place names the file as given. [`RecordingError::NotBuiltIn`] where this build lacks the
-/// feature `mat` or `parquet`.
+/// feature `mat`, `mcap` or `parquet`.
 ///
 /// ```
 /// let path = std::env::temp_dir().join(format!("read_{}.csv", std::process::id()));
@@ -28,33 +29,48 @@ pub const EXTENSIONS: [&str; 3] = ["csv", "mat", "parquet"];
 /// # Ok::<(), greybox_recording::RecordingError>(())
 /// ```
 pub fn read(path: impl AsRef<Path>) -> Result<Recording, RecordingError> {
-    let path = path.as_ref();
-    let (bytes, label, name) = bytes(path)?;
-    parse(bytes, &label, &name)
+    read_selected(path, &Selection::default())
+}
+
+/// As [`read`], of a file whose signals have several clocks only what is selected; [`Recording::select`] takes care of the
+/// others.
+///
+/// # Errors
+/// As [`read`]. A channel that the file lacks is no error here: then all of them are read.
+pub fn read_selected(path: impl AsRef<Path>, selection: &Selection) -> Result<Recording, RecordingError> {
+    let (bytes, label, name) = bytes(path.as_ref())?;
+    parse(bytes, &label, &name, selection)
 }
 
 /// The recording in the bytes of a file: what errors call the file, and its name, whose ending says the format as for
-/// [`read`].
+/// [`read`]; of it what is selected, as for [`read_selected`].
 ///
 /// # Errors
 /// As [`read`].
-pub fn parse(bytes: Vec<u8>, label: &str, name: &str) -> Result<Recording, RecordingError> {
+pub fn parse(
+    bytes: Vec<u8>,
+    label: &str,
+    name: &str,
+    selection: &Selection,
+) -> Result<Recording, RecordingError> {
+    #[cfg(not(feature = "mcap"))]
+    let _ = selection;
+    let missing =
+        |format, feature| Err(RecordingError::NotBuiltIn { place: Place::file(label), format, feature });
     let ending = Path::new(name).extension().map(|e| e.to_string_lossy().to_ascii_lowercase());
     match ending.unwrap_or_default().as_str() {
         #[cfg(feature = "mat")]
         "mat" => crate::mat::parse(&bytes, label, name),
+        #[cfg(feature = "mcap")]
+        "mcap" => crate::mcap::parse(&bytes, label, name, selection),
         #[cfg(feature = "parquet")]
         "parquet" => crate::parquet::parse(bytes, label, name),
         #[cfg(not(feature = "mat"))]
-        "mat" => {
-            Err(RecordingError::NotBuiltIn { place: Place::file(label), format: "MAT-files", feature: "mat" })
-        }
+        "mat" => missing("MAT-files", "mat"),
+        #[cfg(not(feature = "mcap"))]
+        "mcap" => missing("MCAP logs", "mcap"),
         #[cfg(not(feature = "parquet"))]
-        "parquet" => Err(RecordingError::NotBuiltIn {
-            place: Place::file(label),
-            format: "Parquet files",
-            feature: "parquet",
-        }),
+        "parquet" => missing("Parquet files", "parquet"),
         _ => csv::parse(&bytes, label, name, 0),
     }
 }

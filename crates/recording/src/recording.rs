@@ -18,10 +18,11 @@ pub struct Channel {
 }
 
 impl Channel {
-    /// The header cell: `name` or `name [unit]`.
+    /// The header cell: `name` or `name [unit]`; `name[x] []` where a bracket ends the name, and there is no unit.
     pub fn header(&self) -> String {
         match &self.unit {
             Some(unit) => format!("{} [{unit}]", self.name),
+            None if self.name.ends_with(']') => format!("{} []", self.name),
             None => self.name.clone(),
         }
     }

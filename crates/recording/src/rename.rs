@@ -1,15 +1,15 @@
 //! Channels under the names that a model uses.
 
-use crate::error::Place;
 use crate::finding::listed;
-use crate::header::header_cell;
+use crate::header::parts;
 use crate::recording::Recording;
 use std::fmt;
 use std::str::FromStr;
 
 /// A channel of a file and what it is to be called.
 ///
-/// Its text is `NAME=CHANNEL`, or `NAME=CHANNEL [unit]` where the file states no unit.
+/// Its text is `NAME=CHANNEL`, or `NAME=CHANNEL [unit]` where the file states no unit. A bracket may also belong to the
+/// name: of a file with a channel `position[elbow]`, `theta=position[elbow]` means that one.
 ///
 /// ```
 /// let rename: greybox_recording::Rename = "theta=sensor_3 [deg]".parse()?;
@@ -25,6 +25,31 @@ pub struct Rename {
     pub channel: String,
     /// The unit it has; `None` = as in the file.
     pub unit: Option<String>,
+    /// Name and unit as written: the name it has in a file with a channel called so, which then gets no unit.
+    pub written: String,
+}
+
+impl Rename {
+    /// Name and unit of its channel in a file with channels of which `has` tells.
+    pub fn meant(&self, has: impl Fn(&str) -> bool) -> (&str, Option<&str>) {
+        match has(&self.written) {
+            true => (&self.written, None),
+            false => (&self.channel, self.unit.as_deref()),
+        }
+    }
+
+    /// The names that its channel may have in a file, the likelier one first.
+    pub fn names(&self) -> Vec<String> {
+        let mut names = vec![self.written.clone(), self.channel.clone()];
+        names.dedup();
+        names
+    }
+
+    /// Whether its bracket can be nothing but a unit: it stands apart from the name.
+    pub fn states_unit(&self) -> bool {
+        let head = self.written.rfind('[').map(|at| &self.written[..at]);
+        self.unit.is_some() && head.is_some_and(|head| head.ends_with(char::is_whitespace))
+    }
 }
 
 /// Why channels were not renamed. Each message is one sentence with the fix.
@@ -85,20 +110,20 @@ impl FromStr for Rename {
     fn from_str(text: &str) -> Result<Self, RenameError> {
         let wrong = || RenameError::Syntax { found: text.to_owned() };
         let (name, channel) = text.split_once('=').ok_or_else(wrong)?;
-        let (channel, unit) = header_cell(channel.trim(), || Place::file("")).map_err(|_| wrong())?;
-        let name = name.trim();
+        let (name, written) = (name.trim(), channel.trim());
+        let (channel, unit) = parts(written).map_err(|_| wrong())?;
         if name.is_empty() || name.contains(['[', ']']) {
             return Err(wrong());
         }
-        Ok(Rename { name: name.to_owned(), channel, unit })
+        let (channel, unit) = (channel.to_owned(), unit.map(str::to_owned));
+        Ok(Rename { name: name.to_owned(), channel, unit, written: written.to_owned() })
     }
 }
 
 /// As [`FromStr`] reads it.
 impl fmt::Display for Rename {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
-        write!(f, "{}={}", self.name, self.channel)?;
-        self.unit.as_ref().map_or(Ok(()), |unit| write!(f, " [{unit}]"))
+        write!(f, "{}={}", self.name, self.written)
     }
 }
 
@@ -109,20 +134,26 @@ impl Recording {
     /// [`RenameError`]; then the recording is as it was.
     pub fn rename(&mut self, renames: &[Rename]) -> Result<(), RenameError> {
         let mut channels: Vec<_> = self.channels.iter().map(|c| (c.name.clone(), c.unit.clone())).collect();
+        let meant = |rename: &Rename| {
+            let (channel, unit) = rename.meant(|name| self.channel(name).is_some());
+            (channel.to_owned(), unit.map(str::to_owned))
+        };
         for (k, rename) in renames.iter().enumerate() {
             let twice = |name: &String| RenameError::Twice { name: name.clone() };
             if renames[..k].iter().any(|other| other.name == rename.name) {
                 return Err(twice(&rename.name));
             }
-            if renames[..k].iter().any(|other| other.channel == rename.channel) {
-                return Err(twice(&rename.channel));
+            let (channel, unit) = meant(rename);
+            if renames[..k].iter().any(|other| meant(other).0 == channel) {
+                return Err(twice(&channel));
             }
-            let (file, channel) = (self.name.clone(), rename.channel.clone());
+            let file = self.name.clone();
             let Some(index) = self.channel_index(&channel) else {
                 let available = self.channels.iter().map(|c| c.name.clone()).collect();
+                let channel = if rename.states_unit() { channel } else { rename.written.clone() };
                 return Err(RenameError::Unknown { file, channel, available });
             };
-            let unit = match (&rename.unit, &channels[index].1) {
+            let unit = match (&unit, &channels[index].1) {
                 (Some(found), Some(stated)) if found != stated => {
                     return Err(RenameError::Unit {
                         file,
@@ -140,12 +171,13 @@ impl Recording {
                 return Err(RenameError::Taken { file: self.name.clone(), name: rename.name.clone() });
             }
         }
+        let old: Vec<String> = renames.iter().map(|rename| meant(rename).0).collect();
         for (channel, (name, unit)) in self.channels.iter_mut().zip(channels) {
             (channel.name, channel.unit) = (name, unit);
         }
         for warning in &mut self.warnings {
-            let renamed = renames.iter().find(|r| warning.channel.as_ref() == Some(&r.channel));
-            warning.channel = renamed.map(|r| r.name.clone()).or(warning.channel.take());
+            let renamed = renames.iter().zip(&old).find(|(_, old)| warning.channel.as_ref() == Some(old));
+            warning.channel = renamed.map(|(r, _)| r.name.clone()).or(warning.channel.take());
         }
         Ok(())
     }
@@ -181,12 +213,39 @@ mod tests {
     }
 
     #[test]
+    fn a_bracket_may_belong_to_the_name() {
+        let mut recording = recording();
+        recording.channels[0].name = "/j.position[elbow]".to_owned();
+        recording.channels[2].name = "/j.effort".to_owned();
+        let renames =
+            ["theta=/j.position[elbow] [deg]", "tau=/j.effort[N]", "x=b"].map(|t| t.parse().unwrap());
+        let renamed = |renames: &[Rename]| {
+            let mut recording = recording.clone();
+            recording
+                .rename(renames)
+                .map(|()| recording.channels.iter().map(Channel::header).collect::<Vec<_>>())
+        };
+        assert_eq!(renamed(&renames).unwrap(), ["theta [deg]", "x [m]", "tau [N]"]);
+        let whole: Rename = "theta=/j.position[elbow]".parse().unwrap();
+        assert_eq!(whole.to_string(), "theta=/j.position[elbow]");
+        assert_eq!(renamed(&[whole]).unwrap()[0], "theta");
+        let wrong = "theta=/j.position[elbw]".parse().unwrap();
+        let error = renamed(&[wrong]).unwrap_err().to_string();
+        assert!(
+            error.contains("no channel `/j.position[elbw]`; the file has `/j.position[elbow]`"),
+            "{error}"
+        );
+    }
+
+    #[test]
     fn what_cannot_be_renamed_is_told() {
         for (texts, part) in [
             (&["theta"] as &[&str], "`theta` is not `NAME=CHANNEL`"),
             (&["=a"], "is not `NAME=CHANNEL`"),
             (&["theta="], "is not `NAME=CHANNEL`"),
             (&["theta=a [deg"], "is not `NAME=CHANNEL`"),
+            (&["theta=a] []"], "is not `NAME=CHANNEL`"),
+            (&["theta=[deg]"], "is not `NAME=CHANNEL`"),
             (&["theta=d"], "no channel `d`; the file has `a`, `b`, `c`"),
             (&["b=a"], "a channel `b` already"),
             (&["x=a", "x=c"], "`x` stands in two renames"),

@@ -5,6 +5,7 @@ mod bad_files;
 mod blocks;
 mod health;
 mod mat;
+mod mcap;
 mod parquet;
 mod real_recordings;
 mod signals;

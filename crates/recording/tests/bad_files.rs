@@ -2,7 +2,7 @@
 
 // Helpers of a test file are tests too; the lint configuration knows only the annotated functions.
 
-use greybox_recording::{RecordingError, parse_csv, read_csv, write_csv, write_csv_file};
+use greybox_recording::{Channel, RecordingError, parse_csv, read_csv, write_csv, write_csv_file};
 
 /// Ten good rows after `head`, with the given rows (0 = first under the header) replaced.
 fn file(head: &str, replaced: &[(usize, &str)]) -> String {
@@ -134,6 +134,15 @@ fn what_is_written_reads_back() {
     }
     assert_eq!(back.channels[1].name, "a, b");
     assert_eq!(std::fs::read_dir(folder.path()).unwrap().count(), 1, "no temporary file stays behind");
+    // A bracket may end a name, with a unit and without.
+    for unit in [Some("rad"), None] {
+        let name = "/joint_states.position[elbow]".to_owned();
+        let joint = Channel { name, unit: unit.map(str::to_owned), values: y.clone() };
+        let path = folder.path().join("joint.csv");
+        write_csv_file(&path, &time, &[(&joint.header(), &y)]).unwrap();
+        let back = read_csv(&path).unwrap();
+        assert_eq!((&back.channels[0].name, &back.channels[0].unit), (&joint.name, &joint.unit));
+    }
 }
 
 #[test]

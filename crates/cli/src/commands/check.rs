@@ -6,9 +6,9 @@ use clap::Args;
 use greybox_commands::check;
 
 use crate::answer::Answer;
+use crate::channels::Channels;
 use crate::failure::Failure;
 use crate::loading;
-use crate::study::Channels;
 
 /// Check the health of recordings: sampling, gaps, clipping, quantisation, outliers, excitation, delay, clocks
 #[derive(Debug, Args)]
@@ -16,12 +16,13 @@ use crate::study::Channels;
   greybox check run1.csv run2.csv
   greybox check recordings --model link.toml --map \"theta=sensor_3 [deg]\"
   greybox check run1.csv --inputs v
+  greybox check log.mcap --channels \"/joint_states.position[elbow]\" --channels /cmd.data
   greybox check run1.csv --model link.toml --json
 
-A folder stands for all its recordings (*.csv, *.mat, *.parquet).")]
+A folder stands for all its recordings (*.csv, *.mat, *.mcap, *.parquet).")]
 pub(crate) struct Arguments {
     /// Recordings, or folders of them (CSV: first column `t` in seconds, header cells `name` or `name [unit]`;
-    /// MAT-file; Parquet)
+    /// MAT-file; MCAP; Parquet)
     #[arg(value_name = "RECORDING.csv", required = true)]
     recordings: Vec<PathBuf>,
 
@@ -40,8 +41,13 @@ pub(crate) struct Arguments {
 pub(crate) fn run(arguments: &Arguments) -> Result<Answer, Failure> {
     let loaded = arguments.model.as_deref().map(loading::model).transpose()?;
     let paths = loading::without_folders(&arguments.recordings)?;
-    let recordings = loading::recordings(&paths, &arguments.channels.map)?;
     let model = loaded.as_ref().map(|l| &l.model);
+    let wanted = arguments.channels.wanted();
+    let wanted = match model {
+        Some(model) => wanted.of_model(model),
+        None => wanted,
+    };
+    let recordings = loading::recordings(&paths, &wanted)?;
     let checked = check::check(&recordings, model, &arguments.inputs)?;
     Ok(Answer::new(check::story(&checked), check::to_json(model, &checked)))
 }

@@ -200,9 +200,11 @@ fn terms(arguments: &Arguments, model: &PathBuf) -> Result<Answer, Failure> {
 
 fn work(arguments: &Arguments) -> Result<Answer, Failure> {
     let options = options(arguments)?;
+    let names = arguments.states.iter().chain(&arguments.inputs).map(|name| vec![name.trim().to_owned()]);
+    let wanted = arguments.study.channels.wanted().of_names(names);
     let (found, recordings, out, progress) = match arguments.block {
         None => {
-            let recordings = arguments.study.recordings()?;
+            let recordings = arguments.study.recordings(&wanted)?;
             let out = arguments.study.folder(&FILES, [])?;
             let progress = Progress::open();
             let Recordings { train, holdout } = &recordings;
@@ -210,10 +212,10 @@ fn work(arguments: &Arguments) -> Result<Answer, Failure> {
             (found, recordings, out, progress)
         }
         Some(rows) => {
-            let (paths, map) = (&arguments.study.train, &arguments.study.channels.map);
+            let paths = &arguments.study.train;
             loading::no_twins(paths.iter().chain(&arguments.study.holdout))?;
-            let holdout = loading::recordings(&arguments.study.holdout, map)?;
-            let open = || loading::blocks(paths, rows as usize, map);
+            let holdout = loading::recordings(&arguments.study.holdout, &wanted)?;
+            let open = || loading::blocks(paths, rows as usize, &wanted);
             // A file that is missing or empty is told before anything is written.
             drop(open()?);
             let out = arguments.study.folder(&FILES, [])?;

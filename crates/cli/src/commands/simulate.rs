@@ -9,11 +9,11 @@ use greybox_recording::write_csv;
 use serde_json::json;
 
 use crate::answer::Answer;
+use crate::channels::Channels;
 use crate::failure::Failure;
 use crate::loading;
 use crate::output::OutputFile;
 use crate::progress::Progress;
-use crate::study::Channels;
 
 /// Simulate a model on the inputs of a recording, from the initial state estimated on its first quarter
 #[derive(Debug, Args)]
@@ -31,7 +31,7 @@ pub(crate) struct Arguments {
     #[arg(value_name = "MODEL.toml")]
     model: PathBuf,
 
-    /// Recording whose inputs drive the model (CSV, MAT-file or Parquet)
+    /// Recording whose inputs drive the model (CSV, MAT-file, MCAP or Parquet)
     #[arg(value_name = "INPUT.csv")]
     input: PathBuf,
 
@@ -45,7 +45,8 @@ pub(crate) struct Arguments {
 
 pub(crate) fn run(arguments: &Arguments) -> Result<Answer, Failure> {
     let loaded = loading::model(&arguments.model)?;
-    let recordings = loading::recordings(std::slice::from_ref(&arguments.input), &arguments.channels.map)?;
+    let wanted = arguments.channels.wanted().of_model(&loaded.model);
+    let recordings = loading::recordings(std::slice::from_ref(&arguments.input), &wanted)?;
     let [recording] = recordings.as_slice() else {
         return Err(Failure::internal("one recording was named, but not read"));
     };

@@ -10,9 +10,9 @@ use greybox_commands::watch::{Output, Session};
 use greybox_watch::{Options, Saved};
 
 use crate::answer::{Answer, OutputFormat};
+use crate::channels::Names;
 use crate::failure::Failure;
 use crate::loading;
-use crate::study::Channels;
 
 /// How often the state is saved.
 const SAVED_EVERY: Duration = Duration::from_secs(1);
@@ -49,7 +49,7 @@ pub(crate) struct Arguments {
     state: Option<PathBuf>,
 
     #[command(flatten)]
-    channels: Channels,
+    names: Names,
 }
 
 pub(crate) fn run(arguments: &Arguments, format: OutputFormat) -> Result<Answer, Failure> {
@@ -61,7 +61,7 @@ pub(crate) fn run(arguments: &Arguments, format: OutputFormat) -> Result<Answer,
     };
     let state = arguments.state.as_deref();
     let saved = state.map(read).transpose()?.flatten();
-    let mut session = Session::new(model, &arguments.channels.map, options, saved)?;
+    let mut session = Session::new(model, &arguments.names.map, options, saved)?;
     let mut input = io::stdin().lock();
     let mut line = Vec::new();
     let mut saved_at = now();

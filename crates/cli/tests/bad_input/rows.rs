@@ -519,6 +519,20 @@ fn formats() -> Vec<Row> {
             ),
         ]);
     }
+    rows.push(match cfg!(feature = "mcap") {
+        true => Row::new(
+            S,
+            "an MCAP log that was cut off",
+            |b| binary(b, "run.mcap", b"\x89MCAP0\r\n\x01"),
+            "greybox check run.mcap",
+        ),
+        false => Row::new(
+            S,
+            "an MCAP log, which this build does not read",
+            |b| binary(b, "run.mcap", b"\x89MCAP0\r\n\x01"),
+            "greybox check run.mcap",
+        ),
+    });
     rows.push(match cfg!(feature = "parquet") {
         true => Row::new(
             S,
@@ -598,6 +612,12 @@ fn fits() -> Vec<Row> {
             "`--map` names a channel that is not there",
             |b| b.write("raw.csv", &line(1, "t,force,sensor_3")),
             "greybox check raw.csv --map x=sensor3",
+        ),
+        Row::new(
+            S,
+            "`--channels` names a channel that is not there",
+            |b| b.write("raw.csv", &line(1, "t,force,sensor_3")),
+            "greybox check raw.csv --channels sensor3",
         ),
         Row::new(
             S,

@@ -28,6 +28,9 @@ pub(crate) struct Inputs {
     /// New names of channels.
     #[serde(default, skip_serializing_if = "Vec::is_empty")]
     pub(crate) map: Vec<String>,
+    /// Channels that alone were read.
+    #[serde(default, skip_serializing_if = "Vec::is_empty")]
+    pub(crate) channels: Vec<String>,
     /// Mechanisms beside the built-in ones.
     pub(crate) mechanisms: Vec<Fingerprint>,
 }
@@ -108,6 +111,7 @@ mod tests {
             recording: Fingerprint::of("r.csv", recording),
             holdout: vec![],
             map: vec![],
+            channels: vec![],
             mechanisms: vec![],
         }
     }

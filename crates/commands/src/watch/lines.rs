@@ -54,7 +54,9 @@ impl Lines {
         for (place, wanted) in wanted(model).into_iter().enumerate() {
             let channel = wanted.channel.to_owned();
             let rename = map.iter().find(|r| r.name == channel);
-            let name = rename.map_or(wanted.channel, |r| r.channel.as_str());
+            let has =
+                |name: &str| csv.as_ref().is_some_and(|csv| csv.columns().iter().any(|(n, _)| n == name));
+            let (name, given) = rename.map_or((wanted.channel, None), |r| r.meant(has));
             let (index, header) = match &csv {
                 None => (place, None),
                 Some(csv) => {
@@ -63,7 +65,7 @@ impl Lines {
                     (index, csv.columns()[index].1.as_deref())
                 }
             };
-            let stated = header.or(rename.and_then(|r| r.unit.as_deref()));
+            let stated = header.or(given);
             let unit = unit(model, &wanted, stated, line)?;
             keys.push(name.to_owned());
             columns.push(Column { channel, index, unit });

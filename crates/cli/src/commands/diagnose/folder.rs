@@ -7,7 +7,7 @@ use std::sync::atomic::{AtomicUsize, Ordering};
 use std::thread;
 
 use greybox_commands::diagnose::FILES;
-use greybox_commands::fleet::{self, DONE, File, Fleet, Member, SUMMARY, Table};
+use greybox_commands::fleet::{self, Channels, DONE, File, Fleet, Member, SUMMARY, Table};
 use greybox_diagnose::Quiet;
 use greybox_report::summary::Statistics;
 use serde_json::json;
@@ -37,13 +37,14 @@ struct Diagnosed {
 pub(super) fn run(arguments: &Arguments, folder: &Path, own: Option<&Mechanisms>) -> Result<Answer, Failure> {
     let (model, place) = (&arguments.inputs.model, &arguments.inputs.study.out);
     let holdout = &arguments.inputs.study.holdout;
-    let map = &arguments.inputs.study.channels.map;
+    let read = &arguments.inputs.study.channels;
     let loaded = loading::model(model)?;
     loading::no_twins(holdout)?;
     let held = holdout.iter().map(|path| file(path)).collect::<Result<_, _>>()?;
     let texts = own.map_or(&[][..], |own| &own.texts);
     // A fault in what judges all recordings is told once.
-    let fleet = Fleet::new(loaded, held, map.clone(), arguments.options(own), texts)?;
+    let channels = Channels { map: read.names.map.clone(), only: read.only.clone() };
+    let fleet = Fleet::new(loaded, held, channels, arguments.options(own), texts)?;
     let recordings = recordings(folder, holdout, arguments.runs.as_deref())?;
     let inputs = || {
         [model].into_iter().chain(holdout).chain(&arguments.runs).chain(own.iter().flat_map(|own| &own.files))
