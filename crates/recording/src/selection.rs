@@ -39,14 +39,14 @@ impl Selection {
     }
 
     /// Every name in it.
-    #[cfg(feature = "mcap")]
+    #[cfg(any(test, feature = "mcap"))]
     pub(crate) fn names(&self) -> impl Iterator<Item = &str> {
         self.channels.iter().chain(self.named.iter().flatten()).map(String::as_str)
     }
 
     /// The channels to be read among the `available` ones of a file with several clocks; `None` = all of them, since nothing
     /// is selected, or something that is not there.
-    #[cfg(feature = "mcap")]
+    #[cfg(any(test, feature = "mcap"))]
     pub(crate) fn among<'a>(&'a self, available: &[&str]) -> Option<Vec<&'a str>> {
         let has = |name: &&str| available.contains(name);
         let channels = self.channels.iter().map(String::as_str);
