@@ -227,10 +227,15 @@ fn findings(recording: &Recording, model: Option<&Model>, subject: &Subject<'_>)
 
 /// Formats of recordings that this build reads.
 fn formats() -> Vec<&'static str> {
-    [("csv", true), ("mat", cfg!(feature = "mat")), ("parquet", cfg!(feature = "parquet"))]
-        .into_iter()
-        .filter_map(|(name, built)| built.then_some(name))
-        .collect()
+    [
+        ("csv", true),
+        ("mat", cfg!(feature = "mat")),
+        ("hdf5", cfg!(feature = "hdf5")),
+        ("parquet", cfg!(feature = "parquet")),
+    ]
+    .into_iter()
+    .filter_map(|(name, built)| built.then_some(name))
+    .collect()
 }
 
 /// What a panic says.

@@ -144,7 +144,7 @@ impl Kind {
             false => "log the signals, of the machine or of the simulation, into such a file",
         };
         Failure::file(path, message).help(format!(
-            "greybox reads recordings from CSV (a header row such as `t,u [V],y [m]`), MAT-files and Parquet: {how}"
+            "greybox reads recordings from CSV (a header row such as `t,u [V],y [m]`), MAT-files, HDF5 and Parquet: {how}"
         ))
     }
 }

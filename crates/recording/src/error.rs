@@ -266,7 +266,7 @@ pub enum RecordingError {
     /// This build of greybox leaves the format out.
     #[error(
         "{place}: this build of greybox does not read {format}: build it with the feature `{feature}` (`cargo install \
-         --features {feature} …`), or export the recording as CSV"
+         --features {feature} …`), or {instead}"
     )]
     NotBuiltIn {
         /// The file.
@@ -275,6 +275,8 @@ pub enum RecordingError {
         format: &'static str,
         /// Name of the feature.
         feature: &'static str,
+        /// What to do without it.
+        instead: &'static str,
     },
     /// The file is of another format than its name says, or of a version that is not read.
     #[error("{place}: {found}, which greybox does not read; {help}")]

@@ -14,7 +14,7 @@
 //! | module | what it answers |
 //! |---|---|
 //! | [`csv`](mod@csv) | what stands in the file, or exactly which cell is wrong and how to fix it |
-//! | `mat`, `parquet` | the same for MAT-files and Parquet files, each behind a feature of its name |
+//! | `mat`, `hdf5`, `parquet` | the same for MAT-files, HDF5 and Parquet files, each behind a feature of its name |
 //! | [`noise`] | how large the measurement noise is, and whether a channel is quantised |
 //! | [`smooth`] | value, first and second derivative of a noisy channel (Savitzky–Golay) |
 //! | [`interpolate`] | what an input did between its samples (band-limited, linear) |
@@ -51,9 +51,13 @@ mod error;
 mod file;
 mod finding;
 mod grid;
+#[cfg(feature = "hdf5")]
+pub mod hdf5;
 mod header;
 pub mod health;
 pub mod interpolate;
+#[cfg(feature = "mat")]
+mod layout;
 #[cfg(feature = "mat")]
 pub mod mat;
 mod median;
@@ -66,12 +70,16 @@ mod recording;
 mod rename;
 pub mod smooth;
 mod spectrum;
+#[cfg(feature = "mat")]
+mod variables;
 
 pub use crate::correlation::Correlation;
 pub use crate::csv::{CsvBlocks, CsvLines, parse_csv, read_csv, write_csv, write_csv_file};
 pub use crate::error::{Place, RecordingError};
 pub use crate::file::is_device;
 pub use crate::finding::{Finding, Severity, listed};
+#[cfg(feature = "hdf5")]
+pub use crate::hdf5::parse_hdf5;
 #[cfg(feature = "mat")]
 pub use crate::mat::parse_mat;
 #[cfg(feature = "parquet")]

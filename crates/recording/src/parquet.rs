@@ -6,7 +6,7 @@
 //! told in the warnings of the recording. Compression: Snappy, Zstandard, LZ4, gzip.
 
 use crate::error::{Place, RecordingError};
-use crate::file::ROOM;
+use crate::file::{ROOM, guarded};
 use crate::finding::{Finding, Severity, listed};
 use crate::header::{TIMES, header_cell, seconds};
 use crate::recording::{Channel, Recording};
@@ -17,7 +17,6 @@ use ::parquet::errors::ParquetError;
 use ::parquet::file::reader::{FileReader, SerializedFileReader};
 use ::parquet::schema::types::ColumnDescriptor;
 use bytes::Bytes;
-use std::panic::{self, AssertUnwindSafe};
 
 /// Reads a recording called `name` from the bytes of a Parquet file.
 ///
@@ -42,15 +41,8 @@ enum Meaning {
     Timestamp(f64),
 }
 
-/// The library panics on some damaged pages; nothing outlives the call, so that it is an error like the others.
 pub(crate) fn parse(bytes: Vec<u8>, label: &str, name: &str) -> Result<Recording, RecordingError> {
-    panic::catch_unwind(AssertUnwindSafe(|| read(bytes, label, name))).unwrap_or_else(|_| {
-        Err(RecordingError::Damaged {
-            place: Place::file(label),
-            variable: None,
-            found: "its pages contradict each other".to_owned(),
-        })
-    })
+    guarded(label, || read(bytes, label, name))
 }
 
 fn read(bytes: Vec<u8>, label: &str, name: &str) -> Result<Recording, RecordingError> {
