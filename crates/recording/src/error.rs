@@ -336,6 +336,19 @@ pub enum RecordingError {
         /// The variables that are times.
         times: Vec<String>,
     },
+    /// The times restart with every episode of a data set.
+    #[error(
+        "{place}: the file holds {episodes} episodes (column `{column}`), each with times of its own; one file holds one \
+         recording: split it into a file for each value of `{column}`"
+    )]
+    SeveralEpisodes {
+        /// The file.
+        place: Place,
+        /// The column that numbers the episodes.
+        column: String,
+        /// How many there are.
+        episodes: usize,
+    },
     /// There is a time, and no variable or column has a value for each.
     #[error(
         "{place}: no other variable has the {rows} values of the time `{time}` ({found}); save signals and time with one \
@@ -394,6 +407,7 @@ impl RecordingError {
             | Self::TooLarge { place, .. }
             | Self::NoTime { place, .. }
             | Self::SeveralTimes { place, .. }
+            | Self::SeveralEpisodes { place, .. }
             | Self::NoSignals { place, .. }
             | Self::ColumnLength { place, .. } => place,
         }

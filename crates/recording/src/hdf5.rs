@@ -1,7 +1,7 @@
 //! Reading HDF5, and MAT-files of `save -v7.3`, which are HDF5 (feature `hdf5`).
 //!
 //! The rules are those of [MAT-files](mod@crate::mat): a group is a structure, a data set an array, and the time is the vector
-//! `t`, `time` or `tout`, in s. What is HDF5's own:
+//! `t`, `time`, `tout` or `timestamp`, in s. What is HDF5's own:
 //!
 //! | in the file | channels |
 //! |---|---|

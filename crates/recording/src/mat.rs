@@ -3,7 +3,7 @@
 //! Read are files of level 5: those of `save` with `-v6` and `-v7` (compressed), also those that SciPy and Octave
 //! write. Those of `-v7.3` (HDF5) are read with the feature `hdf5`; without, they are an error that names the fix.
 //!
-//! The time is the vector `t`, `time` or `tout`, in s; every real array with a value for each time is a signal:
+//! The time is the vector `t`, `time`, `tout` or `timestamp`, in s; every real array with a value for each time is a signal:
 //!
 //! | in the file | channels |
 //! |---|---|

@@ -2,14 +2,15 @@
 
 use crate::error::Place;
 use crate::finding::listed;
-use crate::header::header_cell;
+use crate::header::{header_cell, list_element};
 use crate::recording::Recording;
 use std::fmt;
 use std::str::FromStr;
 
 /// A channel of a file and what it is to be called.
 ///
-/// Its text is `NAME=CHANNEL`, or `NAME=CHANNEL [unit]` where the file states no unit.
+/// Its text is `NAME=CHANNEL`, or `NAME=CHANNEL [unit]` where the file states no unit. A number in brackets right behind the
+/// channel, as in `state[0]`, is part of its name: an element of lists.
 ///
 /// ```
 /// let rename: greybox_recording::Rename = "theta=sensor_3 [deg]".parse()?;
@@ -85,7 +86,10 @@ impl FromStr for Rename {
     fn from_str(text: &str) -> Result<Self, RenameError> {
         let wrong = || RenameError::Syntax { found: text.to_owned() };
         let (name, channel) = text.split_once('=').ok_or_else(wrong)?;
-        let (channel, unit) = header_cell(channel.trim(), || Place::file("")).map_err(|_| wrong())?;
+        let (channel, unit) = match list_element(channel.trim()) {
+            Some(element) => element,
+            None => header_cell(channel.trim(), || Place::file("")).map_err(|_| wrong())?,
+        };
         let name = name.trim();
         if name.is_empty() || name.contains(['[', ']']) {
             return Err(wrong());
@@ -178,6 +182,23 @@ mod tests {
         assert_eq!(renamed(&["theta=a [deg]", "x = b"]).unwrap(), ["theta [deg]", "x [m]", "c"]);
         assert_eq!(renamed(&["a=b", "b=a"]).unwrap(), ["b", "a [m]", "c"], "they change places");
         assert_eq!(renamed(&["b=b [m]"]).unwrap(), ["a", "b [m]", "c"]);
+    }
+
+    #[test]
+    fn elements_of_lists_have_names() {
+        for (text, channel, unit) in [
+            ("q=state[0]", "state[0]", None),
+            ("q=state[12] [deg]", "state[12]", Some("deg")),
+            ("q=state [1]", "state", Some("1")),
+            ("q=state[m]", "state", Some("m")),
+        ] {
+            let rename: Rename = text.parse().unwrap();
+            assert_eq!((rename.channel.as_str(), rename.unit.as_deref()), (channel, unit), "{text}");
+            assert_eq!(rename.to_string().parse::<Rename>().unwrap(), rename);
+        }
+        for wrong in ["q=[0]", "q=state[0][1]", "q=state[0] [deg", "q=state[]]"] {
+            assert!(wrong.parse::<Rename>().is_err(), "{wrong}");
+        }
     }
 
     #[test]
