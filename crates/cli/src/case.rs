@@ -231,6 +231,7 @@ fn formats() -> Vec<&'static str> {
         ("csv", true),
         ("mat", cfg!(feature = "mat")),
         ("hdf5", cfg!(feature = "hdf5")),
+        ("npz", cfg!(feature = "npz")),
         ("parquet", cfg!(feature = "parquet")),
     ]
     .into_iter()

@@ -46,7 +46,7 @@ fn rename(text: &str) -> Result<Rename, String> {
 /// The recordings of a command that learns from some and is judged on others, and where its results go.
 #[derive(Debug, Args)]
 pub(crate) struct Study {
-    /// Recordings to choose and fit with (CSV, MAT-file, HDF5 or Parquet)
+    /// Recordings to choose and fit with (CSV, MAT-file, HDF5, NumPy or Parquet)
     #[arg(value_name = "TRAIN.csv", required = true)]
     pub(crate) train: Vec<PathBuf>,
 

@@ -14,7 +14,7 @@
 //! | module | what it answers |
 //! |---|---|
 //! | [`csv`](mod@csv) | what stands in the file, or exactly which cell is wrong and how to fix it |
-//! | `mat`, `hdf5`, `parquet` | the same for MAT-files, HDF5 and Parquet files, each behind a feature of its name |
+//! | `mat`, `hdf5`, `npz`, `parquet` | the same for MAT-files, HDF5, arrays of NumPy and Parquet files, each behind a feature of its name |
 //! | [`noise`] | how large the measurement noise is, and whether a channel is quantised |
 //! | [`smooth`] | value, first and second derivative of a noisy channel (Savitzky–Golay) |
 //! | [`interpolate`] | what an input did between its samples (band-limited, linear) |
@@ -62,6 +62,10 @@ mod layout;
 pub mod mat;
 mod median;
 pub mod noise;
+#[cfg(feature = "npz")]
+pub mod npz;
+#[cfg(any(feature = "hdf5", feature = "npz"))]
+mod number;
 mod outliers;
 #[cfg(feature = "parquet")]
 pub mod parquet;
@@ -82,6 +86,8 @@ pub use crate::finding::{Finding, Severity, listed};
 pub use crate::hdf5::parse_hdf5;
 #[cfg(feature = "mat")]
 pub use crate::mat::parse_mat;
+#[cfg(feature = "npz")]
+pub use crate::npz::parse_npz;
 #[cfg(feature = "parquet")]
 pub use crate::parquet::parse_parquet;
 pub use crate::read::{EXTENSIONS, read};

@@ -1,7 +1,7 @@
 //! Files to recordings: the format by the ending of the name.
 
 use crate::csv;
-#[cfg(not(all(feature = "mat", feature = "hdf5", feature = "parquet")))]
+#[cfg(not(all(feature = "mat", feature = "hdf5", feature = "npz", feature = "parquet")))]
 use crate::error::Place;
 use crate::error::RecordingError;
 use crate::file::bytes;
@@ -9,15 +9,15 @@ use crate::recording::Recording;
 use std::path::Path;
 
 /// Endings of the files that may hold a recording. Whether this build reads all of them, its features say
-/// (`mat`, `hdf5`, `parquet`); [`read`] tells which is missing.
-pub const EXTENSIONS: [&str; 5] = ["csv", "mat", "h5", "hdf5", "parquet"];
+/// (`mat`, `hdf5`, `npz`, `parquet`); [`read`] tells which is missing.
+pub const EXTENSIONS: [&str; 7] = ["csv", "mat", "h5", "hdf5", "npz", "npy", "parquet"];
 
 /// Reads the recording in the file at `path`: a MAT-file where the name ends in `.mat`, HDF5 where it ends in `.h5` or
-/// `.hdf5`, a Parquet file where it ends in `.parquet`, CSV else.
+/// `.hdf5`, arrays of NumPy where it ends in `.npz` or `.npy`, a Parquet file where it ends in `.parquet`, CSV else.
 ///
 /// # Errors
 /// Any [`RecordingError`]; its place names the file as given. [`RecordingError::NotBuiltIn`] where this build lacks the
-/// feature `mat`, `hdf5` or `parquet`.
+/// feature `mat`, `hdf5`, `npz` or `parquet`.
 ///
 /// ```
 /// let path = std::env::temp_dir().join(format!("read_{}.csv", std::process::id()));
@@ -36,19 +36,23 @@ pub fn read(path: impl AsRef<Path>) -> Result<Recording, RecordingError> {
         "mat" => crate::mat::parse(bytes.into(), &label, &name),
         #[cfg(feature = "hdf5")]
         "h5" | "hdf5" => crate::hdf5::parse(bytes, &label, &name),
+        #[cfg(feature = "npz")]
+        "npz" | "npy" => crate::npz::parse(&bytes, &label, &name),
         #[cfg(feature = "parquet")]
         "parquet" => crate::parquet::parse(bytes, &label, &name),
         #[cfg(not(feature = "mat"))]
         "mat" => Err(not_built_in(&label, "MAT-files", "mat")),
         #[cfg(not(feature = "hdf5"))]
         "h5" | "hdf5" => Err(not_built_in(&label, "HDF5", "hdf5")),
+        #[cfg(not(feature = "npz"))]
+        "npz" | "npy" => Err(not_built_in(&label, "arrays of NumPy", "npz")),
         #[cfg(not(feature = "parquet"))]
         "parquet" => Err(not_built_in(&label, "Parquet files", "parquet")),
         _ => csv::parse(&bytes, &label, &name, 0),
     }
 }
 
-#[cfg(not(all(feature = "mat", feature = "hdf5", feature = "parquet")))]
+#[cfg(not(all(feature = "mat", feature = "hdf5", feature = "npz", feature = "parquet")))]
 fn not_built_in(label: &str, format: &'static str, feature: &'static str) -> RecordingError {
     let instead = "export the recording as CSV";
     RecordingError::NotBuiltIn { place: Place::file(label), format, feature, instead }

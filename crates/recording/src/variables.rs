@@ -32,7 +32,7 @@ pub(crate) struct Array {
     pub(crate) single: bool,
 }
 
-#[cfg(feature = "hdf5")]
+#[cfg(any(feature = "hdf5", feature = "npz"))]
 impl Array {
     /// The array of numbers that stand row by row. Of more than two dimensions the first counts the samples there, and
     /// the last here.

@@ -6,6 +6,7 @@ mod blocks;
 mod hdf5;
 mod health;
 mod mat;
+mod npz;
 mod parquet;
 mod real_recordings;
 mod signals;

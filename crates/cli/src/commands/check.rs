@@ -18,10 +18,10 @@ use crate::study::Channels;
   greybox check run1.csv --inputs v
   greybox check run1.csv --model link.toml --json
 
-A folder stands for all its recordings (*.csv, *.mat, *.h5, *.hdf5, *.parquet).")]
+A folder stands for all its recordings (*.csv, *.mat, *.h5, *.hdf5, *.npz, *.npy, *.parquet).")]
 pub(crate) struct Arguments {
     /// Recordings, or folders of them (CSV: first column `t` in seconds, header cells `name` or `name [unit]`;
-    /// MAT-file; HDF5; Parquet)
+    /// MAT-file; HDF5; NumPy; Parquet)
     #[arg(value_name = "RECORDING.csv", required = true)]
     recordings: Vec<PathBuf>,
 

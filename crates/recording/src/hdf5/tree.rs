@@ -3,7 +3,7 @@
 //! Nothing is reserved on the word of the file: what a data set needs counts against the room before it is read, and
 //! references are followed to no more objects than the file can hold.
 
-use super::value::{Number, described};
+use super::value::{described, number};
 use crate::header::{TIMES, seconds};
 use crate::variables::{Array, Value, Variable, rows_of};
 use ::hdf5_pure::{
@@ -179,7 +179,7 @@ impl Reader {
                     Some(_) => Value::Cells(elements),
                 }
             }
-            (Some("char"), _) => match Number::of(&datatype).filter(|number| number.is_text_unit()) {
+            (Some("char"), _) => match number(&datatype).filter(|number| number.is_text_unit()) {
                 Some(number) => {
                     let text = number.text(&dataset.read_raw()?);
                     Value::Text(rows_of(&text, shape.last().copied().unwrap_or(1), shape.iter().product()))
@@ -198,7 +198,7 @@ impl Reader {
                 let bytes = dataset.read_raw()?;
                 let mut fields = Vec::new();
                 for member in members {
-                    let value = match Number::of(&member.datatype) {
+                    let value = match number(&member.datatype) {
                         Some(number) => {
                             let offset = usize::try_from(member.byte_offset).unwrap_or(usize::MAX);
                             let values = number.read(&bytes, offset, *size as usize);
@@ -212,7 +212,7 @@ impl Reader {
                 }
                 structure(fields)
             }
-            _ => match Number::of(&datatype) {
+            _ => match number(&datatype) {
                 Some(number) => {
                     let bytes = dataset.read_raw()?;
                     let stride = datatype.type_size() as usize;
