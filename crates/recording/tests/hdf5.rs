@@ -89,6 +89,14 @@ fn groups_and_storage_of_both_kinds_are_read() {
 }
 
 #[test]
+fn columns_are_signals_though_there_are_as_many_rows() {
+    let square = recording("square.h5");
+    assert_eq!(square.channels.len(), 8);
+    let second: Vec<f64> = (0..8).map(|row| 8.0 * f64::from(row) + 1.0).collect();
+    assert_eq!(square.channel("y_2").unwrap().values, second);
+}
+
+#[test]
 fn what_is_left_out_is_told() {
     let told = |name: &str| {
         let recording = recording(name);

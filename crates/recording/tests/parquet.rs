@@ -135,6 +135,14 @@ fn lists_of_one_length_become_a_channel_per_element() {
     }
 }
 
+/// At 5000 s a time as `f32` has steps of 0.5 ms: that is no jitter of the sampling.
+#[test]
+fn the_digits_of_a_time_end_where_its_type_says() {
+    let late = made("late.parquet").unwrap();
+    assert!((late.dt() - 0.02).abs() < 1e-5, "{}", late.dt());
+    assert!(late.warnings.is_empty(), "{:?}", late.warnings);
+}
+
 #[test]
 fn several_episodes_are_refused_where_the_time_restarts() {
     let error = made("episodes.parquet").unwrap_err();

@@ -217,6 +217,9 @@ with h5py.File(path("unread.h5"), "w") as file:
     layout[:] = h5py.VirtualSource("other.h5", "v", shape=(60,))
     file.create_virtual_dataset("far", layout)
 
+with h5py.File(path("square.h5"), "w") as file:
+    file["t"], file["y"] = t[:8], np.arange(64.0).reshape(8, 8)
+
 with h5py.File(path("two_clocks.h5"), "w") as file:
     for name, step in [("fast", 1), ("slow", 2)]:
         group = file.create_group(name)

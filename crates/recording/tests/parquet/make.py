@@ -41,6 +41,9 @@ pq.write_table(lists, path("lists.parquet"), row_group_size=25)
 pq.write_table(table(pa.list_), path("fixed.parquet"), data_page_version="2.0", compression="zstd")
 lists.to_pandas().to_parquet(path("old_lists.parquet"), use_compliant_nested_type=False)
 
+late = pd.DataFrame({"v": np.sin(t), "timestamp": (5000 + t).astype(np.float32)})
+late.to_parquet(path("late.parquet"), index=False)
+
 several = pd.DataFrame({
     "observation.state": [np.array([a, 2 * a], np.float32) for a in np.tile(t[:20], 3)],
     "timestamp": np.tile(t[:20], 3).astype(np.float32),
