@@ -237,6 +237,8 @@ fn formats() -> Vec<&'static str> {
     [
         ("csv", true),
         ("mat", cfg!(feature = "mat")),
+        ("hdf5", cfg!(feature = "hdf5")),
+        ("npz", cfg!(feature = "npz")),
         ("mcap", cfg!(feature = "mcap")),
         ("parquet", cfg!(feature = "parquet")),
     ]

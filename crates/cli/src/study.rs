@@ -23,7 +23,7 @@ pub(crate) fn whole(text: &str) -> Result<u64, String> {
 /// The recordings of a command that learns from some and is judged on others, and where its results go.
 #[derive(Debug, Args)]
 pub(crate) struct Study {
-    /// Recordings to choose and fit with (CSV, MAT-file, MCAP or Parquet)
+    /// Recordings to choose and fit with (CSV, MAT-file, HDF5, NumPy, MCAP or Parquet)
     #[arg(value_name = "TRAIN.csv", required = true)]
     pub(crate) train: Vec<PathBuf>,
 

@@ -274,7 +274,7 @@ fn check_takes_folders_and_finds_clocks_that_disagree() {
     fs::create_dir(bench.path("empty")).unwrap();
     bench.refuses(
         &["check", "empty"],
-        &["empty: this folder holds no recording (`*.csv`, `*.mat`, `*.mcap`, `*.parquet`)"],
+        &["empty: this folder holds no recording (`*.csv`, `*.mat`, `*.h5`, `*.hdf5`, `*.npz`, `*.npy`, `*.mcap`, `*.parquet`)"],
     );
     bench
         .refuses(&["check", "runs", "runs/one_clock.csv"], &["one_clock.csv: this recording is named twice"]);

@@ -94,7 +94,8 @@ const KINDS: [&Kind; 13] =
 /// The kind of the file at `path`: by the ending of its name, else by how it begins. `None` for any other file, and where
 /// there is none.
 pub(crate) fn of(path: &Path) -> Option<&'static Kind> {
-    if !path.is_file() {
+    // Archives of NumPy arrays are recordings, though they begin as other archives do.
+    if !path.is_file() || path.extension().is_some_and(|e| e.eq_ignore_ascii_case("npz")) {
         return None;
     }
     let mut head = Vec::new();
@@ -144,7 +145,7 @@ impl Kind {
             false => "log the signals, of the machine or of the simulation, into such a file",
         };
         Failure::file(path, message).help(format!(
-            "greybox reads recordings from CSV (a header row such as `t,u [V],y [m]`), MAT-files, MCAP logs and Parquet: {how}"
+            "greybox reads recordings from CSV (a header row such as `t,u [V],y [m]`), MAT-files, HDF5, NumPy, MCAP logs and Parquet: {how}"
         ))
     }
 }

@@ -266,7 +266,7 @@ pub enum RecordingError {
     /// This build of greybox leaves the format out.
     #[error(
         "{place}: this build of greybox does not read {format}: build it with the feature `{feature}` (`cargo install \
-         --features {feature} …`), or export the recording as CSV"
+         --features {feature} …`), or {instead}"
     )]
     NotBuiltIn {
         /// The file.
@@ -275,6 +275,8 @@ pub enum RecordingError {
         format: &'static str,
         /// Name of the feature.
         feature: &'static str,
+        /// What to do without it.
+        instead: &'static str,
     },
     /// The file is of another format than its name says, or of a version that is not read.
     #[error("{place}: {found}, which greybox does not read; {help}")]
@@ -362,6 +364,19 @@ pub enum RecordingError {
         /// Its last time, s after the first of the file.
         end: f64,
     },
+    /// The times restart with every episode of a data set.
+    #[error(
+        "{place}: the file holds {episodes} episodes (column `{column}`), each with times of its own; one file holds one \
+         recording: split it into a file for each value of `{column}`"
+    )]
+    SeveralEpisodes {
+        /// The file.
+        place: Place,
+        /// The column that numbers the episodes.
+        column: String,
+        /// How many there are.
+        episodes: usize,
+    },
     /// There is a time, and no variable or column has a value for each.
     #[error(
         "{place}: no other variable has the {rows} values of the time `{time}` ({found}); save signals and time with one \
@@ -422,6 +437,7 @@ impl RecordingError {
             | Self::SeveralTimes { place, .. }
             | Self::NoSeries { place, .. }
             | Self::NoOverlap { place, .. }
+            | Self::SeveralEpisodes { place, .. }
             | Self::NoSignals { place, .. }
             | Self::ColumnLength { place, .. } => place,
         }

@@ -58,3 +58,18 @@ pub(crate) fn unread(label: &str, source: std::io::Error) -> RecordingError {
         _ => RecordingError::Io { place: Place::file(label), action: "read", source },
     }
 }
+
+/// What `read` returns; where the library panics on damaged bytes, an error like the others. Nothing outlives the call.
+#[cfg(any(feature = "hdf5", feature = "parquet"))]
+pub(crate) fn guarded<T>(
+    label: &str,
+    read: impl FnOnce() -> Result<T, RecordingError>,
+) -> Result<T, RecordingError> {
+    std::panic::catch_unwind(std::panic::AssertUnwindSafe(read)).unwrap_or_else(|_| {
+        Err(RecordingError::Damaged {
+            place: Place::file(label),
+            variable: None,
+            found: "its parts contradict each other".to_owned(),
+        })
+    })
+}

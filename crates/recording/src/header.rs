@@ -3,9 +3,9 @@
 use crate::error::{Place, RecordingError};
 
 /// Names of the time in files that do not say which column it is; the first found counts. `tout` is what Simulink
-/// calls it.
+/// calls it, `timestamp` what data sets of robot learning do.
 #[cfg(any(feature = "mat", feature = "parquet"))]
-pub(crate) const TIMES: [&str; 4] = ["t", "time", "Time", "tout"];
+pub(crate) const TIMES: [&str; 5] = ["t", "time", "Time", "tout", "timestamp"];
 
 /// Seconds per unit of a time; `None` for a unit that times do not have.
 pub(crate) fn seconds(unit: Option<&str>) -> Option<f64> {

@@ -14,7 +14,7 @@
 //! | module | what it answers |
 //! |---|---|
 //! | [`csv`](mod@csv) | what stands in the file, or exactly which cell is wrong and how to fix it |
-//! | `mat`, `mcap`, `parquet` | the same for MAT-files, MCAP logs and Parquet files, each behind a feature of its name |
+//! | `mat`, `hdf5`, `npz`, `mcap`, `parquet` | the same for MAT-files, HDF5, arrays of NumPy, MCAP logs and Parquet files, each behind a feature of its name |
 //! | [`noise`] | how large the measurement noise is, and whether a channel is quantised |
 //! | [`smooth`] | value, first and second derivative of a noisy channel (Savitzky–Golay) |
 //! | [`interpolate`] | what an input did between its samples (band-limited, linear) |
@@ -54,15 +54,23 @@ mod error;
 mod file;
 mod finding;
 mod grid;
+#[cfg(feature = "hdf5")]
+pub mod hdf5;
 mod header;
 pub mod health;
 pub mod interpolate;
+#[cfg(feature = "mat")]
+mod layout;
 #[cfg(feature = "mat")]
 pub mod mat;
 #[cfg(feature = "mcap")]
 pub mod mcap;
 mod median;
 pub mod noise;
+#[cfg(feature = "npz")]
+pub mod npz;
+#[cfg(any(feature = "hdf5", feature = "npz"))]
+mod number;
 mod outliers;
 #[cfg(feature = "parquet")]
 pub mod parquet;
@@ -72,6 +80,8 @@ mod rename;
 mod selection;
 pub mod smooth;
 mod spectrum;
+#[cfg(feature = "mat")]
+mod variables;
 
 pub use crate::character::{Character, character};
 pub use crate::correlation::Correlation;
@@ -79,10 +89,14 @@ pub use crate::csv::{CsvBlocks, CsvLines, parse_csv, read_csv, write_csv, write_
 pub use crate::error::{Place, RecordingError};
 pub use crate::file::{content, is_device};
 pub use crate::finding::{Finding, Severity, listed};
+#[cfg(feature = "hdf5")]
+pub use crate::hdf5::parse_hdf5;
 #[cfg(feature = "mat")]
 pub use crate::mat::parse_mat;
 #[cfg(feature = "mcap")]
 pub use crate::mcap::parse_mcap;
+#[cfg(feature = "npz")]
+pub use crate::npz::parse_npz;
 #[cfg(feature = "parquet")]
 pub use crate::parquet::parse_parquet;
 pub use crate::read::{EXTENSIONS, parse, read, read_selected};

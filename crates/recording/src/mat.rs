@@ -1,9 +1,9 @@
 //! Reading MAT-files of MATLAB and Simulink (feature `mat`).
 //!
 //! Read are files of level 5: those of `save` with `-v6` and `-v7` (compressed), also those that SciPy and Octave
-//! write. A file of `-v7.3` (HDF5) is an error that names the fix.
+//! write. Those of `-v7.3` (HDF5) are read with the feature `hdf5`; without, they are an error that names the fix.
 //!
-//! The time is the vector `t`, `time` or `tout`, in s; every real array with a value for each time is a signal:
+//! The time is the vector `t`, `time`, `tout` or `timestamp`, in s; every real array with a value for each time is a signal:
 //!
 //! | in the file | channels |
 //! |---|---|
@@ -18,18 +18,20 @@
 //! Structures within structures are looked through. A name that would stand twice gets the structures' names before
 //! it (`hub_theta`). NaN is a missing sample. What is left out is told in the warnings of the recording.
 
-mod layout;
 mod level5;
 
 use crate::error::{Place, RecordingError};
 use crate::file::ROOM;
+use crate::layout;
 use crate::recording::Recording;
 use level5::Fault;
+use std::borrow::Cow;
 
 /// Reads a recording called `name` from the bytes of a MAT-file.
 ///
 /// # Errors
-/// [`RecordingError::Format`], [`RecordingError::Damaged`] or [`RecordingError::TooLarge`] where the bytes cannot be read;
+/// [`RecordingError::Format`], [`RecordingError::Damaged`] or [`RecordingError::TooLarge`] where the bytes cannot be read,
+/// [`RecordingError::NotBuiltIn`] for a file of `-v7.3` where the feature `hdf5` is off;
 /// [`RecordingError::NoTime`], [`RecordingError::SeveralTimes`] or [`RecordingError::NoSignals`] where they make no recording;
 /// else as [`Recording::from_columns`].
 ///
@@ -38,16 +40,26 @@ use level5::Fault;
 /// assert!(error.to_string().starts_with("run1.mat: the file is damaged"));
 /// ```
 pub fn parse_mat(bytes: &[u8], name: &str) -> Result<Recording, RecordingError> {
-    parse(bytes, name, name)
+    parse(Cow::Borrowed(bytes), name, name)
 }
 
-pub(crate) fn parse(bytes: &[u8], label: &str, name: &str) -> Result<Recording, RecordingError> {
-    let variables = level5::variables(bytes).map_err(|fault| refused(fault, Place::file(label)))?;
+pub(crate) fn parse(bytes: Cow<'_, [u8]>, label: &str, name: &str) -> Result<Recording, RecordingError> {
+    #[cfg(feature = "hdf5")]
+    if level5::is_hdf5(&bytes) {
+        return crate::hdf5::parse(bytes.into_owned(), label, name);
+    }
+    let variables = level5::variables(&bytes).map_err(|fault| refused(fault, Place::file(label)))?;
     layout::recording(&variables, label, name)
 }
 
 fn refused(fault: Fault, place: Place) -> RecordingError {
     match fault {
+        Fault::Hdf5 => RecordingError::NotBuiltIn {
+            place,
+            format: "MAT-files of version 7.3 (HDF5)",
+            feature: "hdf5",
+            instead: level5::SAVE_V7,
+        },
         Fault::Format(found, help) => RecordingError::Format { place, found: found.to_owned(), help },
         Fault::Damaged { variable, what, at } => {
             RecordingError::Damaged { place, variable, found: format!("{what} (byte {at})") }

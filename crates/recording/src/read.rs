@@ -1,7 +1,13 @@
 //! Files to recordings: the format by the ending of the name.
 
 use crate::csv;
-#[cfg(not(all(feature = "mat", feature = "mcap", feature = "parquet")))]
+#[cfg(not(all(
+    feature = "mat",
+    feature = "hdf5",
+    feature = "npz",
+    feature = "mcap",
+    feature = "parquet"
+)))]
 use crate::error::Place;
 use crate::error::RecordingError;
 use crate::file::bytes;
@@ -10,15 +16,16 @@ use crate::selection::Selection;
 use std::path::Path;
 
 /// Endings of the files that may hold a recording. Whether this build reads all of them, its features say
-/// (`mat`, `mcap`, `parquet`); [`read`] tells which is missing.
-pub const EXTENSIONS: [&str; 4] = ["csv", "mat", "mcap", "parquet"];
+/// (`mat`, `hdf5`, `npz`, `mcap`, `parquet`); [`read`] tells which is missing.
+pub const EXTENSIONS: [&str; 8] = ["csv", "mat", "h5", "hdf5", "npz", "npy", "mcap", "parquet"];
 
-/// Reads the recording in the file at `path`: a MAT-file where the name ends in `.mat`, an MCAP log where it ends in
-/// `.mcap`, a Parquet file where it ends in `.parquet`, CSV else.
+/// Reads the recording in the file at `path`: a MAT-file where the name ends in `.mat`, HDF5 where it ends in `.h5` or
+/// `.hdf5`, arrays of NumPy where it ends in `.npz` or `.npy`, an MCAP log where it ends in `.mcap`, a Parquet file where it
+/// ends in `.parquet`, CSV else.
 ///
 /// # Errors
 /// Any [`RecordingError`]; its place names the file as given. [`RecordingError::NotBuiltIn`] where this build lacks the
-/// feature `mat`, `mcap` or `parquet`.
+/// feature that it needs.
 ///
 /// ```
 /// let path = std::env::temp_dir().join(format!("read_{}.csv", std::process::id()));
@@ -55,22 +62,34 @@ pub fn parse(
 ) -> Result<Recording, RecordingError> {
     #[cfg(not(feature = "mcap"))]
     let _ = selection;
-    let missing =
-        |format, feature| Err(RecordingError::NotBuiltIn { place: Place::file(label), format, feature });
     let ending = Path::new(name).extension().map(|e| e.to_string_lossy().to_ascii_lowercase());
     match ending.unwrap_or_default().as_str() {
         #[cfg(feature = "mat")]
-        "mat" => crate::mat::parse(&bytes, label, name),
+        "mat" => crate::mat::parse(bytes.into(), label, name),
+        #[cfg(feature = "hdf5")]
+        "h5" | "hdf5" => crate::hdf5::parse(bytes, label, name),
+        #[cfg(feature = "npz")]
+        "npz" | "npy" => crate::npz::parse(&bytes, label, name),
         #[cfg(feature = "mcap")]
         "mcap" => crate::mcap::parse(&bytes, label, name, selection),
         #[cfg(feature = "parquet")]
         "parquet" => crate::parquet::parse(bytes, label, name),
         #[cfg(not(feature = "mat"))]
-        "mat" => missing("MAT-files", "mat"),
+        "mat" => Err(not_built_in(label, "MAT-files", "mat")),
+        #[cfg(not(feature = "hdf5"))]
+        "h5" | "hdf5" => Err(not_built_in(label, "HDF5", "hdf5")),
+        #[cfg(not(feature = "npz"))]
+        "npz" | "npy" => Err(not_built_in(label, "arrays of NumPy", "npz")),
         #[cfg(not(feature = "mcap"))]
-        "mcap" => missing("MCAP logs", "mcap"),
+        "mcap" => Err(not_built_in(label, "MCAP logs", "mcap")),
         #[cfg(not(feature = "parquet"))]
-        "parquet" => missing("Parquet files", "parquet"),
+        "parquet" => Err(not_built_in(label, "Parquet files", "parquet")),
         _ => csv::parse(&bytes, label, name, 0),
     }
+}
+
+#[cfg(not(all(feature = "mat", feature = "hdf5", feature = "npz", feature = "mcap", feature = "parquet")))]
+fn not_built_in(label: &str, format: &'static str, feature: &'static str) -> RecordingError {
+    let instead = "export the recording as CSV";
+    RecordingError::NotBuiltIn { place: Place::file(label), format, feature, instead }
 }

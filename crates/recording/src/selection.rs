@@ -39,7 +39,7 @@ impl Selection {
     }
 
     /// Every name in it.
-    #[cfg(any(test, feature = "mcap"))]
+    #[cfg(feature = "mcap")]
     pub(crate) fn names(&self) -> impl Iterator<Item = &str> {
         self.channels.iter().chain(self.named.iter().flatten()).map(String::as_str)
     }

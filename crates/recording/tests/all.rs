@@ -3,9 +3,11 @@
 
 mod bad_files;
 mod blocks;
+mod hdf5;
 mod health;
 mod mat;
 mod mcap;
+mod npz;
 mod parquet;
 mod real_recordings;
 mod signals;

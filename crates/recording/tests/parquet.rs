@@ -1,10 +1,12 @@
-//! Parquet files, written by the same library that reads them, and damaged ones.
+//! Parquet files, written by the same library that reads them or by pandas and PyArrow (`tests/parquet/make.py`), and damaged
+//! ones.
 #![cfg(feature = "parquet")]
 // Helpers of a test file are tests too; the lint configuration knows only the annotated functions.
 
+use std::path::Path;
 use std::sync::Arc;
 
-use greybox_recording::{RecordingError, parse_parquet};
+use greybox_recording::{Recording, RecordingError, parse_parquet, read};
 use parquet::basic::{Compression, ZstdLevel};
 use parquet::data_type::{BoolType, ByteArrayType, DoubleType, FloatType, Int64Type};
 use parquet::file::properties::WriterProperties;
@@ -90,6 +92,83 @@ fn a_file_without_time_names_its_columns() {
     {
         assert!(error.to_string().contains(part), "{error}");
     }
+}
+
+fn made(name: &str) -> Result<Recording, RecordingError> {
+    read(Path::new(env!("CARGO_MANIFEST_DIR")).join("tests/parquet").join(name))
+}
+
+/// `state` is [sin 3t, cos 2t, k], `action` [k/4, missing where k is even], both missing in row 17; times are k/50 as `f32`.
+#[test]
+fn lists_of_one_length_become_a_channel_per_element() {
+    for name in ["lists.parquet", "fixed.parquet", "old_lists.parquet"] {
+        let recording = made(name).unwrap();
+        let names: Vec<_> = recording.channels.iter().map(|c| (c.name.as_str(), c.unit.as_deref())).collect();
+        let wanted = [
+            ("observation.state[0]", None),
+            ("observation.state[1]", None),
+            ("observation.state[2]", None),
+            ("action[0]", Some("N")),
+            ("action[1]", Some("N")),
+            ("frame_index", None),
+            ("episode_index", None),
+        ];
+        assert_eq!(names, wanted, "{name}");
+        assert_eq!((recording.time.len(), recording.pieces.len()), (60, 1));
+        assert!((recording.dt() - 0.02).abs() < 1e-9, "{name}: {}", recording.dt());
+        for k in 0..60 {
+            let value = |name: &str| recording.channel(name).unwrap().values[k];
+            let is_missing = k == 17;
+            assert_eq!(recording.time[k], f64::from((k as f64 / 50.0) as f32));
+            assert_eq!(value("observation.state[2]").is_nan(), is_missing);
+            assert_eq!(value("action[1]").is_nan(), is_missing || k % 2 == 0);
+            if !is_missing {
+                let t = k as f64 / 50.0;
+                assert!((value("observation.state[0]") - (3.0 * t).sin()).abs() < 1e-7);
+                assert!((value("observation.state[1]") - (2.0 * t).cos()).abs() < 1e-7);
+                assert_eq!((value("observation.state[2]"), value("action[0]")), (k as f64, k as f64 / 4.0));
+            }
+        }
+        let told = &recording.warnings[0].message;
+        assert!(told.contains("`ragged` (lists of different lengths)"), "{name}: {told}");
+        assert!(told.contains("`nested.list."), "{name}: {told}");
+    }
+}
+
+/// At 5000 s a time as `f32` has steps of 0.5 ms: that is no jitter of the sampling.
+#[test]
+fn the_digits_of_a_time_end_where_its_type_says() {
+    let late = made("late.parquet").unwrap();
+    assert!((late.dt() - 0.02).abs() < 1e-5, "{}", late.dt());
+    assert!(late.warnings.is_empty(), "{:?}", late.warnings);
+}
+
+#[test]
+fn several_episodes_are_refused_where_the_time_restarts() {
+    let error = made("episodes.parquet").unwrap_err();
+    assert!(matches!(error, RecordingError::SeveralEpisodes { .. }), "{error}");
+    for part in ["holds 3 episodes (column `episode_index`)", "a file for each value of `episode_index`"] {
+        assert!(error.to_string().contains(part), "{error}");
+    }
+    assert_eq!(made("one_time.parquet").unwrap().time.len(), 60, "episodes of one clock are one recording");
+}
+
+#[test]
+fn no_cut_and_no_changed_byte_of_lists_makes_a_fault() {
+    let folder = Path::new(env!("CARGO_MANIFEST_DIR")).join("tests/parquet");
+    let whole = std::fs::read(folder.join("lists.parquet")).unwrap();
+    for end in 0..whole.len() {
+        assert!(parse_parquet(whole[..end].to_vec(), "cut.parquet").is_err(), "{end}");
+    }
+    let mut refused = 0;
+    for at in 0..whole.len() {
+        for change in [0x01, 0x80, 0xff] {
+            let mut changed = whole.clone();
+            changed[at] ^= change;
+            refused += usize::from(parse_parquet(changed, "changed.parquet").is_err());
+        }
+    }
+    assert!(refused > 100, "{refused}");
 }
 
 #[test]

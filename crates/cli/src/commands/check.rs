@@ -19,10 +19,10 @@ use crate::loading;
   greybox check log.mcap --channels \"/joint_states.position[elbow]\" --channels /cmd.data
   greybox check run1.csv --model link.toml --json
 
-A folder stands for all its recordings (*.csv, *.mat, *.mcap, *.parquet).")]
+A folder stands for all its recordings (*.csv, *.mat, *.h5, *.hdf5, *.npz, *.npy, *.mcap, *.parquet).")]
 pub(crate) struct Arguments {
     /// Recordings, or folders of them (CSV: first column `t` in seconds, header cells `name` or `name [unit]`;
-    /// MAT-file; MCAP; Parquet)
+    /// MAT-file; HDF5; NumPy; MCAP; Parquet)
     #[arg(value_name = "RECORDING.csv", required = true)]
     recordings: Vec<PathBuf>,
 

@@ -29,7 +29,7 @@ use crate::study::{BILLION, ModelStudy, Study, whole};
 DIR receives report.json, report.html (self-contained, with plots) and improved.toml. With no --holdout, the
 last fifth of each recording is held out. The same seed and inputs give the same results.
 
-A folder in the place of TRAIN.csv stands alone: each of its recordings (*.csv, *.mat, *.mcap, *.parquet) that is not held out
+A folder in the place of TRAIN.csv stands alone: each of its recordings (*.csv, *.mat, *.h5, *.npz, *.mcap, *.parquet, …) that is not held out
 is diagnosed by itself, into a folder of its own in DIR, and summary.html and summary.json say what all say together. The
 same command resumes an interrupted run: what is done is not done again. With --runs they also say in which share of the
 machines something is found, what each machine has of its own, what changes with date and temperature, and which machines

@@ -31,7 +31,7 @@ pub(crate) struct Arguments {
     #[arg(value_name = "MODEL.toml")]
     model: PathBuf,
 
-    /// Recording whose inputs drive the model (CSV, MAT-file, MCAP or Parquet)
+    /// Recording whose inputs drive the model (CSV, MAT-file, HDF5, NumPy, MCAP or Parquet)
     #[arg(value_name = "INPUT.csv")]
     input: PathBuf,
 

@@ -6,6 +6,7 @@
 //! Nothing is reserved on the word of the file: what is read is there, what is unpacked counts against [`ROOM`].
 
 use crate::file::ROOM;
+use crate::variables::{Array, Value, Variable, rows_of};
 use flate2::bufread::ZlibDecoder;
 use std::io::Read;
 
@@ -15,41 +16,11 @@ const MAX_DEPTH: usize = 32;
 /// Bytes before the first element.
 const HEADER: usize = 128;
 
-/// A variable of the workspace.
-#[derive(Debug, Clone, PartialEq)]
-pub(crate) struct Variable {
-    pub(crate) name: String,
-    pub(crate) value: Value,
-}
-
-/// What a variable, a field or a cell holds.
-#[derive(Debug, Clone, PartialEq)]
-pub(crate) enum Value {
-    Numbers(Array),
-    /// One text per row.
-    Text(Vec<String>),
-    /// An array of structures: name of each field, and its value in every structure.
-    Structure {
-        count: usize,
-        fields: Vec<(String, Vec<Value>)>,
-    },
-    Cells(Vec<Value>),
-    /// Something that holds no samples greybox reads: what it is, in words.
-    Other(&'static str),
-}
-
-/// Numbers in columns one after the other; there are as many as the dimensions say.
-#[derive(Debug, Clone, PartialEq)]
-pub(crate) struct Array {
-    pub(crate) dimensions: Vec<usize>,
-    pub(crate) values: Vec<f64>,
-    /// Whether they are of the class `single`, whose digits end after seven.
-    pub(crate) single: bool,
-}
-
 /// Why the bytes are not read.
 #[derive(Debug, Clone, PartialEq)]
 pub(crate) enum Fault {
+    /// They are HDF5: a file of `-v7.3`.
+    Hdf5,
     /// They are of another format: what it is, and the fix.
     Format(&'static str, &'static str),
     /// They end too early, or have no meaning: what was found, in which variable, before which byte.
@@ -59,7 +30,8 @@ pub(crate) enum Fault {
 }
 
 /// The fix for formats that greybox does not read.
-const SAVE_V7: &str = "load it in MATLAB and write it again with `save('run.mat', 't', 'y', '-v7')`";
+pub(super) const SAVE_V7: &str =
+    "load it in MATLAB and write it again with `save('run.mat', 't', 'y', '-v7')`";
 
 /// Reads all variables of a file.
 pub(crate) fn variables(bytes: &[u8]) -> Result<Vec<Variable>, Fault> {
@@ -92,14 +64,16 @@ fn variables_within(bytes: &[u8], mut room: u64) -> Result<Vec<Variable>, Fault>
     Ok(variables)
 }
 
+/// Whether it is a file of `-v7.3`: HDF5, behind a header of MATLAB's or without.
+pub(super) fn is_hdf5(bytes: &[u8]) -> bool {
+    const HDF5: &[u8] = b"\x89HDF\r\n\x1a\n";
+    bytes.starts_with(b"MATLAB 7.3 MAT-file") || bytes.starts_with(HDF5) || bytes.get(512..520) == Some(HDF5)
+}
+
 /// Whether the file has its high bytes first; an error where it is no file of level 5.
 fn check_header(bytes: &[u8]) -> Result<bool, Fault> {
-    const HDF5: &[u8] = b"\x89HDF\r\n\x1a\n";
-    if bytes.starts_with(b"MATLAB 7.3 MAT-file")
-        || bytes.starts_with(HDF5)
-        || bytes.get(512..520) == Some(HDF5)
-    {
-        return Err(Fault::Format("it is of version 7.3 (HDF5)", SAVE_V7));
+    if is_hdf5(bytes) {
+        return Err(Fault::Hdf5);
     }
     let Some(header) = bytes.get(..HEADER) else {
         return Err(damaged("the file ends within its header", bytes.len()));
@@ -384,16 +358,6 @@ fn text_of(element: &Element<'_>, big: bool) -> String {
         }
         _ => String::from_utf8_lossy(element.data).into_owned(),
     }
-}
-
-/// The rows of a matrix of characters, which stands column by column, without the blanks at their ends.
-fn rows_of(text: &str, rows: usize, count: usize) -> Vec<String> {
-    if count == 0 || rows == 0 {
-        return Vec::new();
-    }
-    let characters: Vec<char> = text.chars().collect();
-    let row = |r: usize| characters.iter().skip(r).step_by(rows).collect::<String>().trim_end().to_owned();
-    (0..rows.min(characters.len())).map(row).collect()
 }
 
 #[cfg(test)]

@@ -1,10 +1,11 @@
 //! Which variables are the time, which the signals, and how the signals are called.
 
-use super::level5::{Array, Value, Variable};
 use crate::error::{Place, RecordingError};
 use crate::finding::{Finding, Severity, listed};
 use crate::header::{TIMES, header_cell, seconds};
 use crate::recording::{Channel, MIN_SAMPLES, Recording};
+use crate::variables::{Array, Value, Variable};
+use std::collections::HashMap;
 
 /// Names of a list of column names, alone or behind the matrix's name and `_`.
 const NAMES: [&str; 6] = ["names", "labels", "columns", "channels", "header", "headers"];
@@ -56,7 +57,7 @@ struct Found {
 type Entries<'a> = Vec<(&'a str, &'a Value)>;
 
 /// The recording in the variables of a file.
-pub(super) fn recording(
+pub(crate) fn recording(
     variables: &[Variable],
     label: &str,
     name: &str,
@@ -106,8 +107,9 @@ pub(super) fn recording(
     }
     clock.signals.extend(clocks.into_iter().flat_map(|other| other.signals));
     tell_apart(&mut clock.signals);
+    let mut places = HashMap::new();
     for (c, signal) in clock.signals.iter().enumerate() {
-        if let Some(first) = clock.signals[..c].iter().position(|other| other.name == signal.name) {
+        if let Some(first) = places.insert(&signal.name, c) {
             return Err(RecordingError::DuplicateName {
                 place: place().column(c + 1, &signal.path),
                 name: signal.name.clone(),
@@ -375,9 +377,12 @@ fn same_times(a: &[f64], b: &[f64]) -> bool {
 
 /// Signals that share a name get those of the structures around them.
 fn tell_apart(signals: &mut [Signal]) {
-    let names: Vec<String> = signals.iter().map(|s| s.name.clone()).collect();
-    for (k, signal) in signals.iter_mut().enumerate() {
-        if names.iter().enumerate().any(|(other, name)| other != k && *name == names[k]) {
+    let mut times = HashMap::new();
+    for signal in signals.iter() {
+        *times.entry(signal.name.clone()).or_insert(0) += 1;
+    }
+    for signal in signals {
+        if times.get(&signal.name).is_some_and(|&times| times > 1) {
             let words =
                 signal.path.split(|c: char| !c.is_alphanumeric() && c != '_').filter(|w| !w.is_empty());
             signal.name = words.collect::<Vec<_>>().join("_");

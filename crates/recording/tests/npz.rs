@@ -1,0 +1,108 @@
+//! Files of NumPy as `np.savez`, `np.savez_compressed` and `np.save` write them (`tests/npz/make.py`), and damaged ones.
+#![cfg(feature = "npz")]
+// Helpers of a test file are tests too; the lint configuration knows only the annotated functions.
+
+use greybox_recording::{Recording, RecordingError, parse_npz, read};
+use std::path::{Path, PathBuf};
+
+fn path(name: &str) -> PathBuf {
+    Path::new(env!("CARGO_MANIFEST_DIR")).join("tests/npz").join(name)
+}
+
+fn bytes(name: &str) -> Vec<u8> {
+    std::fs::read(path(name)).unwrap()
+}
+
+#[track_caller]
+fn recording(name: &str) -> Recording {
+    read(path(name)).unwrap_or_else(|e| panic!("{e}"))
+}
+
+fn headers(recording: &Recording) -> Vec<String> {
+    recording.channels.iter().map(|c| c.header()).collect()
+}
+
+/// The samples of all files: time, voltage and angle, to the bit as NumPy made them.
+fn samples() -> [Vec<f64>; 3] {
+    let bytes = bytes("samples.bin");
+    let numbers: Vec<f64> =
+        bytes.chunks_exact(8).map(|b| f64::from_le_bytes(b.try_into().unwrap())).collect();
+    [0, 60, 120].map(|at| numbers[at..at + 60].to_vec())
+}
+
+#[test]
+fn every_form_gives_the_same_recording() {
+    let [t, v, theta] = samples();
+    for (name, wanted) in [
+        ("plain.npz", ["v", "theta"]),
+        ("packed.npz", ["v", "theta"]),
+        ("matrix.npz", ["v [V]", "theta [deg]"]),
+        ("columns.npz", ["v [V]", "theta [deg]"]),
+        ("first.npz", ["run_1", "run_2"]),
+        ("records.npz", ["v", "theta"]),
+        ("records.npy", ["v", "theta"]),
+        ("matrix.npy", ["y_1", "y_2"]),
+    ] {
+        let recording = recording(name);
+        assert_eq!(headers(&recording), wanted, "{name}");
+        assert_eq!(recording.time, t, "{name}");
+        assert_eq!(recording.channels[0].values, v, "{name}");
+        assert_eq!(recording.channels[1].values, theta, "{name}");
+    }
+}
+
+#[test]
+fn every_kind_of_number_is_read_and_what_is_left_out_is_told() {
+    let kinds = recording("kinds.npz");
+    let [_, v, _] = samples();
+    assert_eq!(headers(&kinds), ["big", "half", "wide", "byte", "on"]);
+    for k in 0..60 {
+        let value = |name: &str| kinds.channel(name).unwrap().values[k];
+        assert_eq!((value("big"), value("half")), (f64::from(v[k] as f32), k as f64 / 4.0 - 5.0));
+        assert_eq!((value("wide"), value("byte"), value("on")), (-(k as f64), k as f64, (k % 2) as f64));
+    }
+    let told = &kinds.warnings[0].message;
+    for part in ["`z` (complex numbers)", "`when` (dates or durations)", "`things` (Python objects)"] {
+        assert!(told.contains(part), "{told}");
+    }
+}
+
+#[test]
+fn what_is_no_recording_is_refused_with_its_help() {
+    let timeless = parse_npz(&bytes("no_time.npz"), "bad.npz").unwrap_err();
+    assert!(matches!(timeless, RecordingError::NoTime { .. }), "{timeless}");
+    assert!(timeless.to_string().contains("`v` (60×1), `theta` (60×1)"), "{timeless}");
+    let text = parse_npz(b"t,v\n0,1\n", "bad.npz").unwrap_err().to_string();
+    assert!(text.contains("no archive of NumPy") && text.contains("np.savez"), "{text}");
+}
+
+#[test]
+fn no_cut_makes_a_recording() {
+    for name in ["plain.npz", "packed.npz", "records.npy"] {
+        let whole = bytes(name);
+        for end in 1..whole.len() {
+            assert!(parse_npz(&whole[..end], "cut.npz").is_err(), "{name} {end}");
+        }
+    }
+}
+
+/// A changed byte is an error or other names; of the values, the checksum tells.
+#[test]
+fn no_changed_byte_makes_a_fault() {
+    for (name, share) in [("plain.npz", 0.8), ("packed.npz", 0.8), ("records.npy", 0.02)] {
+        let whole = bytes(name);
+        let mut refused = 0;
+        for at in 0..whole.len() {
+            for change in [0x01, 0x80, 0xff] {
+                let mut changed = whole.clone();
+                changed[at] ^= change;
+                refused += usize::from(parse_npz(&changed, "changed.npz").is_err());
+            }
+        }
+        assert!(
+            refused as f64 > share * 3.0 * whole.len() as f64,
+            "{name}: {refused} of {}",
+            3 * whole.len()
+        );
+    }
+}
