@@ -140,7 +140,9 @@ impl Line {
             return Ok(None);
         }
         let nanoseconds = self.timestamp.ok_or("there is no timestamp, in nanoseconds")?;
-        let mut row = vec![nanoseconds as f64 / 1e9];
+        // (A double has no room for nanoseconds since 1970.)
+        let (seconds, rest) = (nanoseconds.div_euclid(1_000_000_000), nanoseconds.rem_euclid(1_000_000_000));
+        let mut row = vec![seconds as f64 + rest as f64 / 1e9];
         for field in found {
             row.push(match field {
                 None => f64::NAN,
