@@ -185,7 +185,7 @@ pub struct ParameterOver {
     pub pooled: Pooled,
 }
 
-/// A number estimated in several recordings ([`crate::pool`]).
+/// A number estimated in several recordings ([`greybox_fleet::pool()`]).
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize, JsonSchema)]
 pub struct Pooled {
     /// Pooled estimate; `null` where no recording gives an interval.
