@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import functools
+import hashlib
 import io
 from dataclasses import dataclass, field
 from typing import Any
@@ -22,7 +23,8 @@ class Plan:
 
     model_text: str
     model_path: str
-    holdout: tuple[str, ...]
+    #: Each with the hash of what was in it when the work began.
+    holdout: tuple[tuple[str, str], ...]
     map: tuple[str, ...]
     channels: tuple[str, ...]
     seed: int
@@ -55,10 +57,19 @@ class Outcome:
     failure: str | None = None
 
 
+def hash_of(content: bytes) -> str:
+    return hashlib.sha256(content).hexdigest()
+
+
 @functools.lru_cache(maxsize=4)
 def fleet(plan: Plan) -> _native.Fleet:
     """The plan, read: once in a process."""
-    held = [(place, content(place, plan.options)) for place in plan.holdout]
+    held = []
+    for place, hashed in plan.holdout:
+        found = content(place, plan.options)
+        if hash_of(found) != hashed:
+            raise InputError(f"{place}: what is held out has changed since the work began; start it again")
+        held.append((place, found))
     model = _native.Model(plan.model_text, plan.model_path)
     return _native.Fleet(model, held, list(plan.map), list(plan.channels), plan.seed, plan.work, list(plan.mechanisms))
 

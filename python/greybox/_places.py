@@ -6,7 +6,7 @@ import contextlib
 import importlib
 import os
 import posixpath
-import tempfile
+import uuid
 from collections.abc import Mapping
 from typing import Any, Optional
 
@@ -103,20 +103,12 @@ class Folder:
             return
         os.makedirs(self._path, exist_ok=True)
         for name, content in files:
-            handle, waiting = tempfile.mkstemp(prefix=".greybox-", suffix=".partial", dir=self._path)
+            waiting = os.path.join(self._path, f".greybox-{uuid.uuid4().hex}.partial")
             try:
-                with os.fdopen(handle, "wb") as file:
+                with open(waiting, "xb") as file:
                     file.write(content)
-                os.chmod(waiting, 0o666 & ~_umask())
                 os.replace(waiting, os.path.join(self._path, name))
             except BaseException:
                 with contextlib.suppress(FileNotFoundError):
                     os.remove(waiting)
                 raise
-
-
-def _umask() -> int:
-    """The rights that new files of this process lack."""
-    mask = os.umask(0o022)
-    os.umask(mask)
-    return mask

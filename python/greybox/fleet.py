@@ -20,9 +20,9 @@ from typing import Any, Union
 from . import _native
 from ._engines import each, engine
 from ._errors import GreyboxError, InputError, InternalError
-from ._fleet_work import Outcome, Plan, Run, fleet, work as _work
+from ._fleet_work import Outcome, Plan, Run, fleet, hash_of, work as _work
 from ._inputs import ModelLike, model as native, names, renames
-from ._places import Folder, Options, entries, is_folder, is_url, matching
+from ._places import Folder, Options, content, entries, is_folder, is_url, matching
 from ._tables import RunsLike, table
 from ._records import Named, Record
 from ._results import Diagnosis, _Result, _write
@@ -167,11 +167,11 @@ def diagnose(
     if threads < 1:
         raise InputError(f"`threads` is {threads}; a diagnosis needs one at least")
     inner = native(model)
-    held = tuple(_places(holdout, storage_options)) if holdout is not None else ()
+    held = _places(holdout, storage_options) if holdout is not None else []
     plan = Plan(
         model_text=inner.text,
         model_path=os.fspath(inner.path),
-        holdout=held,
+        holdout=tuple((place, hash_of(content(place, storage_options))) for place in held),
         map=tuple(renames(map)),
         channels=tuple(names(channels)),
         seed=seed,

@@ -271,3 +271,15 @@ def test_what_all_share_is_checked_first(recordings, tmp_path):
     summary = fleet.diagnose(recordings.model, [Path(recordings.place) / f"run00{k}.csv" for k in (0, 1)],
                              holdout=Path(recordings.place) / "run001.csv")
     assert [one.recording for one in summary.recordings] == ["run000.csv"]
+
+
+def test_what_is_held_out_is_read_anew_where_it_has_changed(recordings, tmp_path):
+    held, one = tmp_path / "held.csv", Path(recordings.place) / "run000.csv"
+    shutil.copy(Path(recordings.place) / "run001.csv", held)
+    given = {"holdout": held, "out": tmp_path / "out"}
+    first = fleet.diagnose(recordings.model, one, **given)
+    assert fleet.diagnose(recordings.model, one, **given).done_before == 1
+    shutil.copy(Path(recordings.place) / "run002.csv", held)
+    second = fleet.diagnose(recordings.model, one, **given)
+    assert second.done_before == 0
+    assert second.to_json() != first.to_json()

@@ -60,7 +60,7 @@ pub(crate) fn unread(label: &str, source: std::io::Error) -> RecordingError {
 }
 
 /// What `read` returns; where the library panics on damaged bytes, an error like the others. Nothing outlives the call.
-#[cfg(any(feature = "hdf5", feature = "parquet"))]
+#[cfg(any(feature = "hdf5", feature = "mcap", feature = "parquet"))]
 pub(crate) fn guarded<T>(
     label: &str,
     read: impl FnOnce() -> Result<T, RecordingError>,

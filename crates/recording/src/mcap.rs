@@ -29,13 +29,12 @@ mod units;
 
 use crate::clocks::{self, Clock, Series};
 use crate::error::{Place, RecordingError};
-use crate::file::ROOM;
+use crate::file::{ROOM, guarded};
 use crate::finding::{Finding, Severity, listed};
 use crate::recording::Recording;
 use crate::selection::Selection;
 use ::mcap::McapError;
 use container::{Content, Fault};
-use std::panic::{self, AssertUnwindSafe};
 use topic::Topic;
 
 /// Reads the selected channels of a recording called `name` from the bytes of an MCAP log.
@@ -58,20 +57,13 @@ pub fn parse_mcap(bytes: &[u8], name: &str, selection: &Selection) -> Result<Rec
     parse(bytes, name, name, selection)
 }
 
-/// The library may panic on damaged records; nothing outlives the call, so that it is an error like the others.
 pub(crate) fn parse(
     bytes: &[u8],
     label: &str,
     name: &str,
     selection: &Selection,
 ) -> Result<Recording, RecordingError> {
-    panic::catch_unwind(AssertUnwindSafe(|| read(bytes, label, name, selection))).unwrap_or_else(|_| {
-        Err(RecordingError::Damaged {
-            place: Place::file(label),
-            variable: None,
-            found: "its records contradict each other".to_owned(),
-        })
-    })
+    guarded(label, || read(bytes, label, name, selection))
 }
 
 fn read(bytes: &[u8], label: &str, name: &str, selection: &Selection) -> Result<Recording, RecordingError> {
