@@ -270,7 +270,13 @@ fn machines_are_told_of_where_a_table_says_which_they_are() {
 #[test]
 fn a_machine_has_what_is_found_in_half_of_its_recordings() {
     let mut parts = Vec::new();
-    for (machine, found) in [("a", [true, false, false]), ("b", [true, true, false]), ("c", [false; 3])] {
+    let of_machines: [(&str, &[bool]); 4] = [
+        ("a", &[true, false, false]),
+        ("b", &[true, true, false]),
+        ("c", &[false; 3]),
+        ("d", &[true, false]),
+    ];
+    for (machine, found) in of_machines {
         for (k, found) in found.iter().enumerate() {
             let mut one = report(0.06, 0.001);
             if !found {
@@ -283,7 +289,7 @@ fn a_machine_has_what_is_found_in_half_of_its_recordings() {
         }
     }
     let summary = conclude(reduce(parts).unwrap(), Producer::default(), ModelId::default());
-    assert_eq!(summary.mechanisms[0].machines.as_ref().unwrap().found_in, ["b"]);
+    assert_eq!(summary.mechanisms[0].machines.as_ref().unwrap().found_in, ["b", "d"]);
 }
 
 #[test]
