@@ -62,7 +62,7 @@ pub struct Channels {
 #[derive(Debug)]
 struct Shared {
     model: Fingerprint,
-    holdout: Vec<Vec<u8>>,
+    holdout: Vec<Fingerprint>,
     mechanisms: Vec<Fingerprint>,
 }
 
@@ -112,7 +112,7 @@ impl Fleet {
     ) -> Result<Fleet, Failure> {
         let shared = Shared {
             model: Fingerprint::of(&loaded.file, loaded.text.as_bytes()),
-            holdout: holdout.iter().map(|file| file.bytes.clone()).collect(),
+            holdout: holdout.iter().map(|file| Fingerprint::of("", &file.bytes)).collect(),
             mechanisms: mechanisms
                 .iter()
                 .map(|(name, text)| Fingerprint::of(name, text.as_bytes()))
@@ -202,18 +202,17 @@ impl Fleet {
     /// What the results of a recording depend on.
     fn inputs(&self, recording: &File) -> Inputs {
         let paths = self.paths(&recording.path);
-        let fingerprint = |path: &Path, bytes: &[u8]| Fingerprint::of(loading::called(path, &paths), bytes);
         Inputs {
             greybox: env!("CARGO_PKG_VERSION").to_owned(),
             seed: self.options.seed,
             work: self.options.work,
             model: self.shared.model.clone(),
-            recording: fingerprint(&recording.path, &recording.bytes),
+            recording: Fingerprint::of(loading::called(&recording.path, &paths), &recording.bytes),
             holdout: self
                 .holdout
                 .iter()
                 .zip(&self.shared.holdout)
-                .map(|((path, _), bytes)| fingerprint(path, bytes))
+                .map(|((path, _), content)| content.called(loading::called(path, &paths)))
                 .collect(),
             map: self.channels.map.iter().map(Rename::to_string).collect(),
             channels: self.channels.only.clone(),

@@ -34,7 +34,7 @@ pub struct Estimate {
     pub machine: usize,
     /// Estimate and standard error.
     pub effect: Effect,
-    /// Value of each covariate; NaN where it is not known.
+    /// Value of each covariate; NaN, or none at the end of the list, where it is not known.
     pub covariates: Vec<f64>,
 }
 
@@ -257,8 +257,10 @@ fn different(problem: &Problem, first: Fit, free: [bool; 2], used: usize) -> (Ve
 
 /// The estimates whose covariates are all known, and which covariates those are: what most recordings lack does not count.
 fn complete(estimates: &[Estimate]) -> (Vec<&Estimate>, Vec<usize>) {
-    let count = estimates.first().map_or(0, |estimate| estimate.covariates.len());
-    let has = |estimate: &&Estimate, covariate: usize| estimate.covariates[covariate].is_finite();
+    let count = estimates.iter().map(|estimate| estimate.covariates.len()).max().unwrap_or(0);
+    let has = |estimate: &&Estimate, covariate: usize| {
+        estimate.covariates.get(covariate).is_some_and(|value| value.is_finite())
+    };
     let known: Vec<usize> = (0..count)
         .filter(|&covariate| 2 * estimates.iter().filter(|e| has(e, covariate)).count() > estimates.len())
         .collect();

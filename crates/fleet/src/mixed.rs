@@ -476,31 +476,15 @@ mod tests {
         assert!(fit.variances[0] > 0.1);
     }
 
-    /// The thirteen trials of the BCG vaccine, as in the tests of [`crate::pool`]; REML with the latitude as a
-    /// moderator in W. Viechtbauer, "Conducting meta-analyses in R with the metafor package", J. Stat. Softw. 36(3), 2010:
-    /// without a moderator τ² = 0.3132 and −0.7145 (0.1798).
+    /// The trials of [`crate::pool`] by REML in W. Viechtbauer, "Conducting meta-analyses in R with the metafor package",
+    /// J. Stat. Softw. 36(3), 2010: τ² = 0.3132 and −0.7145 (0.1798).
     #[test]
     fn the_trials_of_a_vaccine_give_the_published_figures() {
-        let trials: [[f64; 4]; 13] = [
-            [4.0, 119.0, 11.0, 128.0],
-            [6.0, 300.0, 29.0, 274.0],
-            [3.0, 228.0, 11.0, 209.0],
-            [62.0, 13536.0, 248.0, 12619.0],
-            [33.0, 5036.0, 47.0, 5761.0],
-            [180.0, 1361.0, 372.0, 1079.0],
-            [8.0, 2537.0, 10.0, 619.0],
-            [505.0, 87886.0, 499.0, 87892.0],
-            [29.0, 7470.0, 45.0, 7232.0],
-            [17.0, 1699.0, 65.0, 1600.0],
-            [186.0, 50448.0, 141.0, 27197.0],
-            [5.0, 2493.0, 3.0, 2338.0],
-            [27.0, 16886.0, 29.0, 17825.0],
-        ];
-        let estimates = trials.iter().enumerate().map(|(k, [a, b, c, d])| {
-            let value = (a / (a + b) / (c / (c + d))).ln();
-            let variance = 1.0 / a - 1.0 / (a + b) + 1.0 / c - 1.0 / (c + d);
-            (k, value, variance, DVector::from_vec(vec![1.0]))
-        });
+        let effects = crate::pool::vaccine_trials();
+        let estimates = effects
+            .iter()
+            .enumerate()
+            .map(|(k, effect)| (k, effect.value, effect.error.powi(2), DVector::from_vec(vec![1.0])));
         let (problem, _) = Problem::new(estimates);
         let fit = problem.fit([0.1, 0.0], [true, false]).unwrap();
         close(fit.variances[0], 0.3132, 5e-5);

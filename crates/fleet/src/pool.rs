@@ -141,6 +141,30 @@ fn heterogeneity(effects: &[Effect], value: f64, degrees_of_freedom: usize) -> H
     }
 }
 
+/// Log risk ratios of thirteen trials of the BCG vaccine (G. A. Colditz et al., JAMA 271(9), 1994, 698–702).
+#[cfg(test)]
+pub(crate) fn vaccine_trials() -> [Effect; 13] {
+    let trials: [[f64; 4]; 13] = [
+        [4.0, 119.0, 11.0, 128.0],
+        [6.0, 300.0, 29.0, 274.0],
+        [3.0, 228.0, 11.0, 209.0],
+        [62.0, 13536.0, 248.0, 12619.0],
+        [33.0, 5036.0, 47.0, 5761.0],
+        [180.0, 1361.0, 372.0, 1079.0],
+        [8.0, 2537.0, 10.0, 619.0],
+        [505.0, 87886.0, 499.0, 87892.0],
+        [29.0, 7470.0, 45.0, 7232.0],
+        [17.0, 1699.0, 65.0, 1600.0],
+        [186.0, 50448.0, 141.0, 27197.0],
+        [5.0, 2493.0, 3.0, 2338.0],
+        [27.0, 16886.0, 29.0, 17825.0],
+    ];
+    trials.map(|[a, b, c, d]| Effect {
+        value: (a / (a + b) / (c / (c + d))).ln(),
+        error: (1.0 / a - 1.0 / (a + b) + 1.0 / c - 1.0 / (c + d)).sqrt(),
+    })
+}
+
 #[cfg(test)]
 mod tests {
     use super::*;
@@ -183,31 +207,12 @@ mod tests {
         close(pooled.ci95()[1] - 1.2, NORMAL_95 / 5f64.sqrt(), 1e-15);
     }
 
-    /// Thirteen trials of the BCG vaccine (G. A. Colditz et al., JAMA 271(9), 1994, 698–702), log risk ratios, as
-    /// analysed in W. Viechtbauer, "Conducting meta-analyses in R with the metafor package", J. Stat. Softw. 36(3),
+    /// The [`vaccine_trials`] as analysed in W. Viechtbauer, "Conducting meta-analyses in R with the metafor package", J. Stat. Softw. 36(3),
     /// 2010: fixed effect −0.4303 (0.0405), Q = 152.2330; DerSimonian–Laird τ² = 0.3088, I² = 92.12 %, and the
     /// random-effects estimate −0.7141 (0.1787).
     #[test]
     fn the_trials_of_a_vaccine_give_the_published_figures() {
-        let trials: [[f64; 4]; 13] = [
-            [4.0, 119.0, 11.0, 128.0],
-            [6.0, 300.0, 29.0, 274.0],
-            [3.0, 228.0, 11.0, 209.0],
-            [62.0, 13536.0, 248.0, 12619.0],
-            [33.0, 5036.0, 47.0, 5761.0],
-            [180.0, 1361.0, 372.0, 1079.0],
-            [8.0, 2537.0, 10.0, 619.0],
-            [505.0, 87886.0, 499.0, 87892.0],
-            [29.0, 7470.0, 45.0, 7232.0],
-            [17.0, 1699.0, 65.0, 1600.0],
-            [186.0, 50448.0, 141.0, 27197.0],
-            [5.0, 2493.0, 3.0, 2338.0],
-            [27.0, 16886.0, 29.0, 17825.0],
-        ];
-        let effects = trials.map(|[a, b, c, d]| Effect {
-            value: (a / (a + b) / (c / (c + d))).ln(),
-            error: (1.0 / a - 1.0 / (a + b) + 1.0 / c - 1.0 / (c + d)).sqrt(),
-        });
+        let effects = vaccine_trials();
         let fixed = mean(&effects, 0.0).unwrap();
         close(fixed.value, -0.4303, 5e-5);
         close(fixed.error, 0.0405, 5e-5);

@@ -3,6 +3,7 @@
 
 mod bad_files;
 mod blocks;
+mod files;
 mod hdf5;
 mod health;
 mod mat;

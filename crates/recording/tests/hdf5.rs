@@ -2,6 +2,7 @@
 #![cfg(feature = "hdf5")]
 // Helpers of a test file are tests too; the lint configuration knows only the annotated functions.
 
+use crate::files::{self, headers};
 use greybox_recording::{Recording, RecordingError, parse_hdf5, parse_mat, read};
 use std::path::{Path, PathBuf};
 
@@ -18,16 +19,9 @@ fn recording(name: &str) -> Recording {
     read(path(name)).unwrap_or_else(|e| panic!("{e}"))
 }
 
-fn headers(recording: &Recording) -> Vec<String> {
-    recording.channels.iter().map(|c| c.header()).collect()
-}
-
-/// The samples of all files: time, voltage and angle, to the bit as NumPy made them.
+/// The samples of all files.
 fn samples() -> [Vec<f64>; 3] {
-    let bytes = bytes("samples.bin");
-    let numbers: Vec<f64> =
-        bytes.chunks_exact(8).map(|b| f64::from_le_bytes(b.try_into().unwrap())).collect();
-    [0, 60, 120].map(|at| numbers[at..at + 60].to_vec())
+    files::samples(&bytes("samples.bin"))
 }
 
 #[track_caller]

@@ -2,6 +2,7 @@
 #![cfg(feature = "mat")]
 // Helpers of a test file are tests too; the lint configuration knows only the annotated functions.
 
+use crate::files::headers;
 use greybox_recording::{Recording, RecordingError, parse_mat};
 use std::path::Path;
 
@@ -26,10 +27,6 @@ fn is_the_experiment(recording: &Recording, v: &str, theta: &str, tolerance: f64
         assert!((v.values[k] - (3.0 * t).sin()).abs() < tolerance);
         assert!((theta.values[k] - (2.0 * t).cos()).abs() < tolerance);
     }
-}
-
-fn headers(recording: &Recording) -> Vec<String> {
-    recording.channels.iter().map(|c| c.header()).collect()
 }
 
 #[test]

@@ -8,10 +8,17 @@ use greybox_fleet::{Effect, share};
 use crate::contract::Interval;
 use crate::summary::{Level, MachineEstimate, MachinesOver, RecordingResult, Run, ShareOver, SlopeOver};
 
+/// What the table of recordings says of each, by the names of the recordings that it has.
+pub(crate) type Runs<'a> = BTreeMap<&'a str, &'a Run>;
+
+/// Of these recordings.
+pub(crate) fn runs(recordings: &[RecordingResult]) -> Runs<'_> {
+    recordings.iter().filter_map(|r| Some((r.recording.as_str(), r.run.as_ref()?))).collect()
+}
+
 /// The recordings by machine.
 pub(crate) struct Fleet<'a> {
-    /// What the table says of each recording that it has.
-    runs: BTreeMap<&'a str, &'a Run>,
+    runs: Runs<'a>,
     /// The machines, in the order of their names, and how many of their recordings were diagnosed.
     machines: BTreeMap<&'a str, usize>,
     /// Headers of the covariates.
@@ -20,8 +27,7 @@ pub(crate) struct Fleet<'a> {
 
 impl<'a> Fleet<'a> {
     pub(crate) fn of(recordings: &'a [RecordingResult]) -> Fleet<'a> {
-        let runs: BTreeMap<&str, &Run> =
-            recordings.iter().filter_map(|r| Some((r.recording.as_str(), r.run.as_ref()?))).collect();
+        let runs = runs(recordings);
         let mut machines = BTreeMap::new();
         let mut covariates: Vec<&str> = Vec::new();
         for run in runs.values() {

@@ -47,6 +47,11 @@ impl Fingerprint {
     pub(crate) fn of(name: impl Into<String>, content: &[u8]) -> Fingerprint {
         Fingerprint { name: name.into(), fnv1a: format!("{:032x}", fnv1a(content)) }
     }
+
+    /// The same content under another name.
+    pub(crate) fn called(&self, name: impl Into<String>) -> Fingerprint {
+        Fingerprint { name: name.into(), fnv1a: self.fnv1a.clone() }
+    }
 }
 
 /// The hash FNV-1a of 128 bits (G. Fowler, L. C. Noll, K.-P. Vo, <http://www.isthe.com/chongo/tech/comp/fnv/>): it tells

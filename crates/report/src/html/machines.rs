@@ -3,20 +3,11 @@
 use std::collections::BTreeMap;
 
 use super::summary::{Forest, forest, labelled};
+use crate::machines::Runs;
 use crate::page::MechanismPlot;
 use crate::sentence::recordings::probability;
-use crate::summary::{
-    Level, MachineEstimate, MachinesOver, Pooled, RecordingEstimate, RecordingResult, Run, SlopeOver,
-};
+use crate::summary::{Level, MachineEstimate, MachinesOver, Pooled, RecordingEstimate, SlopeOver};
 use crate::{expression, format, svg};
-
-/// What the table of recordings says of each.
-pub(super) type Runs<'a> = BTreeMap<&'a str, &'a Run>;
-
-/// By the names of the recordings, those that the table has.
-pub(super) fn runs(recordings: &[RecordingResult]) -> Runs<'_> {
-    recordings.iter().filter_map(|r| Some((r.recording.as_str(), r.run.as_ref()?))).collect()
-}
 
 pub(super) struct MachinesView {
     pub(super) value: String,

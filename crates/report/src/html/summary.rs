@@ -2,9 +2,10 @@
 
 use askama::Template;
 
-use super::machines::{MachinesView, Runs, runs};
+use super::machines::MachinesView;
 use super::{Assets, Common};
 use crate::contract::Verdict;
+use crate::machines::{Runs, runs};
 use crate::sentence::recordings::{place, probability};
 use crate::summary::{MechanismOver, Method, ParameterOver, Pooled, RecordingResult, Spread, Summary};
 use crate::{ReportError, expression, format, svg};
