@@ -4,11 +4,13 @@
 
 needs the wheel (`cargo xtask python-package`) and the packages of python/requirements.txt. Diagnoses COUNT short recordings
 of a cart whose friction the model leaves out, on each engine, and then once more with all of them done: the second run
-has nothing to compute, and costs what the engine and the files cost. All engines must leave the same bytes.
+has nothing to compute, and costs what the engine and the files cost. All engines must leave the same bytes. Last, the
+summary of 10 000 recordings, those of the first ones under other names, of 2500 machines.
 """
 
 import argparse
 import hashlib
+import json
 import multiprocessing
 import tempfile
 import time
@@ -59,6 +61,25 @@ def bytes_of(folder):
     for path in sorted(p for p in folder.rglob("*") if p.is_file()):
         digest.update(str(path.relative_to(folder)).encode() + b"\0" + path.read_bytes())
     return digest.hexdigest()
+
+
+def summary_of_many(results, model, machines=2500, each=4):
+    """Seconds and bytes of the summary of many recordings."""
+    measured = json.loads((results / "summary.json").read_text())["recordings"]
+    names = [f"run{k:06}.csv" for k in range(machines * each)]
+    many = [{**measured[k % len(measured)], "recording": name} for k, name in enumerate(names)]
+    temperatures = 20 + 5 * np.random.default_rng(1).standard_normal(len(names))
+    runs = {
+        "recording": names,
+        "machine": [f"M{k // each:05}" for k in range(len(names))],
+        "temperature [degC]": temperatures.round(1).tolist(),
+    }
+    statistics = fleet.Statistics(json.dumps({"recordings": many, "failed": []}))
+    start = time.perf_counter()
+    summary = fleet.conclude(statistics, model, runs=runs)
+    took = time.perf_counter() - start
+    print(f"\n{len(names)} recordings of {machines} machines: {took:.0f} s, ", end="")
+    print(f"summary.json {len(summary.to_json()) / 1e6:.1f} MB, summary.html {len(summary.report_html()) / 1e6:.2f} MB")
 
 
 @contextmanager
@@ -118,6 +139,7 @@ def main():
             rate = arguments.count / took[0] / arguments.cores
             print(f"| {engine.__name__} | {rate:.2f} | {1e3 * took[1] / arguments.count:.1f} |", flush=True)
         print("\nall engines left the same bytes" if len(left) == 1 else "\nTHE ENGINES LEFT DIFFERENT BYTES")
+        summary_of_many(folder / "threads", folder / "cart.toml")
         return len(left) != 1
 
 
