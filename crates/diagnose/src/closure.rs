@@ -612,6 +612,19 @@ second = "n*y'' + c*y' + l*(y - x) = 0"
         }
     }
 
+    /// The model with these forces on the first body beside what was found.
+    pub(crate) fn with_forces(search: &Search<'_>, found: &Found, kinds: &[&str]) -> FittedModel {
+        let first = |c: &Candidate| c.place.equations(&search.nominal().model) == ["first"];
+        let law = |kind: &&str| {
+            let is_it = |c: &&Candidate| search.library[c.mechanism].kind == *kind && first(c);
+            search.terms().find(is_it).cloned().expect(kind)
+        };
+        let laws: Vec<Candidate> = kinds.iter().map(law).collect();
+        let model = search.larger(&found.improved, &laws, laws.len(), &found.scale).unwrap();
+        assert_eq!(model.parts.len(), kinds.len());
+        model
+    }
+
     /// Kind, equation and coefficient of each term, sorted.
     fn terms(found: &Found, library: &[Mechanism], model: &Model) -> Vec<(String, String, f64)> {
         let fitted = &found.improved;
@@ -820,14 +833,7 @@ second = "n*y'' + c*y' + l*(y - x) = 0"
         let above = |kinds: &[&str], more: &dyn Fn([f64; 5]) -> [f64; 3]| {
             let search = Search::new(bodies(more, 61), &library, &crate::Quiet);
             let found = nothing(&search);
-            let first = |c: &Candidate| c.place.equations(&search.nominal().model) == ["first"];
-            let named = |kind: &&str| {
-                let is_it = |c: &&Candidate| library[c.mechanism].kind == *kind && first(c);
-                search.terms().find(is_it).cloned().expect(kind)
-            };
-            let laws: Vec<Candidate> = kinds.iter().map(named).collect();
-            let model = search.larger(&found.calibrated, &laws, laws.len(), &found.scale).unwrap();
-            assert_eq!(model.parts.len(), kinds.len());
+            let model = with_forces(&search, &found, kinds);
             let all: Vec<usize> = (0..kinds.len()).collect();
             search.unnamed_above(&model, &all, &found.scale).unwrap().0
         };

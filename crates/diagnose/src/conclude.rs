@@ -22,7 +22,7 @@ use crate::remainder::{only_variable, remainder};
 use crate::search::{Search, UNDECIDED};
 use crate::trajectory::TrajectoryEval;
 use crate::uncertainty::Uncertainty;
-use crate::verdict::{Judged, discrepancy_of, is_crowded, is_shared, outdone};
+use crate::verdict::{Judged, discrepancy_of, is_crowded, is_shared};
 
 /// Residual over the estimated noise below which the estimate was not of noise alone.
 const BELOW_NOISE: f64 = 0.8;
@@ -89,7 +89,7 @@ pub(crate) fn conclude(
             finding.stands_as(instance, &improved_model, mechanism.shape.is_some());
         });
     }
-    cast_doubt(&mut mechanisms, search, (&found, improved), &judged, (verdict, significant));
+    cast_doubt(&mut mechanisms, search, improved, &judged, significant);
     let subsets = match verdict == Verdict::MissingPhysics && believed.iter().all(|b| *b) && !found.closed {
         true => {
             let left = [&judged.alone, &judged.without]
@@ -211,24 +211,23 @@ impl Models<'_> {
 fn cast_doubt(
     mechanisms: &mut [IdentifiedMechanism],
     search: &Search<'_>,
-    (found, improved): (&Found, &FittedModel),
+    improved: &FittedModel,
     judged: &Judged,
-    (verdict, significant): (Verdict, bool),
+    significant: bool,
 ) {
     let nominal = &search.nominal().model;
-    let outdone = outdone(search, found, verdict);
     for (i, m) in mechanisms.iter_mut().enumerate() {
         // What is still missing may be what was taken for this.
         if significant
             || judged.doubts[i].is_some_and(|d| d > -UNDECIDED)
-            || outdone[i].is_some()
+            || !judged.outdone[i].is_empty()
             || is_shared(improved, &judged.shares, i)
             || is_crowded(improved, &judged.shares, i, nominal)
         {
             m.confidence = m.confidence.min(DOUBTED);
             m.alternatives.iter_mut().for_each(|a| a.confidence = a.confidence.min(DOUBTED));
         }
-        if let Some(law) = &outdone[i] {
+        if let Some(law) = judged.outdone[i].first() {
             let place = &law.candidate.place;
             let mechanism = &search.library[law.candidate.mechanism];
             m.alternatives.push(Alternative {

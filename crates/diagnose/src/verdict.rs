@@ -40,19 +40,19 @@ const EXPLAINED: f64 = 0.5;
 const SLOW_MISFIT: f64 = 1.2;
 const SLOW: f64 = 0.05;
 
-/// For each part that is named, the law without a name that does its work, or that of all parts together, better. (Beside an
+/// For each part that is named, the laws without a name that do its work, or that of all parts together, better. (Beside an
 /// error of the model and in a closure, such laws were among the candidates.)
-pub(crate) fn outdone(search: &Search<'_>, found: &Found, verdict: Verdict) -> Vec<Option<MechanismTerm>> {
+fn outdone(search: &Search<'_>, found: &Found, verdict: Verdict) -> Vec<Vec<MechanismTerm>> {
     let parts: Vec<usize> = (0..found.improved.parts.len()).collect();
     if verdict != Verdict::MissingPhysics || found.errs || found.closed {
-        return vec![None; parts.len()];
+        return vec![Vec::new(); parts.len()];
     }
     let outdoes = |parts: &[usize]| {
         let (above, law) = search.unnamed_above(&found.improved, parts, &found.scale)?;
         (above > UNDECIDED).then_some(law)
     };
     let all = if parts.len() > 1 { outdoes(&parts) } else { None };
-    parts.par_iter().map(|part| outdoes(&[*part]).or_else(|| all.clone())).collect()
+    parts.par_iter().map(|part| outdoes(&[*part]).into_iter().chain(all.clone()).collect()).collect()
 }
 
 /// A residual sum of squares over that without any mechanism.
@@ -76,6 +76,8 @@ pub(crate) struct Judged {
     pub(crate) base: f64,
     /// How far above each part the law is that casts doubt on it.
     pub(crate) doubts: Vec<Option<f64>>,
+    /// The laws without a name that do the work of each part better.
+    pub(crate) outdone: Vec<Vec<MechanismTerm>>,
 }
 
 impl Judged {
@@ -131,7 +133,15 @@ impl Judged {
         let is_imitation = (0..doubts.len()).any(|i| {
             beaten(i) && (lost[i] > CORRECTION || (0..doubts.len()).any(|j| i != j && redundant(i, j)))
         });
-        let named: Vec<bool> = improved.parts.iter().map(named).collect();
+        // Where a law of another family does its work better, not even the family of a name is known.
+        let outdone = outdone(search, found, left.verdict(improved.parts.len()));
+        let family = |part: &MechanismTerm| &library[part.candidate.mechanism].family;
+        let is_family_known = |part: &MechanismTerm, others: &[MechanismTerm]| {
+            others.iter().all(|other| family(other) == family(part))
+        };
+        let parts = improved.parts.iter().zip(&outdone);
+        let named: Vec<bool> =
+            parts.map(|(part, others)| named(part) && is_family_known(part, others)).collect();
         let by_name: f64 = shares.iter().zip(&named).filter(|s| *s.1).map(|s| s.0).sum();
         let is_series_expansion = || is_series_expansion(improved, &shares, library, left.steady, redundant);
         let verdict = match left.verdict(improved.parts.len()) {
@@ -149,7 +159,7 @@ impl Judged {
             }
             verdict => verdict,
         };
-        Judged { verdict, named, shares, left, discrepancy, alone, without, full, base, doubts }
+        Judged { verdict, named, shares, left, discrepancy, alone, without, full, base, doubts, outdone }
     }
 }
 
@@ -377,4 +387,42 @@ impl ResidualDiagnostics {
 /// What free shapes explain of a residual.
 pub(crate) fn discrepancy_of(fitted: &FittedModel, scale: &[f64]) -> Option<Discrepancy> {
     crate::discrepancy::test(fitted.at(scale))
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::built_in;
+    use crate::closure::tests::{bodies, nothing, with_forces};
+
+    /// A law without a name that does the work of names better leaves those of its own family: springs that imitate a damper
+    /// of one side are not believed, a drag that imitates a cube of the speed stands for its family.
+    #[test]
+    fn a_name_stands_where_what_outdoes_it_is_of_its_family() {
+        let library = built_in().unwrap();
+        let named = |kinds: &[&str], more: &dyn Fn([f64; 5]) -> [f64; 3]| {
+            let search = Search::new(bodies(more, 61), &library, &crate::Quiet);
+            let found = nothing(&search);
+            let improved = with_forces(&search, &found, kinds);
+            let found = Found { improved, ..found };
+            let judged = Judged::of(
+                &search,
+                &found,
+                &found.improved,
+                &found.scale,
+                (&found.calibrated, &|_| true),
+                &library,
+            );
+            let outdone: Vec<bool> = judged.outdone.iter().map(|laws| !laws.is_empty()).collect();
+            (judged.verdict, judged.named, outdone)
+        };
+        let damper = |[_, _, v, ..]: [f64; 5]| [0.1 * v.abs(), 0.0, 0.0];
+        let springs = named(&["quadratic_stiffness"], &damper);
+        assert_eq!(springs, (Verdict::Unexplained, vec![false], vec![true]));
+        let cube = |[_, _, v, ..]: [f64; 5]| [0.02 * v.powi(3), 0.0, 0.0];
+        let friction = named(&["quadratic_drag"], &cube);
+        assert_eq!(friction, (Verdict::MissingPhysics, vec![true], vec![true]));
+        let dry = |[_, _, v, ..]: [f64; 5]| [0.8 * f64::tanh(1e3 * v), 0.0, 0.0];
+        assert_eq!(named(&["coulomb_friction"], &dry), (Verdict::MissingPhysics, vec![true], vec![false]));
+    }
 }
