@@ -399,22 +399,6 @@ impl Beam {
         (self.jl + self.jeq) / self.jl
     }
 
-    /// θ'' of equation 3.21 with B_l = 0: the torque in N m beside damping, back-emf and spring, over Jeq.
-    pub(crate) fn hub_acceleration(&self, torque: f64, dtheta: f64, alpha: f64) -> f64 {
-        let back_emf = self.kg * self.km / self.volts_per_torque() * dtheta;
-        (torque - back_emf - self.beq * dtheta + self.ks * alpha) / self.jeq
-    }
-
-    /// ks/Jl, 1/s².
-    pub(crate) fn spring_over_link(&self) -> f64 {
-        self.ks / self.jl
-    }
-
-    /// The joint of section 3.4 as Table 3.5 has it (E8, E9): Jeq = 0.00208, Beq = 0.015.
-    pub(crate) fn joint() -> Self {
-        Self { jeq: 0.00208, beq: 0.015, ..Self::consistent() }
-    }
-
     /// The spring's factor in the α-equation, ks (Jl + Jeq)/Jl.
     pub(crate) fn joint_stiffness(&self) -> f64 {
         self.ks * self.inertia_ratio()

@@ -4,12 +4,14 @@ use std::f64::consts::TAU;
 
 use anyhow::{Context, Result};
 use greybox_eso::{Design, Observer, Scheme, record};
+use greybox_simulate::rigs::{RotaryFlexibleJoint, Sampling};
 
 use super::algorithm2::{figure_3_1, figure_3_5, table_3_1, table_3_4, table_3_5};
 use super::chapter2::{Beam, photograph, relative_rms};
+use super::delayed_joint::STEP;
 use super::fixture::Fixture;
 use super::index::number;
-use super::{Check, Column, Drawing, Entry, Piece, Status, Table, joint};
+use super::{Check, Column, Drawing, Entry, Piece, Status, Table};
 use greybox_dev::figure::{Axis, Plot, Series, Style};
 
 /// Its tables and figures, in order.
@@ -150,8 +152,15 @@ const SHOWN: f64 = 10.0;
 /// The four signals of figures 3.3 and 3.4 on the virtual joint, for one minute, and how well the observer of
 /// equation 3.27 estimates the velocities.
 fn response(fixture: &Fixture, reference: impl Fn(f64) -> f64) -> Result<Piece> {
-    let run = joint::run(&Beam::joint(), reference, 60.0);
-    let (theta, alpha) = (run.column(0), run.column(1));
+    // The loop ten times as fast as the records: the thesis's controller is continuous.
+    let fast = 10;
+    let sampling = Sampling { dt: STEP / fast as f64, substeps: 1 };
+    let samples = (60.0 / sampling.dt).round() as usize + 1;
+    let run = RotaryFlexibleJoint::LINEAR.run(sampling, [0.0; 4], samples, &reference)?;
+    let column = |state: usize| -> Vec<f64> { run.states.iter().step_by(fast).map(|x| x[state]).collect() };
+    let voltage: Vec<f64> = run.voltages.iter().step_by(fast).copied().collect();
+    let (theta, alpha) = (column(0), column(1));
+    let wanted: Vec<f64> = (0..theta.len()).map(|k| reference(k as f64 * STEP)).collect();
     let mut piece = Piece::new(
         Status::VirtualRig,
         "The recordings are not public. A linear joint with the constants of Table 3.5, kp = √10 (E16) and the delay of \
@@ -165,12 +174,12 @@ fn response(fixture: &Fixture, reference: impl Fn(f64) -> f64) -> Result<Piece> 
         Check::new("alpha at 20 s, rad", alpha[20_000]),
         Check::new("largest theta, rad", largest(&theta)),
         Check::new("largest alpha, rad", largest(&alpha)),
-        Check::new("largest voltage, V", largest(&run.voltage)),
+        Check::new("largest voltage, V", largest(&voltage)),
     ]);
 
     let mut draw = |caption: &str, unit: &str, series: Vec<(&str, Style, &[f64])>| -> Result<()> {
         let curves = series.into_iter().map(|(label, style, values)| {
-            let points = values.iter().enumerate().step_by(10).map(|(k, v)| [k as f64 * joint::STEP, *v]);
+            let points = values.iter().enumerate().step_by(10).map(|(k, v)| [k as f64 * STEP, *v]);
             Series::new(label, style, points.take_while(|p| p[0] <= SHOWN).collect())
         });
         let plot = Plot {
@@ -183,15 +192,15 @@ fn response(fixture: &Fixture, reference: impl Fn(f64) -> f64) -> Result<Piece> 
         piece.figures.push(Drawing { caption: caption.into(), svg });
         Ok(())
     };
-    draw("Motor voltage.", "V_m in V", vec![("", Style::Line, &run.voltage)])?;
+    draw("Motor voltage.", "V_m in V", vec![("", Style::Line, &voltage)])?;
     draw(
         "Angle of the base and its reference.",
         "angle in rad",
-        vec![("θ", Style::Line, &theta), ("θ_d", Style::Dashed, &run.reference)],
+        vec![("θ", Style::Line, &theta), ("θ_d", Style::Dashed, &wanted)],
     )?;
     draw("Deflection of the joint.", "α in rad", vec![("", Style::Line, &alpha)])?;
-    for (name, angle, rate) in [("theta", &theta, run.column(2)), ("alpha", &alpha, run.column(3))] {
-        let observer = Observer::new(Design::thesis(), joint::STEP, Scheme::Euler)?;
+    for (name, angle, rate) in [("theta", &theta, column(2)), ("alpha", &alpha, column(3))] {
+        let observer = Observer::new(Design::thesis(), STEP, Scheme::Euler)?;
         let (mut literal, mut ahead) = (vec![[0.0; 2]; angle.len()], vec![[0.0; 2]; angle.len()]);
         let complete = record::lag_compensated(&observer, angle, None, &mut literal, &mut ahead)?;
         let estimate: Vec<f64> = literal.iter().map(|z| z[1]).collect();

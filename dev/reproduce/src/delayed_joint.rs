@@ -15,9 +15,10 @@ use rand_pcg::Pcg64Mcg;
 use rand_pcg::rand_core::SeedableRng;
 
 use super::delayed::Which;
-use super::joint::STEP;
 use super::link::Equation;
 
+/// Sample time of the thesis's records, s.
+pub(crate) const STEP: f64 = 1e-3;
 /// The joint with the constants of Table 3.5 and Coulomb friction of 0.02 N m.
 pub(crate) const RIG: RotaryFlexibleJoint = RotaryFlexibleJoint::WITH_FRICTION;
 /// a kp, N m/rad.

@@ -17,7 +17,6 @@ mod delayed_joint;
 mod duffing;
 mod fixture;
 mod index;
-mod joint;
 pub mod link;
 mod optimal;
 mod pages;
