@@ -714,6 +714,8 @@ pub fn relative_rms(estimate: &[f64], truth: &[f64]) -> f64 {
 
 #[cfg(test)]
 mod tests {
+    use greybox_simulate::rigs::RotaryFlexibleJoint;
+
     use super::*;
 
     #[test]
@@ -721,8 +723,12 @@ mod tests {
         let folder = greybox_dev::root().join("fixtures").join("thesis");
         let table = |id: &str| Fixture::read(&folder, id).unwrap();
         assert_eq!(Beam::read(&table("Table 2.2"), "truth").unwrap(), Beam::consistent());
-        let joint = Beam { jeq: 0.002084, ..Beam::joint() };
-        assert_eq!(Beam::read(&table("Table 3.3"), "truth").unwrap(), joint);
+        let joint = Beam::read(&table("Table 3.3"), "truth").unwrap();
+        assert_eq!(joint, Beam { beq: 0.015, ..Beam::consistent() });
+        let rig = RotaryFlexibleJoint::LINEAR;
+        assert_eq!([rig.link_inertia, rig.base_damping, rig.stiffness], [joint.jl, joint.beq, joint.ks]);
+        assert!((rig.torque_per_volt * joint.volts_per_torque() - 1.0).abs() < 1e-12);
+        assert!((rig.back_emf * joint.volts_per_torque() + joint.kg * joint.km).abs() < 1e-12);
     }
 
     #[test]
