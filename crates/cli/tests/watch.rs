@@ -3,18 +3,21 @@
 
 use std::fmt::Write as _;
 use std::io::Write as _;
-use std::net::TcpListener;
-use std::process::{Child, Command, Stdio};
+use std::process::{Command, Stdio};
 use std::thread::sleep;
 use std::time::Duration;
 
 use common::Bench;
+use greybox_recording::Zone;
+use running::{Broker, Running, Watching};
 use serde_json::Value;
 
 #[allow(dead_code, reason = "not every test file uses all of it")]
 mod common;
 #[path = "common/noise.rs"]
 mod noise;
+#[path = "common/running.rs"]
+mod running;
 #[path = "common/throttle.rs"]
 mod throttle;
 
@@ -72,8 +75,62 @@ fn influx_lines_say_the_same() {
     for kind in ["changed", "settled"] {
         let (a, b) = (of(&a, kind), of(&b, kind));
         assert_eq!((a.len(), b.len()), (1, 1));
-        assert_eq!((&a[0]["name"], &a[0]["since"]), (&b[0]["name"], &b[0]["since"]));
+        assert_eq!(a[0]["name"], b[0]["name"]);
+        let since = Zone::Offset(0).date(0, a[0]["since"].as_f64().unwrap()).unwrap();
+        assert_eq!(b[0]["since"], since);
     }
+}
+
+/// Rows whose times are dates: those of the events are dates too.
+#[test]
+fn dates_say_the_same() {
+    let bench = bench();
+    let samples = throttle::samples(190.0);
+    let from_csv = bench.greybox_fed(&["watch", "throttle.toml", "--json"], &throttle::csv(&samples));
+    let noon = 1_795_955_696;
+    let mut rows = "t,torque [N*m],angle [rad]\n".to_owned();
+    for [t, torque, angle] in &samples {
+        let date = Zone::Offset(3600).date(noon, *t).unwrap();
+        let _ = writeln!(rows, "{date},{torque:.5},{angle:.6}");
+    }
+    let dated = bench.greybox_fed(&["watch", "throttle.toml", "--json"], &rows);
+    let objects: Vec<String> = rows
+        .lines()
+        .skip(1)
+        .map(|row| {
+            let cells: Vec<&str> = row.split(',').collect();
+            format!(r#"{{"at": "{}", "torque": {}, "angle": {}}}"#, cells[0], cells[1], cells[2])
+        })
+        .collect();
+    let arguments = ["watch", "throttle.toml", "--json", "--map", "t=at"];
+    assert_eq!(bench.greybox_fed(&arguments, &objects.join("\n")).stdout, dated.stdout);
+    let (a, b) = (events(&from_csv.stdout), events(&dated.stdout));
+    assert_eq!(a.len(), b.len());
+    for (mut a, b) in a.into_iter().zip(b) {
+        for key in ["t", "since"] {
+            if let Some(t) = a[key].as_f64() {
+                a[key] = Zone::Offset(3600).date(noon, t).into();
+            }
+        }
+        assert_eq!(a, b);
+    }
+    // The same clock, anywhere: nothing jumps where the first seconds end.
+    let shifted: Vec<[f64; 3]> = samples[..7000].iter().map(|[t, u, y]| [t + 12.34, *u, *y]).collect();
+    let shifted = bench.greybox_fed(&["watch", "throttle.toml", "--json"], &throttle::csv(&shifted));
+    let kinds: Vec<Value> = events(&shifted.stdout).into_iter().map(|e| e["event"].clone()).collect();
+    assert!(
+        kinds.len() > 10 && kinds[0] == "learned" && kinds[1..].iter().all(|k| k == "estimates"),
+        "{kinds:?}"
+    );
+    let words = bench.greybox_fed(&["watch", "throttle.toml"], &rows);
+    assert!(words.stdout.contains("since 2026-11-29T13:37:26.300+01:00"), "{}", words.stdout);
+
+    // A number after dates is no time of this clock.
+    let mixed = bench.greybox_fed(&["watch", "throttle.toml", "--json"], &format!("{rows}12.5,0,0\n"));
+    let unreadable = events(&mixed.stdout).pop().unwrap();
+    assert!(
+        unreadable["message"].as_str().unwrap().contains("the time is a number of seconds; those before")
+    );
 }
 
 /// JSON lines, keys within objects, other names and units, lines that cannot be read: the same events.
@@ -145,54 +202,16 @@ fn a_clock_that_jumps_in_the_first_seconds_is_reported() {
     assert!(of(&events, "changed").is_empty(), "{events:?}");
 }
 
-/// A process that ends with the test.
-struct Running(Child);
-
-impl Drop for Running {
-    fn drop(&mut self) {
-        let _ = self.0.kill();
-        let _ = self.0.wait();
-    }
-}
-
-/// A port that is free just now.
-fn free_port() -> u16 {
-    TcpListener::bind("127.0.0.1:0").unwrap().local_addr().unwrap().port()
-}
-
 /// As on the page: samples published to a real MQTT broker, `mosquitto_sub` piped into the command.
 #[test]
 fn a_broker_is_piped_into_it() {
     let bench = bench();
-    let port = free_port();
-    // (No limit to what waits: this publisher is faster than any plant.)
-    bench.write(
-        "broker.conf",
-        &format!("listener {port} 127.0.0.1\nallow_anonymous true\nmax_queued_messages 0\n"),
-    );
-    let broker =
-        Command::new("mosquitto").arg("-c").arg(bench.path("broker.conf")).stderr(Stdio::null()).spawn();
-    let Ok(broker) = broker else {
-        eprintln!("skipped: mosquitto is not installed (Debian: mosquitto, mosquitto-clients)");
-        return;
-    };
-    let _broker = Running(broker);
+    let Some(broker) = Broker::start(&bench, "allow_anonymous true") else { return };
     let samples = throttle::samples(30.0);
-    let (port, count) = (port.to_string(), samples.len().to_string());
-    let client = |program: &str, more: &[&str]| {
-        let mut command = Command::new(program);
-        command.args(["-h", "127.0.0.1", "-p", &port, "-q", "1", "-t", "plant/throttle"]).args(more);
-        command
-    };
-    // Until the broker listens.
-    for _ in 0..100 {
-        if client("mosquitto_pub", &["-n"]).stderr(Stdio::null()).status().is_ok_and(|s| s.success()) {
-            break;
-        }
-        sleep(Duration::from_millis(50));
-    }
-    let mut subscriber =
-        Running(client("mosquitto_sub", &["-C", &count, "-W", "60"]).stdout(Stdio::piped()).spawn().unwrap());
+    let count = samples.len().to_string();
+    let mut subscriber = Running(
+        broker.client("mosquitto_sub", &["-C", &count, "-W", "60"]).stdout(Stdio::piped()).spawn().unwrap(),
+    );
     let lines = subscriber.0.stdout.take().unwrap();
     let watch = Command::new(env!("CARGO_BIN_EXE_greybox"))
         .args(["watch", "throttle.toml", "--learn", "15", "--json"])
@@ -202,12 +221,10 @@ fn a_broker_is_piped_into_it() {
         .spawn()
         .unwrap();
     sleep(Duration::from_millis(500));
-    let mut publisher = Running(client("mosquitto_pub", &["-l"]).stdin(Stdio::piped()).spawn().unwrap());
-    let mut input = publisher.0.stdin.take().unwrap();
-    for [t, torque, angle] in &samples {
-        writeln!(input, r#"{{"t": {t}, "torque": {torque:.5}, "angle": {angle:.6}}}"#).unwrap();
-    }
-    drop(input);
+    let lines = samples
+        .iter()
+        .map(|[t, torque, angle]| format!(r#"{{"t": {t}, "torque": {torque:.5}, "angle": {angle:.6}}}"#));
+    broker.publish(&lines.collect::<Vec<_>>(), &[]);
     let output = watch.wait_with_output().unwrap();
     assert!(output.status.success());
     let piped = String::from_utf8(output.stdout).unwrap();
@@ -215,6 +232,71 @@ fn a_broker_is_piped_into_it() {
         bench.greybox_fed(&["watch", "throttle.toml", "--learn", "15", "--json"], &throttle::csv(&samples));
     assert_eq!(piped, fed.stdout);
     assert_eq!(of(&events(&piped), "learned").len(), 1);
+}
+
+/// What the same lines leave where they end.
+fn state_after(bench: &Bench, text: &str) -> (String, String) {
+    let arguments = ["watch", "throttle.toml", "--json", "--learn", "15", "--state", "fed.json"];
+    let said = bench.greybox_fed(&arguments, text);
+    assert_eq!(said.code, 0, "{}", said.stderr);
+    (said.stdout, bench.read("fed.json"))
+}
+
+/// The machine falls silent, and the watch is killed: the file has everything that came.
+#[test]
+fn a_kill_in_the_silence_loses_nothing() {
+    let bench = bench();
+    let text = throttle::csv(&throttle::samples(20.03));
+    let (_, state) = state_after(&bench, &text);
+    let mut watching = Watching::start(&bench, &["--learn", "15", "--state", "state.json"]);
+    // (The input stays open.)
+    let mut input = watching.input.take().unwrap();
+    input.write_all(text.as_bytes()).unwrap();
+    input.flush().unwrap();
+    watching.until_saved(&bench, "state.json", &state);
+    watching.process.0.kill().unwrap();
+    watching.process.0.wait().unwrap();
+    assert_eq!(bench.read("state.json"), state);
+    assert!(bench.names().iter().all(|name| !name.ends_with(".tmp")), "{:?}", bench.names());
+}
+
+/// Told to end, it saves first, and ends by the signal.
+#[cfg(unix)]
+#[test]
+fn a_watch_that_is_told_to_end_saves_its_state() {
+    use std::os::unix::process::ExitStatusExt as _;
+    for (name, number) in [("TERM", 15), ("INT", 2)] {
+        let bench = bench();
+        let text = throttle::csv(&throttle::samples(20.0));
+        let (said, _) = state_after(&bench, &text);
+        // Up to the row at which the last block ends.
+        let last = events(&said).pop().unwrap()["t"].as_f64().unwrap();
+        let text = throttle::csv(&throttle::samples(last + 0.01));
+        std::fs::remove_file(bench.path("fed.json")).unwrap();
+        let (said, state) = state_after(&bench, &text);
+        let mut watching = Watching::start(&bench, &["--learn", "15", "--state", "state.json"]);
+        let mut input = watching.input.take().unwrap();
+        input.write_all(text.as_bytes()).unwrap();
+        input.flush().unwrap();
+        for line in said.lines() {
+            assert_eq!(watching.next().0, line);
+        }
+        let id = watching.process.0.id().to_string();
+        assert!(Command::new("kill").args(["-s", name, &id]).status().unwrap().success());
+        let status = watching.process.0.wait().unwrap();
+        assert_eq!(status.signal(), Some(number));
+        assert_eq!(bench.read("state.json"), state);
+    }
+}
+
+/// A greybox without MQTT says how to get it.
+#[cfg(not(feature = "mqtt"))]
+#[test]
+fn a_broker_needs_the_feature() {
+    let said = bench().greybox_fed(&["watch", "throttle.toml", "--from", "mqtt://u:secret@host/plant"], "");
+    assert_eq!(said.code, 2);
+    assert!(said.stderr.contains("mqtt://host:1883: this greybox was built without MQTT"), "{}", said.stderr);
+    assert!(said.stderr.contains("mosquitto_sub -L") && !said.stderr.contains("secret"));
 }
 
 #[test]

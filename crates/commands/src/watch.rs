@@ -2,28 +2,38 @@
 
 use greybox_recording::{Channel, Recording, Rename};
 use greybox_report::format;
-use greybox_watch::{Clock, Event, Options, Saved, Watch, WatchError};
+use greybox_watch::{Clock as Jump, Event, Options, Saved, Watch, WatchError};
+use serde::de::IgnoredAny;
+use serde::{Deserialize, Serialize};
 
 use crate::failure::Failure;
 use crate::loading::LoadedModel;
 
+mod clock;
 mod influx;
 mod lines;
 mod words;
 
-use lines::{LABEL, Lines};
+pub use clock::Clock;
+use lines::{Lines, Place};
+
+/// What the first seconds are called in messages.
+const LABEL: &str = "first seconds";
 
 /// Lines in which nothing could be read from which on the input is taken to be something else.
 const UNREADABLE: usize = 100;
 
-/// A watch on lines of samples: CSV with a header, or JSON objects, one a line.
+/// A watch on lines of samples: CSV with a header, JSON objects, or the Influx line protocol.
 #[derive(Debug)]
 pub struct Session {
     model: LoadedModel,
     map: Vec<Rename>,
     options: Options,
+    /// Lines, or messages, so far.
     line: u64,
     lines: Option<Lines>,
+    /// That of the samples, from the first of them on.
+    clock: Option<Clock>,
     stage: Stage,
     /// Lines one after the other that could not be read.
     unreadable: usize,
@@ -49,7 +59,7 @@ enum Added {
     More,
     Enough,
     /// The clock jumped: they begin anew.
-    Restarted(Clock),
+    Restarted(Jump),
 }
 
 /// Share of the first seconds that is a gap: no samples are missing for so long.
@@ -61,7 +71,7 @@ impl First {
         let t = row[0];
         if let (Some(first), Some(last)) = (self.rows.first(), self.rows.last()) {
             if t < first[0] {
-                let clock = Clock { from: last[0], t };
+                let clock = Jump { from: last[0], t };
                 (self.rows, self.seconds) = (vec![row], 0.0);
                 return Added::Restarted(clock);
             }
@@ -77,15 +87,33 @@ impl First {
     }
 }
 
+/// The state of a session as data: what [`Session::new`] goes on from.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+pub struct State<W = Saved> {
+    /// The clock of its samples.
+    #[serde(default)]
+    clock: Clock,
+    /// The state of the watch.
+    #[serde(flatten)]
+    watch: W,
+}
+
 /// One thing that a session says.
 #[derive(Debug, Clone, PartialEq)]
 pub enum Output {
     /// Of the machine.
-    Event(Event),
+    Event {
+        /// What has happened; its times are seconds of the clock.
+        event: Event,
+        /// The clock of the samples.
+        clock: Clock,
+    },
     /// A line could not be read; it is passed over.
     Unreadable {
-        /// Its number.
+        /// Its number, or that of its message.
         line: u64,
+        /// The topic of its message.
+        topic: Option<String>,
         /// Why.
         message: String,
     },
@@ -100,16 +128,18 @@ impl Session {
         model: LoadedModel,
         map: &[Rename],
         options: Options,
-        saved: Option<Saved>,
+        saved: Option<State>,
     ) -> Result<Session, Failure> {
         options.check().map_err(|e| failure(&model, e))?;
-        let stage = match saved {
-            Some(saved) => Stage::Watching(Box::new(
-                Watch::restore(&model.model, saved).map_err(|e| failure(&model, e))?,
-            )),
-            None => Stage::Learning(First::default()),
+        let (clock, stage) = match saved {
+            Some(State { clock, watch }) => {
+                let watch = Watch::restore(&model.model, watch).map_err(|e| failure(&model, e))?;
+                (Some(clock), Stage::Watching(Box::new(watch)))
+            }
+            None => (None, Stage::Learning(First::default())),
         };
-        Ok(Session { model, map: map.to_vec(), options, line: 0, lines: None, stage, unreadable: 0 })
+        let map = map.to_vec();
+        Ok(Session { model, map, options, line: 0, lines: None, clock, stage, unreadable: 0 })
     }
 
     /// Takes the next line.
@@ -122,10 +152,10 @@ impl Session {
         if text.trim().is_empty() {
             return Ok(Vec::new());
         }
-        let model = &self.model.model;
+        let (model, place) = (&self.model.model, Place { topic: None, line: self.line });
         match &self.lines {
             None => {
-                let lines = Lines::new(model, &self.map, text, self.line)?;
+                let lines = Lines::new(model, &self.map, text, place)?;
                 let sample = lines.begins_with_a_sample();
                 self.lines = Some(lines);
                 if !sample {
@@ -133,21 +163,46 @@ impl Session {
                 }
             }
             Some(lines) if lines.may_be_a_header(text) => {
-                if let Ok(again) = Lines::new(model, &self.map, text, self.line) {
+                if let Ok(again) = Lines::new(model, &self.map, text, place) {
                     self.lines = Some(again);
                     return Ok(Vec::new());
                 }
             }
             Some(_) => {}
         }
-        self.sample(text)
+        self.sample(text, None)
     }
 
-    /// The state of the watch, where it has learned.
-    pub fn saved(&self) -> Option<&Saved> {
+    /// Takes the next message of a broker: JSON objects, or lines of the Influx protocol.
+    ///
+    /// # Errors
+    /// Bad input, as of lines.
+    pub fn message(&mut self, topic: &str, payload: &str) -> Result<Vec<Output>, Failure> {
+        self.line += 1;
+        if self.lines.is_none() {
+            let place = Place { topic: Some(topic), line: self.line };
+            self.lines = Some(Lines::new(&self.model.model, &self.map, payload, place)?);
+        }
+        // (An object may stand on several lines; lines of the protocol come many in a message.)
+        let object =
+            payload.trim_start().starts_with('{') && serde_json::from_str::<IgnoredAny>(payload).is_ok();
+        if object {
+            return self.sample(payload, Some(topic));
+        }
+        let mut outputs = Vec::new();
+        for text in payload.lines().filter(|text| !text.trim().is_empty()) {
+            outputs.append(&mut self.sample(text, Some(topic))?);
+        }
+        Ok(outputs)
+    }
+
+    /// The state, where it has learned.
+    pub fn state(&self) -> Option<State<&Saved>> {
         match &self.stage {
             Stage::Learning(_) => None,
-            Stage::Watching(watch) => Some(watch.saved()),
+            Stage::Watching(watch) => {
+                Some(State { clock: self.clock.unwrap_or_default(), watch: watch.saved() })
+            }
         }
     }
 
@@ -158,15 +213,25 @@ impl Session {
     pub fn end(&self) -> Result<(), Failure> {
         let Stage::Learning(First { seconds, .. }) = &self.stage else { return Ok(()) };
         Err(Failure::input(format!(
-            "{LABEL}: the samples ended after {} s, before the {} s from which is learned what is usual",
+            "the samples ended after {} s, before the {} s from which is learned what is usual",
             format::number(*seconds),
             format::number(self.options.learn)
         ))
         .help("send more samples, or learn from fewer seconds: `--learn SECONDS`"))
     }
 
-    fn sample(&mut self, text: &str) -> Result<Vec<Output>, Failure> {
-        let row = match self.lines.as_ref().map_or(Ok(None), |lines| lines.row(text, self.line)) {
+    /// The seconds on the clock of the samples, and the columns of a line.
+    fn row(&mut self, text: &str, place: Place<'_>) -> Result<Option<Vec<f64>>, String> {
+        let Some(lines) = &self.lines else { return Ok(None) };
+        let Some((stamp, values)) = lines.row(text, place)? else { return Ok(None) };
+        let clock = self.clock.get_or_insert_with(|| Clock::of(&stamp));
+        let t = clock.read(&stamp).map_err(|e| format!("{place}: {e}"))?;
+        Ok(Some(std::iter::once(t).chain(values).collect()))
+    }
+
+    fn sample(&mut self, text: &str, topic: Option<&str>) -> Result<Vec<Output>, Failure> {
+        let line = self.line;
+        let row = match self.row(text, Place { topic, line }) {
             Ok(Some(row)) => row,
             Ok(None) => return Ok(Vec::new()),
             Err(message) => {
@@ -175,27 +240,34 @@ impl Session {
                     return Err(Failure::input(format!(
                         "{UNREADABLE} lines one after the other cannot be read; the last: {message}"
                     ))
-                    .help("send CSV with a header, or one JSON object a line with the time as `t`"));
+                    .help(match topic {
+                        None => "send CSV with a header, or one JSON object a line with the time as `t`",
+                        Some(_) => {
+                            "subscribe to the topic of the samples alone: JSON objects with the time as `t`, or lines of \
+                             the Influx protocol"
+                        }
+                    }));
                 }
-                return Ok(vec![Output::Unreadable { line: self.line, message }]);
+                return Ok(vec![Output::Unreadable { line, topic: topic.map(str::to_owned), message }]);
             }
         };
         self.unreadable = 0;
-        match &mut self.stage {
+        let events = match &mut self.stage {
             Stage::Watching(watch) => {
                 let inputs = self.model.model.inputs.len();
-                let events = watch.push(row[0], &row[1..=inputs], &row[1 + inputs..]);
-                Ok(events.into_iter().map(Output::Event).collect())
+                watch.push(row[0], &row[1..=inputs], &row[1 + inputs..])
             }
             Stage::Learning(first) => match first.add(row, self.options.learn) {
-                Added::More => Ok(Vec::new()),
-                Added::Restarted(clock) => Ok(vec![Output::Event(Event::Restarted(clock))]),
-                Added::Enough => self.learn(),
+                Added::More => Vec::new(),
+                Added::Restarted(clock) => vec![Event::Restarted(clock)],
+                Added::Enough => self.learn()?,
             },
-        }
+        };
+        let clock = self.clock.unwrap_or_default();
+        Ok(events.into_iter().map(|event| Output::Event { event, clock }).collect())
     }
 
-    fn learn(&mut self) -> Result<Vec<Output>, Failure> {
+    fn learn(&mut self) -> Result<Vec<Event>, Failure> {
         let (Stage::Learning(First { rows, .. }), Some(lines)) = (&self.stage, &self.lines) else {
             return Ok(Vec::new());
         };
@@ -214,7 +286,7 @@ impl Session {
         let (watch, event) = Watch::learn(&self.model.model, &recording, &self.options)
             .map_err(|e| failure(&self.model, e))?;
         self.stage = Stage::Watching(Box::new(watch));
-        Ok(vec![Output::Event(event)])
+        Ok(vec![event])
     }
 }
 

@@ -1,14 +1,15 @@
 //! Reading and writing CSV files.
 //!
-//! UTF-8, comma separated, one header row; the first column is the time `t` in seconds (`t [ms]` and `t [us]`
-//! are converted). A header cell is `name` or `name [unit]`. An empty cell is a missing sample. A byte order
+//! UTF-8, comma separated, one header row; the first column is the time `t` in seconds (`t [ms]`, `t [us]`
+//! and `t [ns]` are converted), or dates, which count from the whole second of the first one. A header cell is `name` or `name [unit]`. An empty cell is a missing sample. A byte order
 //! mark, quoted cells, CRLF line ends and empty lines at the end are tolerated; everything else is an error
 //! that names the cell.
 
 use crate::error::{Place, RecordingError};
 use crate::file::{self, check_file, unread};
-use crate::header::{header_cell, seconds};
+use crate::header::{exponent, header_cell};
 use crate::recording::{Channel, Recording};
+use crate::stamp::{Stamp, Zone, scale};
 use ::csv::{ByteRecord, ReaderBuilder, WriterBuilder};
 use std::fs;
 use std::io::{BufRead, BufReader, Read, Write};
@@ -58,6 +59,7 @@ pub struct CsvBlocks {
     next: Vec<u8>,
     next_rows: usize,
     before: u64,
+    times: Times,
     /// Last time of the block before, s.
     last: Option<f64>,
     over: bool,
@@ -82,6 +84,7 @@ impl CsvBlocks {
             next: Vec::new(),
             next_rows: 0,
             before: 0,
+            times: Times::default(),
             last: None,
             over: false,
         };
@@ -124,7 +127,8 @@ impl CsvBlocks {
             text.append(&mut self.next);
             self.next_rows = 0;
         }
-        let recording = parse(&text, &self.label, &self.name, self.before - self.header_lines)?;
+        let above = self.before - self.header_lines;
+        let recording = parse_on(&text, &self.label, &self.name, above, &mut self.times)?;
         if let (Some(previous), Some(&found)) = (self.last, recording.time.first())
             && found <= previous
         {
@@ -201,13 +205,7 @@ pub fn write_csv_file(
     let failed = |source| RecordingError::Io { place: Place::file(&label), action: "written", source };
     let mut bytes = Vec::new();
     write(&mut bytes, &label, time, columns)?;
-    let mut beside = path.as_os_str().to_owned();
-    beside.push(format!(".{}.tmp", std::process::id()));
-    fs::write(&beside, &bytes).and_then(|()| fs::rename(&beside, path)).map_err(|source| {
-        // The temporary file may not exist; the first error is the one to report.
-        let _ = fs::remove_file(&beside);
-        failed(source)
-    })
+    file::write_whole(path, &bytes).map_err(failed)
 }
 
 fn write(
@@ -294,6 +292,17 @@ impl Source<'_> {
 
 /// Parses a header and rows; `above` lines of the file stand before them.
 pub(crate) fn parse(bytes: &[u8], label: &str, name: &str, above: u64) -> Result<Recording, RecordingError> {
+    parse_on(bytes, label, name, above, &mut Times::default())
+}
+
+/// The same where rows of the file may have been parsed before.
+fn parse_on(
+    bytes: &[u8],
+    label: &str,
+    name: &str,
+    above: u64,
+    times: &mut Times,
+) -> Result<Recording, RecordingError> {
     let text = check_text(bytes, label, above)?;
     let source = Source { text, label, above };
     let mut reader = ReaderBuilder::new().has_headers(false).flexible(true).from_reader(text);
@@ -335,12 +344,11 @@ pub(crate) fn parse(bytes: &[u8], label: &str, name: &str, above: u64) -> Result
         }
         for (c, cell) in record.iter().enumerate() {
             let cell = cell.trim_ascii();
-            let value = match number(cell) {
-                Some(value) => value,
-                None => {
-                    let name = if c == 0 { "t" } else { header.columns[c - 1].0.as_str() };
-                    return Err(bad_cell(cell, c, source.place(&record).column(c, name)));
-                }
+            let value = match c {
+                0 => times.read(cell, header.time_exponent, || source.place(&record).column(0, "t"))?,
+                _ => number(cell).ok_or_else(|| {
+                    bad_cell(cell, c, source.place(&record).column(c, &header.columns[c - 1].0))
+                })?,
             };
             columns[c].push(value);
         }
@@ -353,7 +361,6 @@ pub(crate) fn parse(bytes: &[u8], label: &str, name: &str, above: u64) -> Result
         };
         let time = &mut columns[0];
         let last = time.len() - 1;
-        time[last] *= header.time_scale;
         if last > 0 && time[last] <= time[last - 1] {
             return Err(RecordingError::TimeNotIncreasing {
                 place: source.place(&record).column(0, "t"),
@@ -384,8 +391,32 @@ pub(crate) fn parse(bytes: &[u8], label: &str, name: &str, above: u64) -> Result
         .zip(columns)
         .map(|((name, unit), values)| Channel { name, unit, values })
         .collect();
-    let resolution = decimals.map_or(0.0, |d| header.time_scale * 10f64.powi(-d));
+    let resolution = decimals.map_or(0.0, |d| scale(header.time_exponent) * 10f64.powi(-d));
     Recording::assemble(label, name, time, channels, resolution)
+}
+
+/// How the times of a file are read: dates count from the whole second of the first one.
+#[derive(Debug, Default)]
+struct Times {
+    first: Option<Stamp>,
+}
+
+impl Times {
+    /// The time in a cell, in seconds; NaN for an empty one.
+    fn read(&mut self, cell: &[u8], exponent: i32, place: impl Fn() -> Place) -> Result<f64, RecordingError> {
+        let (value, stamp) = match (number(cell), std::str::from_utf8(cell).ok().and_then(Stamp::date)) {
+            (Some(value), _) if value.is_nan() => return Ok(value),
+            (Some(value), _) => (value * scale(exponent), Stamp::number(0.0)),
+            (None, Some(date)) => (f64::NAN, date),
+            (None, None) => return Err(bad_cell(cell, 0, place())),
+        };
+        let first = self.first.get_or_insert(stamp);
+        if !first.zone.is_as(stamp.zone) {
+            let found = String::from_utf8_lossy(cell).into_owned();
+            return Err(RecordingError::TimesDiffer { place: place(), found });
+        }
+        Ok(if stamp.zone == Zone::Seconds { value } else { stamp.after(first.seconds) })
+    }
 }
 
 /// Drops the byte order mark and makes sure that the rest is UTF-8 text.
@@ -418,8 +449,8 @@ fn is_blank(record: &ByteRecord) -> bool {
 
 #[derive(Debug, Clone)]
 struct Header {
-    /// Seconds per unit of the time column.
-    time_scale: f64,
+    /// Power of ten of the unit of the time column: −3 for milliseconds.
+    time_exponent: i32,
     /// Name and unit of every column after the time.
     columns: Vec<(String, Option<String>)>,
 }
@@ -457,9 +488,9 @@ fn header(record: &ByteRecord, place: &Place, text: &[u8]) -> Result<Header, Rec
     let time_column =
         |help: String| RecordingError::TimeColumn { place: place.clone(), found: first.clone(), help };
     let time = header_cell(&first, || place.clone().column(0, &first));
-    let time_scale = match &time {
-        Ok((name, unit)) if name == "t" => match seconds(unit.as_deref()) {
-            Some(scale) => scale,
+    let time_exponent = match &time {
+        Ok((name, unit)) if name == "t" => match exponent(unit.as_deref()) {
+            Some(exponent) => exponent,
             None => {
                 let unit = unit.as_deref().unwrap_or_default();
                 return Err(time_column(format!("convert the times from {unit} to s")));
@@ -486,7 +517,7 @@ fn header(record: &ByteRecord, place: &Place, text: &[u8]) -> Result<Header, Rec
             });
         }
     }
-    Ok(Header { time_scale, columns: parsed.into_iter().skip(1).collect() })
+    Ok(Header { time_exponent, columns: parsed.into_iter().skip(1).collect() })
 }
 
 /// The number in a cell; NaN for an empty cell, `None` for anything that is not a finite number.
@@ -504,7 +535,7 @@ fn printed_decimals(cell: &[u8]) -> Option<i32> {
         return None;
     }
     let point = cell.iter().position(|&b| b == b'.');
-    Some(point.map_or(0, |p| (cell.len() - p - 1) as i32))
+    Some(point.map_or(0, |p| cell[p + 1..].iter().take_while(|b| b.is_ascii_digit()).count() as i32))
 }
 
 fn bad_cell(cell: &[u8], c: usize, place: Place) -> RecordingError {
@@ -525,7 +556,7 @@ fn bad_cell(cell: &[u8], c: usize, place: Place) -> RecordingError {
     let help = if open_quote {
         "a quotation mark opens there and does not close in its line: remove it"
     } else if c == 0 {
-        "write the time as a number of seconds"
+        "write the time as a number of seconds, or as a date such as `2026-11-29T12:34:56.789Z`"
     } else {
         "write a number, or leave the cell empty for a missing sample"
     };
@@ -572,6 +603,32 @@ mod tests {
     fn cells_read_back_exactly() {
         for value in [0.0, -0.0, 1.0 / 3.0, 1e-24, -2.5e300, 610.3516, f64::MIN_POSITIVE] {
             assert_eq!(cell(value).parse::<f64>().unwrap().to_bits(), value.to_bits());
+        }
+    }
+
+    /// Dates count from the whole second of the first one, in a file as in its blocks.
+    #[test]
+    fn times_may_be_dates() {
+        let rows = |k: u32| format!("2026-11-29T13:34:{:02}.{:03}+01:00,{k}\n", 56 + k / 50, 20 * (k % 50));
+        let text = format!("t,y\n{}", (5..105).map(rows).collect::<String>());
+        let recording = parse_csv(text.as_bytes(), "f.csv").unwrap();
+        assert_eq!((recording.time[0], recording.time[99]), (0.1, 2.08));
+        assert_eq!((recording.pieces.len(), recording.pieces[0].dt), (1, 0.02));
+        let file = tempfile::NamedTempFile::new().unwrap();
+        fs::write(file.path(), &text).unwrap();
+        let blocks = CsvBlocks::open(file.path(), 40).unwrap().map(|block| block.unwrap().time);
+        assert_eq!(blocks.collect::<Vec<_>>().concat(), recording.time);
+        for (row, part) in [
+            ("7.5,1", "`7.5` is no time like those before it"),
+            ("2026-11-29T13:40:00,1", "is no time like those before it"),
+            ("soon,1", "`soon` is not a number; write the time as a number of seconds, or as a date"),
+            (",1", "the time is missing"),
+            ("2026-11-29T13:34:56Z,1", "does not come after"),
+        ] {
+            // (The row of 13:34 UTC is an hour after those of 13:34 +01:00; what comes next is before it.)
+            let last = if part.starts_with("does") { rows(104) } else { String::new() };
+            let said = parse_csv(format!("{text}{row}\n{last}").as_bytes(), "f.csv").unwrap_err().to_string();
+            assert!(said.contains(part) && said.contains("f.csv:10"), "{said}");
         }
     }
 }

@@ -224,6 +224,16 @@ pub enum RecordingError {
         /// The cell.
         place: Place,
     },
+    /// A date among numbers, a number among dates, or an offset from UTC at some of the dates alone.
+    #[error(
+        "{place}: `{found}` is no time like those before it; write all as numbers, or all as dates of one kind"
+    )]
+    TimesDiffer {
+        /// The cell.
+        place: Place,
+        /// The cell as written.
+        found: String,
+    },
     /// The time repeats or runs backwards.
     #[error(
         "{place}: the time {found} s does not come after the time {previous} s of the row before; {help}"
@@ -426,6 +436,7 @@ impl RecordingError {
             | Self::NotFinite { place, .. }
             | Self::Scale { place, .. }
             | Self::MissingTime { place }
+            | Self::TimesDiffer { place, .. }
             | Self::TimeNotIncreasing { place, .. }
             | Self::TooFewRows { place, .. }
             | Self::NoUsablePiece { place, .. }

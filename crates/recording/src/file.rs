@@ -38,6 +38,20 @@ pub(crate) fn check_file(path: &Path) -> Result<(String, String), RecordingError
     Ok((label, name))
 }
 
+/// Writes a file whole or not at all: beside its place under a temporary name, which is then renamed.
+///
+/// # Errors
+/// What the system says; then the file is as it was.
+pub fn write_whole(path: impl AsRef<Path>, bytes: impl AsRef<[u8]>) -> std::io::Result<()> {
+    let path = path.as_ref();
+    let mut beside = path.as_os_str().to_owned();
+    beside.push(format!(".{}.tmp", std::process::id()));
+    fs::write(&beside, bytes).and_then(|()| fs::rename(&beside, path)).inspect_err(|_| {
+        // (The temporary file may not exist; the first error is the one to report.)
+        let _ = fs::remove_file(&beside);
+    })
+}
+
 /// Whether it is a device, of which some never end. (A pipe is none: `<(zcat run.csv.gz)` may be read.)
 pub fn is_device(kind: fs::FileType) -> bool {
     #[cfg(unix)]

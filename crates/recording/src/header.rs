@@ -7,14 +7,21 @@ use crate::error::{Place, RecordingError};
 #[cfg(any(feature = "mat", feature = "parquet"))]
 pub(crate) const TIMES: [&str; 5] = ["t", "time", "Time", "tout", "timestamp"];
 
-/// Seconds per unit of a time; `None` for a unit that times do not have.
-pub(crate) fn seconds(unit: Option<&str>) -> Option<f64> {
+/// Power of ten of a unit of time, in seconds; `None` for a unit that times do not have.
+pub(crate) fn exponent(unit: Option<&str>) -> Option<i32> {
     match unit {
-        None | Some("s") => Some(1.0),
-        Some("ms") => Some(1e-3),
-        Some("us" | "µs" | "μs") => Some(1e-6),
+        None | Some("s") => Some(0),
+        Some("ms") => Some(-3),
+        Some("us" | "µs" | "μs") => Some(-6),
+        Some("ns") => Some(-9),
         Some(_) => None,
     }
+}
+
+/// Seconds per unit of a time; `None` for a unit that times do not have.
+#[cfg(any(feature = "mat", feature = "mcap", feature = "parquet"))]
+pub(crate) fn seconds(unit: Option<&str>) -> Option<f64> {
+    exponent(unit).map(crate::stamp::scale)
 }
 
 /// `name` or `name [unit]`. A bracket before the last one belongs to the name.

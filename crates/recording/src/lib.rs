@@ -80,6 +80,7 @@ mod rename;
 mod selection;
 pub mod smooth;
 mod spectrum;
+mod stamp;
 #[cfg(feature = "mat")]
 mod variables;
 
@@ -87,7 +88,7 @@ pub use crate::character::{Character, character};
 pub use crate::correlation::Correlation;
 pub use crate::csv::{CsvBlocks, CsvLines, parse_csv, read_csv, write_csv, write_csv_file};
 pub use crate::error::{Place, RecordingError};
-pub use crate::file::{content, is_device};
+pub use crate::file::{content, is_device, write_whole};
 pub use crate::finding::{Finding, Severity, listed};
 #[cfg(feature = "hdf5")]
 pub use crate::hdf5::parse_hdf5;
@@ -103,3 +104,4 @@ pub use crate::read::{EXTENSIONS, parse, read, read_selected};
 pub use crate::recording::{Channel, MIN_SAMPLES, Piece, Recording, SIZES};
 pub use crate::rename::{Rename, RenameError};
 pub use crate::selection::Selection;
+pub use crate::stamp::{ROOM, Stamp, Zone};

@@ -140,7 +140,7 @@ pub(crate) fn learn(model: &Model, recording: &Recording, options: &Options) -> 
     let setup = fitted.at.setup;
     let indices = setup.free.iter().map(|f| f.index).collect();
     let machine = Machine::new(model.clone(), setup.system.clone(), usual.steps.method(), indices);
-    Ok(First { machine, usual, start: (x, deviations), samples: samples(&data) })
+    Ok(First { machine, usual, start: (x, deviations), samples: samples(&data, recording.time[0]) })
 }
 
 fn usual(fitted: &Fitted, noise: &[RateNoise], weight: f64) -> Usual {
@@ -181,12 +181,13 @@ fn usual(fitted: &Fitted, noise: &[RateNoise], weight: f64) -> Usual {
     }
 }
 
-fn samples(data: &Data) -> Vec<Sample> {
+/// All samples, on the clock of the recording: its pieces count from its `first` time.
+fn samples(data: &Data, first: f64) -> Vec<Sample> {
     data.pieces
         .iter()
         .flat_map(|piece| {
             (0..piece.len).map(|k| Sample {
-                t: piece.start + piece.dt * k as f64,
+                t: first + piece.start + piece.dt * k as f64,
                 inputs: piece.inputs.iter().map(|u| u[k]).collect(),
                 measured: piece.measured.iter().map(|y| Some(y[k]).filter(|v| v.is_finite())).collect(),
             })

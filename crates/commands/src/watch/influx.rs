@@ -7,6 +7,8 @@
 //!
 //! The timestamp is in nanoseconds since 1970. Only numbers and truth values are read; tags are passed over.
 
+use greybox_recording::{Stamp, Zone};
+
 /// A line: its measurement, the fields that are numbers (others are `None`), and its time in nanoseconds.
 #[derive(Debug, PartialEq)]
 pub(super) struct Line {
@@ -125,12 +127,12 @@ pub(super) fn parse(text: &str) -> Result<Line, String> {
 }
 
 impl Line {
-    /// Time in seconds and the values of `keys`, each `field` or `measurement.field`; NaN for one that is not there, and
-    /// `None` where none of them is.
+    /// Time and the values of `keys`, each `field` or `measurement.field`; NaN for one that is not there, and `None` where
+    /// none of them is.
     ///
     /// # Errors
     /// No timestamp, or a text in the place of a number.
-    pub(super) fn row(&self, keys: &[String]) -> Result<Option<Vec<f64>>, String> {
+    pub(super) fn row(&self, keys: &[String]) -> Result<Option<(Stamp, Vec<f64>)>, String> {
         let of = |key: &String| {
             let inner = key.strip_prefix(&self.measurement).and_then(|rest| rest.strip_prefix('.'));
             self.fields.iter().find(|(name, _)| name == key || Some(name.as_str()) == inner)
@@ -140,17 +142,13 @@ impl Line {
             return Ok(None);
         }
         let nanoseconds = self.timestamp.ok_or("there is no timestamp, in nanoseconds")?;
-        // (A double has no room for nanoseconds since 1970.)
-        let (seconds, rest) = (nanoseconds.div_euclid(1_000_000_000), nanoseconds.rem_euclid(1_000_000_000));
-        let mut row = vec![seconds as f64 + rest as f64 / 1e9];
-        for field in found {
-            row.push(match field {
-                None => f64::NAN,
-                Some((_, Some(value))) => *value,
-                Some((name, None)) => return Err(format!("`{name}` is a text, not a number")),
-            });
-        }
-        Ok(Some(row))
+        let values = found.into_iter().map(|field| match field {
+            None => Ok(f64::NAN),
+            Some((_, Some(value))) => Ok(*value),
+            Some((name, None)) => Err(format!("`{name}` is a text, not a number")),
+        });
+        let stamp = Stamp::count(nanoseconds.into(), 1_000_000_000, Zone::Offset(0));
+        Ok(Some((stamp, values.collect::<Result<_, _>>()?)))
     }
 }
 
@@ -160,7 +158,8 @@ mod tests {
 
     fn row(text: &str, keys: &[&str]) -> Result<Option<Vec<f64>>, String> {
         let keys: Vec<String> = keys.iter().map(|key| (*key).to_owned()).collect();
-        parse(text)?.row(&keys)
+        let found = parse(text)?.row(&keys)?;
+        Ok(found.map(|(time, values)| std::iter::once(time.after(0)).chain(values).collect()))
     }
 
     /// The lines of the documentation of the protocol, and what it says of escapes.
@@ -175,6 +174,10 @@ mod tests {
         assert_eq!(row(line, &["motor angle", "a=b"]), Ok(Some(vec![1.0, 1e-3, 2.0])));
         let Ok(Some(part)) = row("m a=1 0", &["a", "b"]) else { panic!("a row") };
         assert!(part[1] == 1.0 && part[2].is_nan());
+        let Ok(Some((time, _))) = parse("m a=1 1556813561123456789").unwrap().row(&["a".to_owned()]) else {
+            panic!("a row")
+        };
+        assert_eq!((time.after(1_556_813_561), time.zone), (0.123_456_789, Zone::Offset(0)));
         // A line of something else is none.
         assert_eq!(row("cpu usage=3 0", &["throttle.angle"]), Ok(None));
         assert_eq!(row("cpu angle=3 0", &["throttle.angle"]), Ok(None));

@@ -1,15 +1,36 @@
 //! Lines to rows: time, inputs and measurements of a model, SI.
 
+use std::fmt;
+
 use greybox_calibrate::data::recorded_unit;
 use greybox_model::{Expr, Model, Unit};
-use greybox_recording::{CsvLines, Rename, listed};
+use greybox_recording::{CsvLines, Rename, Stamp, listed};
 use serde_json::Value;
 
 use super::influx;
 use crate::failure::Failure;
 
-/// What the samples are called in messages.
-pub(super) const LABEL: &str = "standard input";
+/// Where a line came from.
+#[derive(Debug, Clone, Copy)]
+pub(super) struct Place<'a> {
+    /// The topic of a message; a line of standard input has none.
+    pub(super) topic: Option<&'a str>,
+    /// Number of the line, or of the message.
+    pub(super) line: u64,
+}
+
+impl Place<'_> {
+    pub(super) fn label(&self) -> String {
+        self.topic.map_or_else(|| "standard input".to_owned(), |topic| format!("topic `{topic}`, message"))
+    }
+}
+
+impl fmt::Display for Place<'_> {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        let between = if self.topic.is_some() { ' ' } else { ':' };
+        write!(f, "{}{between}{}", self.label(), self.line)
+    }
+}
 
 /// How lines are read: told by the first of them.
 #[derive(Debug)]
@@ -22,10 +43,18 @@ pub(super) struct Lines {
 #[derive(Debug)]
 enum Format {
     Csv(CsvLines),
-    /// Keys of the channels, in the order of the columns.
-    Json(Vec<String>),
-    /// The same.
-    Influx(Vec<String>),
+    /// JSON objects and lines of the Influx protocol.
+    Keyed(Keys),
+}
+
+/// Where objects have what is read.
+#[derive(Debug)]
+struct Keys {
+    time: String,
+    /// Power of ten of the unit of times that are numbers.
+    exponent: i32,
+    /// Of the channels, in the order of the columns.
+    channels: Vec<String>,
 }
 
 /// Where a channel stands in a line.
@@ -40,40 +69,39 @@ pub(super) struct Column {
 }
 
 impl Lines {
-    /// Reads the first line: the header of a CSV file, a JSON object, or a line of the Influx protocol.
+    /// Reads the first line: the header of a CSV file, a JSON object, or a line of the Influx protocol. A message has no
+    /// header.
     ///
     /// # Errors
     /// Bad input: a header without the model's channels, or a unit that does not fit.
-    pub(super) fn new(model: &Model, map: &[Rename], text: &str, line: u64) -> Result<Lines, Failure> {
-        let influx = influx::is_influx(text);
-        let csv = match influx || is_json(text) {
+    pub(super) fn new(model: &Model, map: &[Rename], text: &str, place: Place<'_>) -> Result<Lines, Failure> {
+        let csv = match place.topic.is_some() || influx::is_influx(text) || is_json(text) {
             true => None,
-            false => Some(CsvLines::new(text, LABEL, line)?),
+            false => Some(CsvLines::new(text, &place.label(), place.line)?),
         };
-        let (mut keys, mut columns) = (Vec::new(), Vec::new());
-        for (place, wanted) in wanted(model).into_iter().enumerate() {
+        let (mut channels, mut columns) = (Vec::new(), Vec::new());
+        for (number, wanted) in wanted(model).into_iter().enumerate() {
             let channel = wanted.channel.to_owned();
             let rename = map.iter().find(|r| r.name == channel);
             let has =
                 |name: &str| csv.as_ref().is_some_and(|csv| csv.columns().iter().any(|(n, _)| n == name));
             let (name, given) = rename.map_or((wanted.channel, None), |r| r.meant(has));
             let (index, header) = match &csv {
-                None => (place, None),
+                None => (number, None),
                 Some(csv) => {
                     let found = csv.columns().iter().position(|(n, _)| n == name);
-                    let index = found.ok_or_else(|| missing(csv, name, &channel, line))?;
+                    let index = found.ok_or_else(|| missing(csv, name, &channel, place))?;
                     (index, csv.columns()[index].1.as_deref())
                 }
             };
             let stated = header.or(given);
-            let unit = unit(model, &wanted, stated, line)?;
-            keys.push(name.to_owned());
+            let unit = unit(model, &wanted, stated, place)?;
+            channels.push(name.to_owned());
             columns.push(Column { channel, index, unit });
         }
         let format = match csv {
             Some(csv) => Format::Csv(csv),
-            None if influx => Format::Influx(keys),
-            None => Format::Json(keys),
+            None => Format::Keyed(keys(map, channels)?),
         };
         Ok(Lines { format, columns })
     }
@@ -93,25 +121,36 @@ impl Lines {
     ///
     /// # Errors
     /// What is wrong with the line, and where.
-    pub(super) fn row(&self, text: &str, line: u64) -> Result<Option<Vec<f64>>, String> {
-        let values = match &self.format {
-            Format::Csv(lines) => match lines.row(text, line).map_err(|e| e.to_string())? {
-                Some(values) => values,
-                None => return Ok(None),
-            },
-            Format::Influx(_) if text.trim().is_empty() || text.starts_with('#') => return Ok(None),
-            Format::Influx(keys) => {
-                let row = influx::parse(text).and_then(|found| found.row(keys));
-                match row.map_err(|e| format!("{LABEL}:{line}: {e}"))? {
-                    Some(values) => values,
-                    None => return Ok(None),
-                }
+    pub(super) fn row(&self, text: &str, place: Place<'_>) -> Result<Option<(Stamp, Vec<f64>)>, String> {
+        let row = match &self.format {
+            Format::Csv(lines) => lines.row(text, place.line).map_err(|e| e.to_string())?,
+            Format::Keyed(_) if text.trim().is_empty() || text.starts_with('#') => None,
+            Format::Keyed(keys) if is_json(text) => {
+                Some(from_json(text, keys).map_err(|e| format!("{place}: {e}"))?)
             }
-            Format::Json(keys) => from_json(text, keys).map_err(|e| format!("{LABEL}:{line}: {e}"))?,
+            Format::Keyed(keys) => from_influx(text, &keys.channels).map_err(|e| format!("{place}: {e}"))?,
         };
-        let columns = self.columns.iter().map(|c| c.unit.to_si(values[c.index + 1]));
-        Ok(Some(std::iter::once(values[0]).chain(columns).collect()))
+        let in_si = |values: Vec<f64>| self.columns.iter().map(|c| c.unit.to_si(values[c.index])).collect();
+        Ok(row.map(|(time, values)| (time, in_si(values))))
     }
+}
+
+/// The keys of objects; that of the time is `t`, or what `--map t=KEY` says.
+fn keys(map: &[Rename], channels: Vec<String>) -> Result<Keys, Failure> {
+    let Some(time) = map.iter().find(|r| r.name == "t") else {
+        return Ok(Keys { time: "t".to_owned(), exponent: 0, channels });
+    };
+    let exponent = match time.unit.as_deref() {
+        None | Some("s") => 0,
+        Some("ms") => -3,
+        Some("us" | "µs") => -6,
+        Some("ns") => -9,
+        Some(other) => {
+            return Err(Failure::input(format!("`--map {time}`: a time is not in [{other}]"))
+                .help("state it in s, ms, us or ns; a date has no unit"));
+        }
+    };
+    Ok(Keys { time: time.channel.clone(), exponent, channels })
 }
 
 fn is_json(text: &str) -> bool {
@@ -134,71 +173,119 @@ fn wanted(model: &Model) -> Vec<Wanted<'_>> {
     inputs.chain(measured).collect()
 }
 
-fn missing(csv: &CsvLines, name: &str, channel: &str, line: u64) -> Failure {
+fn missing(csv: &CsvLines, name: &str, channel: &str, place: Place<'_>) -> Failure {
     let available = listed(csv.columns().iter().map(|(n, _)| format!("`{n}`")).collect());
     Failure::input(format!(
-        "{LABEL}:{line}: there is no channel `{name}`, which the model needs; the header has {available}"
+        "{place}: there is no channel `{name}`, which the model needs; the header has {available}"
     ))
     .help(format!("name the channel that is `{channel}`: `--map \"{channel}=CHANNEL\"`"))
 }
 
-fn unit(model: &Model, wanted: &Wanted<'_>, stated: Option<&str>, line: u64) -> Result<Unit, Failure> {
+fn unit(model: &Model, wanted: &Wanted<'_>, stated: Option<&str>, place: Place<'_>) -> Result<Unit, Failure> {
     let channel = wanted.channel;
     let found = recorded_unit(model, stated, wanted.unit, wanted.measured)
-        .map_err(|e| Failure::input(format!("{LABEL}:{line}: channel `{channel}`: {e}")))?;
+        .map_err(|e| Failure::input(format!("{place}: channel `{channel}`: {e}")))?;
     if found.dimension.same(&wanted.unit.dimension) {
         return Ok(found);
     }
     Err(Failure::input(format!(
-        "{LABEL}:{line}: channel `{channel}` is in [{}], but the model has it in [{}]",
+        "{place}: channel `{channel}` is in [{}], but the model has it in [{}]",
         found.text, wanted.unit.text
     ))
     .help("correct the unit in the header or in the model"))
 }
 
+/// Time and values of a line of the Influx protocol.
+fn from_influx(text: &str, channels: &[String]) -> Result<Option<(Stamp, Vec<f64>)>, String> {
+    if text.trim().parse::<f64>().is_ok() {
+        return Err(format!(
+            "`{}` is a value alone: a sample has a time and all of its channels",
+            text.trim()
+        ));
+    }
+    let line = influx::parse(text);
+    line.map_err(|e| format!("this is no JSON object, nor a line of the Influx protocol: {e}"))?.row(channels)
+}
+
 /// Time and values of a JSON object; a key that is not there, or is `null`, is a missing sample. A key with points may lead
 /// into objects: `motor.angle`.
-fn from_json(text: &str, keys: &[String]) -> Result<Vec<f64>, String> {
+fn from_json(text: &str, keys: &Keys) -> Result<(Stamp, Vec<f64>), String> {
     let object: Value = serde_json::from_str(text).map_err(|e| format!("this is no JSON object: {e}"))?;
     let find = |key: &str| {
         object.get(key).or_else(|| key.split('.').try_fold(&object, |inner, part| inner.get(part)))
     };
-    let number = |key: &str, value: &Value| match value {
-        Value::Null => Ok(f64::NAN),
-        value => value.as_f64().ok_or_else(|| format!("`{key}` is {value}, not a number")),
+    let number = |key: &str| match find(key) {
+        None | Some(Value::Null) => Ok(f64::NAN),
+        Some(value) => value.as_f64().ok_or_else(|| format!("`{key}` is {value}, not a number")),
     };
-    let time = find("t").ok_or("there is no time `t`, in seconds")?;
-    let mut row = vec![number("t", time)?];
-    if row[0].is_nan() {
-        return Err("the time `t` is null".to_owned());
-    }
-    for key in keys {
-        row.push(find(key).map_or(Ok(f64::NAN), |value| number(key, value))?);
-    }
-    Ok(row)
+    let key = &keys.time;
+    let time = match find(key) {
+        None => return Err(format!("there is no time `{key}`, a number of seconds or a date")),
+        Some(Value::Null) => return Err(format!("the time `{key}` is null")),
+        Some(Value::String(text)) => Stamp::date(text),
+        // (Written out, every digit of an integer is there.)
+        Some(value) => Stamp::decimal(&value.to_string(), keys.exponent),
+    };
+    let time = time.ok_or_else(|| {
+        let found = find(key).cloned().unwrap_or_default();
+        format!("`{key}` is {found}, neither a number nor a date such as \"2026-11-29T12:34:56.789Z\"")
+    })?;
+    let values = keys.channels.iter().map(|key| number(key));
+    Ok((time, values.collect::<Result<_, _>>()?))
 }
 
 #[cfg(test)]
 mod tests {
     use super::*;
+    use greybox_recording::Zone;
+
+    fn keyed(time: &str, channels: &[&str]) -> Keys {
+        let map: Vec<Rename> = vec![format!("t={time}").parse().unwrap()];
+        keys(&map, channels.iter().map(|c| (*c).to_owned()).collect()).unwrap()
+    }
 
     #[test]
     fn a_json_object_is_a_row() {
-        let keys = ["u".to_owned(), "motor.angle".to_owned(), "not.there".to_owned()];
-        let row = from_json(r#"{"t": 2, "motor": {"angle": -1.5}, "u": null, "x": "y"}"#, &keys).unwrap();
-        assert_eq!((row[0], row[2]), (2.0, -1.5));
-        assert!(row[1].is_nan() && row[3].is_nan());
+        let keys = keyed("t", &["u", "motor.angle", "not.there"]);
+        let text = r#"{"t": 2, "motor": {"angle": -1.5}, "u": null, "x": "y"}"#;
+        let (time, row) = from_json(text, &keys).unwrap();
+        assert_eq!((time.after(0), row[1]), (2.0, -1.5));
+        assert!(row[0].is_nan() && row[2].is_nan());
         // A key that has a point of its own comes first.
-        assert_eq!(from_json(r#"{"t": 0, "a.b": 3, "a": {"b": 4}}"#, &["a.b".to_owned()]).unwrap()[1], 3.0);
+        assert_eq!(
+            from_json(r#"{"t": 0, "a.b": 3, "a": {"b": 4}}"#, &keyed("t", &["a.b"])).unwrap().1,
+            [3.0]
+        );
         for (text, part) in [
             ("{", "no JSON object"),
             ("[1]", "no time `t`"),
             ("{\"u\": 1}", "no time `t`"),
             ("{\"t\": null}", "`t` is null"),
+            ("{\"t\": true}", "`t` is true, neither a number nor a date"),
+            ("{\"t\": \"noon\"}", "`t` is \"noon\", neither a number nor a date"),
             ("{\"t\": 1, \"u\": \"x\"}", "`u` is \"x\", not a number"),
         ] {
             let said = from_json(text, &keys).unwrap_err();
             assert!(said.contains(part), "{said}");
         }
+    }
+
+    #[test]
+    fn the_time_of_an_object_may_be_a_date_or_count_in_other_units() {
+        let time = |keys: &Keys, text: &str| from_json(text, keys).unwrap().0;
+        let (keys, noon) = (keyed("t", &[]), 1_795_955_696);
+        let dated = time(&keys, r#"{"t": "2026-11-29T12:34:56.789Z"}"#);
+        assert_eq!((dated.after(noon), dated.zone), (0.789, Zone::Offset(0)));
+        for (key, text) in [
+            ("meta.at [ns]", r#"{"meta": {"at": 1795955696789123456}}"#),
+            ("ts [us]", r#"{"ts": 1795955696789123.456}"#),
+            ("ts [ms]", r#"{"ts": 1795955696789}"#),
+        ] {
+            let after = time(&keyed(key, &[]), text).after(noon);
+            // (A number with a fraction is a double in JSON.)
+            assert!((0.789..0.7892).contains(&after), "{text}: {after}");
+            assert!(!key.contains("ns") || after == 0.789_123_456);
+        }
+        assert!(super::keys(&["t=ts [min]".parse().unwrap()], Vec::new()).is_err());
     }
 }

@@ -7,15 +7,31 @@ use greybox_report::format;
 use greybox_watch::{Change, Event, Irregular, Parameter, Subject};
 use serde_json::{Value, json};
 
-use super::Output;
+use super::{Clock, Output};
+
+/// The keys of events that are times.
+const TIMES: [&str; 3] = ["t", "since", "from"];
 
 impl Output {
     /// One line for machines.
     pub fn to_json(&self) -> Value {
         match self {
-            Output::Event(event) => serde_json::to_value(event).unwrap_or_default(),
-            Output::Unreadable { line, message } => {
+            Output::Event { event, clock } => {
+                let mut value = serde_json::to_value(event).unwrap_or_default();
+                for key in TIMES {
+                    if let Some(time) = value.get_mut(key)
+                        && let Some(t) = time.as_f64()
+                    {
+                        *time = clock.value(t);
+                    }
+                }
+                value
+            }
+            Output::Unreadable { line, topic: None, message } => {
                 json!({ "event": "unreadable", "line": line, "message": message })
+            }
+            Output::Unreadable { line, topic, message } => {
+                json!({ "event": "unreadable", "topic": topic, "number": line, "message": message })
             }
         }
     }
@@ -24,13 +40,9 @@ impl Output {
     pub fn in_words(&self) -> Option<String> {
         match self {
             Output::Unreadable { message, .. } => Some(format!("passed over: {message}\n")),
-            Output::Event(event) => in_words(event),
+            Output::Event { event, clock } => in_words(event, *clock),
         }
     }
-}
-
-fn at(t: f64) -> String {
-    format!("{t:.3} s")
 }
 
 /// A value with its 95 % interval and its unit.
@@ -44,7 +56,8 @@ fn parameter(p: &Parameter) -> String {
     format!("{} = {}", p.name, value(p.value, p.std, p.unit.as_deref()))
 }
 
-fn in_words(event: &Event) -> Option<String> {
+fn in_words(event: &Event, clock: Clock) -> Option<String> {
+    let at = |t| clock.words(t);
     let mut text = String::new();
     match event {
         Event::Learned(l) => {
@@ -66,7 +79,7 @@ fn in_words(event: &Event) -> Option<String> {
             );
         }
         Event::Changed(change) => {
-            let _ = writeln!(text, "{}: {}", at(change.t), changed(change));
+            let _ = writeln!(text, "{}: {}", at(change.t), changed(change, &at(change.since)));
         }
         Event::Settled(change) => {
             let (name, since) = (subject(&change.subject), at(change.since));
@@ -118,8 +131,8 @@ fn extent(change: &Change) -> String {
 }
 
 /// The sentence of an alarm.
-fn changed(change: &Change) -> String {
-    let (since, name, extent) = (at(change.since), subject(&change.subject), extent(change));
+fn changed(change: &Change, since: &str) -> String {
+    let (name, extent) = (subject(&change.subject), extent(change));
     if change.or.is_empty() {
         return format!("{name} has changed since {since}: {extent}");
     }

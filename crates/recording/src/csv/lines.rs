@@ -2,6 +2,7 @@
 
 use super::{Header, bad_cell, cell_count, check_text, header, is_blank, number};
 use crate::error::{Place, RecordingError};
+use crate::stamp::Stamp;
 use ::csv::{ByteRecord, ReaderBuilder};
 
 /// Lines of a CSV file that is still being written: the header first, then row after row.
@@ -13,9 +14,11 @@ use ::csv::{ByteRecord, ReaderBuilder};
 /// use greybox_recording::CsvLines;
 /// let lines = CsvLines::new("t [ms],angle [deg],torque", "standard input", 1)?;
 /// assert_eq!(lines.columns()[0], ("angle".to_owned(), Some("deg".to_owned())));
-/// let row = lines.row("20,1.5,", 2)?.expect("a row");
-/// assert_eq!(row[..2], [0.02, 1.5]);           // the time in seconds, then the columns
-/// assert!(row[2].is_nan());                    // an empty cell is a missing sample
+/// let (time, row) = lines.row("20,1.5,", 2)?.expect("a row");
+/// assert_eq!((time.after(0), row[0]), (0.02, 1.5));
+/// assert!(row[1].is_nan());                    // an empty cell is a missing sample
+/// let (time, _) = lines.row("2026-11-29T12:34:56.789Z,1.5,", 2)?.expect("a row");
+/// assert_eq!(time.zone, greybox_recording::Zone::Offset(0));
 /// assert!(lines.row("", 3)?.is_none());
 /// assert!(lines.row("40,1.5", 4).is_err());
 /// # Ok::<(), greybox_recording::RecordingError>(())
@@ -43,11 +46,11 @@ impl CsvLines {
         &self.header.columns
     }
 
-    /// The time in seconds, then the value of every column (NaN = missing); `None` for a blank line.
+    /// The time, and the value of every column after it (NaN = missing); `None` for a blank line.
     ///
     /// # Errors
     /// [`RecordingError`]: another number of cells than the header has, a cell that is no number, no time.
-    pub fn row(&self, text: &str, line: u64) -> Result<Option<Vec<f64>>, RecordingError> {
+    pub fn row(&self, text: &str, line: u64) -> Result<Option<(Stamp, Vec<f64>)>, RecordingError> {
         let record = cells(text.as_bytes(), &self.label)?;
         if is_blank(&record) {
             return Ok(None);
@@ -57,20 +60,19 @@ impl CsvLines {
         if record.len() != width {
             return Err(cell_count(&record, width, place()));
         }
-        let name = |c: usize| if c == 0 { "t" } else { self.header.columns[c - 1].0.as_str() };
-        let mut row = record
-            .iter()
-            .enumerate()
-            .map(|(c, cell)| {
-                let cell = cell.trim_ascii();
-                number(cell).ok_or_else(|| bad_cell(cell, c, place().column(c, name(c))))
-            })
-            .collect::<Result<Vec<f64>, _>>()?;
-        if row[0].is_nan() {
+        let mut columns = record.iter().map(<[u8]>::trim_ascii);
+        let time = columns.next().unwrap_or_default();
+        if time.is_empty() {
             return Err(RecordingError::MissingTime { place: place().column(0, "t") });
         }
-        row[0] *= self.header.time_scale;
-        Ok(Some(row))
+        let stamp = std::str::from_utf8(time)
+            .ok()
+            .and_then(|text| Stamp::decimal(text, self.header.time_exponent).or_else(|| Stamp::date(text)))
+            .ok_or_else(|| bad_cell(time, 0, place().column(0, "t")))?;
+        let values = columns.zip(&self.header.columns).enumerate().map(|(c, (cell, (name, _)))| {
+            number(cell).ok_or_else(|| bad_cell(cell, c + 1, place().column(c + 1, name)))
+        });
+        Ok(Some((stamp, values.collect::<Result<_, _>>()?)))
     }
 }
 
@@ -108,13 +110,14 @@ mod tests {
         .unwrap();
         let mut read = text.lines();
         let lines = CsvLines::new(read.next().unwrap(), "a", 1).unwrap();
-        assert_eq!(lines.row("\"0.5\",\"1\",2\r\n", 9).unwrap().unwrap(), [0.5, 1.0, 2.0]);
+        let (time, row) = lines.row("\"0.5\",\"1\",2\r\n", 9).unwrap().unwrap();
+        assert_eq!((time.after(0), &row[..]), (0.5, &[1.0, 2.0][..]));
         for (k, line) in read.enumerate() {
-            let row = lines.row(line, k as u64 + 2).unwrap().unwrap();
-            assert_eq!(row[0], whole.time[k]);
+            let (time, row) = lines.row(line, k as u64 + 2).unwrap().unwrap();
+            assert_eq!(time.after(0), whole.time[k]);
             for (c, channel) in whole.channels.iter().enumerate() {
                 assert_eq!(channel.name, lines.columns()[c].0);
-                assert_eq!(row[c + 1].to_bits(), channel.values[k].to_bits());
+                assert_eq!(row[c].to_bits(), channel.values[k].to_bits());
             }
         }
     }

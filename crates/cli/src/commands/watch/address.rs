@@ -1,0 +1,135 @@
+//! Where messages come from: a broker and a topic, as `mosquitto_sub -L` has them.
+
+use std::str::FromStr;
+
+use percent_encoding::percent_decode_str;
+
+/// `mqtt://[user[:password]@]host[:port]/topic`.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub(crate) struct Address {
+    pub(super) host: String,
+    pub(super) port: u16,
+    pub(super) user: Option<String>,
+    pub(super) password: Option<String>,
+    pub(super) topic: String,
+}
+
+/// The port of MQTT.
+const PORT: u16 = 1883;
+/// Most bytes of a text of the protocol.
+const LONGEST: usize = 65_535;
+
+impl Address {
+    /// The broker in messages, without what is secret.
+    pub(super) fn broker(&self) -> String {
+        let between = if self.host.contains(':') { ["[", "]"] } else { ["", ""] };
+        format!("mqtt://{}{}{}:{}", between[0], self.host, between[1], self.port)
+    }
+}
+
+impl FromStr for Address {
+    type Err = String;
+
+    fn from_str(text: &str) -> Result<Address, String> {
+        const FORM: &str =
+            "write it like mqtt://broker:1883/plant/throttle, or mqtt://user:password@broker/topic";
+        if text.starts_with("mqtts://") {
+            return Err(
+                "greybox speaks no TLS: pipe `mosquitto_sub --cafile …` into it, or let a broker of \
+                        this machine be the bridge"
+                    .to_owned(),
+            );
+        }
+        let rest =
+            text.strip_prefix("mqtt://").ok_or_else(|| format!("this is no address of a broker; {FORM}"))?;
+        // (A topic is taken as it stands: `#` and `?` mean nothing else here.)
+        let (authority, topic) = rest.split_once('/').ok_or_else(|| format!("there is no topic; {FORM}"))?;
+        let (login, place) = match authority.rsplit_once('@') {
+            Some((login, place)) => (Some(login), place),
+            None => (None, authority),
+        };
+        let (host, port) = host_and_port(place).ok_or_else(|| format!("there is no host or port; {FORM}"))?;
+        let (user, password) = match login.map(|login| login.split_once(':').unwrap_or((login, ""))) {
+            None => (None, None),
+            Some((user, password)) => (Some(decoded(user)?), Some(decoded(password)?)),
+        };
+        check_topic(topic)?;
+        let password = password.filter(|p| !p.is_empty());
+        Ok(Address { host, port, user, password, topic: topic.to_owned() })
+    }
+}
+
+fn host_and_port(place: &str) -> Option<(String, u16)> {
+    let (host, port) = match place.strip_prefix('[') {
+        // An address of IPv6 has colons of its own.
+        Some(rest) => {
+            let (host, rest) = rest.split_once(']')?;
+            (host, if rest.is_empty() { None } else { Some(rest.strip_prefix(':')?) })
+        }
+        None => place.split_once(':').map_or((place, None), |(host, port)| (host, Some(port))),
+    };
+    let port = port.map_or(Some(PORT), |port| port.parse().ok())?;
+    (!host.is_empty()).then(|| (host.to_owned(), port))
+}
+
+/// A user or a password, in which `%40` is an `@`.
+fn decoded(text: &str) -> Result<String, String> {
+    let decoded = percent_decode_str(text).decode_utf8();
+    let decoded = decoded.map_err(|_| "user and password are no UTF-8".to_owned())?;
+    match decoded.len() > LONGEST {
+        true => Err("user and password are too long".to_owned()),
+        false => Ok(decoded.into_owned()),
+    }
+}
+
+/// Sees that a topic may be subscribed to.
+fn check_topic(topic: &str) -> Result<(), String> {
+    let mut levels = topic.split('/').peekable();
+    let mut fits = !topic.is_empty() && topic.len() <= LONGEST && !topic.contains('\0');
+    while let Some(level) = levels.next() {
+        fits &= match level {
+            "#" => levels.peek().is_none(),
+            "+" => true,
+            level => !level.contains(['#', '+']),
+        };
+    }
+    match fits {
+        true => Ok(()),
+        false => Err(format!(
+            "`{topic}` is no topic: name one, with `+` in the place of a level or `#` in that of the last ones"
+        )),
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn addresses_are_read() {
+        let read = |text: &str| text.parse::<Address>();
+        let full = read("mqtt://me%40site:a%3Ab%2F@broker.local:1884/plant/+/#").unwrap();
+        assert_eq!((full.host.as_str(), full.port, full.topic.as_str()), ("broker.local", 1884, "plant/+/#"));
+        assert_eq!((full.user.as_deref(), full.password.as_deref()), (Some("me@site"), Some("a:b/")));
+        assert_eq!(full.broker(), "mqtt://broker.local:1884");
+        let short = read("mqtt://[::1]//a?b").unwrap();
+        assert_eq!((short.broker().as_str(), short.topic.as_str()), ("mqtt://[::1]:1883", "/a?b"));
+        assert_eq!((short.user, short.password), (None, None));
+        for (text, part) in [
+            ("broker/topic", "no address of a broker"),
+            ("mqtts://broker/topic", "no TLS"),
+            ("mqtt://broker", "no topic"),
+            ("mqtt://broker/", "`` is no topic"),
+            ("mqtt://broker/a#", "`a#` is no topic"),
+            ("mqtt://broker/#/a", "`#/a` is no topic"),
+            ("mqtt://broker/a+/b", "`a+/b` is no topic"),
+            ("mqtt:///topic", "no host or port"),
+            ("mqtt://broker:port/topic", "no host or port"),
+            ("mqtt://[::1/topic", "no host or port"),
+            ("mqtt://%ff@broker/topic", "no UTF-8"),
+        ] {
+            let said = read(text).unwrap_err();
+            assert!(said.contains(part), "{text}: {said}");
+        }
+    }
+}

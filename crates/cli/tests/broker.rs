@@ -1,0 +1,144 @@
+//! `greybox watch --from mqtt://…` at a real broker.
+#![cfg(feature = "mqtt")]
+#![allow(missing_docs, clippy::unwrap_used)]
+
+use std::fmt::Write as _;
+use std::process::Stdio;
+
+use common::Bench;
+use running::{Broker, Watching};
+
+#[allow(dead_code, reason = "not every test file uses all of it")]
+mod common;
+#[path = "common/noise.rs"]
+mod noise;
+#[path = "common/running.rs"]
+mod running;
+#[allow(dead_code, reason = "not every test file uses all of it")]
+#[path = "common/throttle.rs"]
+mod throttle;
+
+fn bench() -> Bench {
+    let bench = Bench::empty();
+    bench.write("throttle.toml", throttle::MODEL);
+    bench
+}
+
+/// What the same samples on standard input leave: the lines, and the state.
+fn fed(bench: &Bench, text: &str) -> (Vec<String>, String) {
+    let arguments = ["watch", "throttle.toml", "--json", "--learn", "15", "--state", "fed.json"];
+    let said = bench.greybox_fed(&arguments, text);
+    assert_eq!(said.code, 0, "{}", said.stderr);
+    let state = bench.read("fed.json");
+    std::fs::remove_file(bench.path("fed.json")).unwrap();
+    (said.stdout.lines().map(str::to_owned).collect(), state)
+}
+
+/// The broker is killed and comes back: nothing is lost of what it had, and nothing that it has kept from before counts.
+#[test]
+fn a_broker_that_is_killed_is_waited_for() {
+    let bench = bench();
+    let Some(mut broker) = Broker::start(&bench, "allow_anonymous true") else { return };
+    let samples = throttle::samples(30.0);
+    let lines: Vec<String> = samples
+        .iter()
+        .map(|[t, torque, angle]| format!(r#"{{"t": {t}, "torque": {torque:.5}, "angle": {angle:.6}}}"#))
+        .collect();
+    let (first, second) = lines.split_at(2000);
+    let (early, early_state) = fed(&bench, &first.join("\n"));
+    let (whole, whole_state) = fed(&bench, &lines.join("\n"));
+    let retained = [r#"{"t": 1e6, "torque": 0, "angle": 0}"#.to_owned()];
+    broker.publish(&retained, &["-r"]);
+
+    let from = format!("mqtt://127.0.0.1:{}/plant/+", broker.port);
+    let watching = Watching::start(&bench, &["--learn", "15", "--from", &from, "--state", "state.json"]);
+    assert_eq!(watching.until("subscribed").len(), 1);
+    broker.publish(first, &[]);
+    // The machine is silent now: the state is saved all the same.
+    watching.until_saved(&bench, "state.json", &early_state);
+    let mut said = watching.rest();
+    assert_eq!(said, early);
+
+    broker.kill();
+    let (_, lost) = watching.next();
+    assert_eq!((&lost["event"], &lost["pause"]), (&"disconnected".into(), &1.into()), "{lost}");
+    assert!(broker.run());
+    broker.publish(&retained, &["-r"]);
+    while watching.next().1["event"] != "subscribed" {}
+    broker.publish(second, &[]);
+    watching.until_saved(&bench, "state.json", &whole_state);
+    said.extend(watching.rest());
+    assert_eq!(said, whole);
+}
+
+/// Lines of the Influx protocol, many in a message, from a broker that asks who is there.
+#[test]
+fn a_broker_with_users_sends_lines_of_the_influx_protocol() {
+    let bench = bench();
+    let passwords = bench.path("passwords");
+    let config = format!("allow_anonymous false\npassword_file {}", passwords.display());
+    // (Made by `mosquitto_passwd`: user `rig`, password `a:b@c`.)
+    bench.write("passwords", "");
+    let made = std::process::Command::new("mosquitto_passwd")
+        .args(["-b", passwords.to_str().unwrap(), "rig", "a:b@c"])
+        .stderr(Stdio::null())
+        .status();
+    if !made.is_ok_and(|status| status.success()) {
+        eprintln!("skipped: mosquitto_passwd is not installed (Debian: mosquitto)");
+        return;
+    }
+    let Some(broker) = Broker::start(&bench, &config) else { return };
+    let mut text = String::new();
+    let mut messages = Vec::new();
+    for ten in throttle::samples(20.0).chunks(10) {
+        let mut message = String::from("# by Telegraf\n");
+        for [t, torque, angle] in ten {
+            let ns = 1_795_955_696_123_456_789 + (t * 1e9).round() as i64;
+            let _ = writeln!(message, "throttle,site=a torque={torque:.5},angle={angle:.6} {ns}");
+        }
+        text.push_str(&message);
+        messages.push(message);
+    }
+    let (whole, state) = fed(&bench, &text);
+    assert!(whole[0].contains(r#""t":"2026-11-29T12:35:11.123457Z"#), "{}", whole[0]);
+
+    let from = format!("mqtt://rig:a%3Ab%40c@127.0.0.1:{}/plant/#", broker.port);
+    let watching = Watching::start(&bench, &["--learn", "15", "--from", &from, "--state", "state.json"]);
+    let subscribed = watching.until("subscribed");
+    assert!(subscribed.len() == 1 && !subscribed[0].contains("a:b") && !subscribed[0].contains("rig"));
+    let login = ["-u", "rig", "-P", "a:b@c"];
+    for message in &messages {
+        let status = broker.client("mosquitto_pub", &login).args(["-m", message]).status();
+        assert!(status.unwrap().success());
+    }
+    // A value alone is no sample, and is said to be none.
+    broker.publish(&["1.23".to_owned()], &login);
+    watching.until_saved(&bench, "state.json", &state);
+    let said = watching.until("unreadable");
+    assert_eq!(said[..said.len() - 1], whole[..]);
+    assert!(said.last().unwrap().contains("`1.23` is a value alone"), "{said:?}");
+
+    for login in ["rig:wrong@", ""] {
+        let from = format!("mqtt://{login}127.0.0.1:{}/plant/throttle", broker.port);
+        let refused = bench.greybox_fed(&["watch", "throttle.toml", "--from", &from], "");
+        assert_eq!((refused.code, refused.stdout.as_str()), (2, ""));
+        assert!(refused.stderr.contains("the broker refuses the connection"), "{}", refused.stderr);
+        assert!(
+            refused.stderr.contains("--from mqtt://user:password@host") && !refused.stderr.contains("wrong")
+        );
+    }
+}
+
+#[test]
+fn no_broker_at_the_beginning_is_an_error() {
+    let bench = bench();
+    let port = std::net::TcpListener::bind("127.0.0.1:0").unwrap().local_addr().unwrap().port();
+    let from = format!("mqtt://127.0.0.1:{port}/plant");
+    let said = bench.greybox_fed(&["watch", "throttle.toml", "--from", &from], "");
+    assert_eq!(said.code, 2);
+    assert!(
+        said.stderr.contains("no connection") && said.stderr.contains("see that the broker runs"),
+        "{}",
+        said.stderr
+    );
+}
