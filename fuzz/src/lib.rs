@@ -1,10 +1,13 @@
 //! What must hold of any bytes, one function per fuzz target: each panics where something does not.
 
+#[path = "../../crates/recording/tests/sound.rs"]
+mod sound;
+
 use std::sync::{Arc, Mutex, PoisonError};
 
 use greybox_diagnose::{Options, ProgressListener, diagnose as run};
 use greybox_model::{Expr, Model, System, Unit, WriteOptions, parse, parse_equation};
-use greybox_recording::{Channel, MIN_SAMPLES, Recording, RecordingError};
+use greybox_recording::{Channel, Recording, RecordingError};
 use greybox_report::contract::Report;
 use greybox_report::convert::{self, Sources};
 
@@ -12,8 +15,16 @@ use greybox_report::convert::{self, Sources};
 pub type Target = (&'static str, fn(&[u8]));
 
 /// All targets.
-pub const TARGETS: [Target; 5] =
-    [("expression", expression), ("model", model), ("csv", csv), ("mat", mat), ("diagnose", diagnose)];
+pub const TARGETS: [Target; 8] = [
+    ("expression", expression),
+    ("model", model),
+    ("csv", csv),
+    ("mat", mat),
+    ("npz", npz),
+    ("hdf5", hdf5),
+    ("mcap", mcap),
+    ("diagnose", diagnose),
+];
 
 /// Text as an expression, an equation and a unit: what is read is printed and read again as the same, derivatives have a
 /// size of their own kind, and errors point into the text.
@@ -115,7 +126,7 @@ pub fn csv(bytes: &[u8]) {
             return;
         }
     };
-    sound(&recording, bytes.len());
+    sound::sound(&recording, Some(bytes.len()));
     let headers: Vec<String> = recording.channels.iter().map(header).collect();
     let columns: Vec<(&str, &[f64])> =
         headers.iter().zip(&recording.channels).map(|(h, c)| (h.as_str(), c.values.as_slice())).collect();
@@ -145,29 +156,23 @@ fn header(channel: &Channel) -> String {
 
 /// Bytes as a MAT-file: a recording is sound.
 pub fn mat(bytes: &[u8]) {
-    match greybox_recording::parse_mat(bytes, "fuzz.mat") {
-        // What is compressed may be a thousand times as long.
-        Ok(recording) => sound(&recording, 1100 * bytes.len()),
-        Err(error) => assert!(error.to_string().starts_with("fuzz.mat"), "the file is not named: {error}"),
-    }
+    // What is compressed may be a thousand times as long.
+    let _ = sound::read("fuzz.mat", bytes, Some(1100 * bytes.len()));
 }
 
-/// Pieces are uniform, as long as they say, and together no longer than a file of so many bytes can ask for.
-fn sound(recording: &Recording, bytes: usize) {
-    let rows = recording.time.len();
-    assert!(rows >= MIN_SAMPLES && rows <= bytes);
-    assert!(recording.channels.iter().all(|c| c.values.len() == rows && !c.name.is_empty()));
-    assert!(recording.time.windows(2).all(|w| w[0] < w[1]));
-    assert!(!recording.pieces.is_empty());
-    let mut samples = 0;
-    for piece in &recording.pieces {
-        assert!(piece.dt > 0.0 && piece.dt.is_finite(), "a step of {}", piece.dt);
-        assert!(piece.len >= MIN_SAMPLES);
-        assert!(piece.columns.len() == recording.channels.len());
-        assert!(piece.columns.iter().all(|column| column.len() == piece.len));
-        samples += piece.len;
-    }
-    assert!(samples <= 64 * rows, "{rows} rows become {samples} samples");
+/// Bytes as an archive of NumPy arrays, or as one array: a recording is sound.
+pub fn npz(bytes: &[u8]) {
+    let _ = sound::read("fuzz.npz", bytes, Some(1100 * bytes.len()));
+}
+
+/// Bytes as HDF5: a recording is sound. What is not stored is filled, so that the file's length says nothing of the rows.
+pub fn hdf5(bytes: &[u8]) {
+    let _ = sound::read("fuzz.h5", bytes, None);
+}
+
+/// Bytes as a log: a recording is sound.
+pub fn mcap(bytes: &[u8]) {
+    let _ = sound::read("fuzz.mcap", bytes, None);
 }
 
 /// Work after which the search of [`diagnose`] looks for nothing more, and the most that a whole diagnosis may take: a

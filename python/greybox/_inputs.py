@@ -5,7 +5,7 @@ from __future__ import annotations
 import os
 import re
 from collections.abc import Iterable, Mapping, Sequence
-from typing import TYPE_CHECKING, Any, Union
+from typing import TYPE_CHECKING, Any, NamedTuple, Union
 
 import numpy as np
 from numpy.typing import NDArray
@@ -16,8 +16,10 @@ from ._errors import InputError
 if TYPE_CHECKING:
     import pandas
 
-#: A recording: a file, a dict of arrays, a frame, or a :class:`Recording`.
-RecordingLike = Union[str, "os.PathLike[str]", Mapping[str, Any], "pandas.DataFrame", "Recording"]
+#: Columns with one clock: a dict of arrays or a frame.
+TableLike = Union[Mapping[str, Any], "pandas.DataFrame"]
+#: A recording: a file, a dict of arrays, a frame, a list of such tables with a clock each, or a :class:`Recording`.
+RecordingLike = Union[str, "os.PathLike[str]", TableLike, Sequence[TableLike], "Recording"]
 #: A model: a file, its text (more than one line), or a :class:`Model`.
 ModelLike = Union[str, "os.PathLike[str]", "Model"]
 
@@ -29,7 +31,7 @@ _HEADER = re.compile(r"\s*(.*?)\s*\[(.*)\]\s*")
 def _header(cell: object) -> tuple[str, str | None]:
     """Name and unit of ``name [unit]``."""
     found = _HEADER.fullmatch(str(cell))
-    return (found[1], found[2].strip()) if found else (str(cell).strip(), None)
+    return (found[1], found[2].strip() or None) if found else (str(cell).strip(), None)
 
 
 def _values(values: object, what: str, called: str) -> NDArray[np.float64]:
@@ -44,11 +46,27 @@ def _values(values: object, what: str, called: str) -> NDArray[np.float64]:
     return np.ascontiguousarray(array)
 
 
-def _index(frame: Any, called: str) -> tuple[str, Any]:
-    """The index of a frame as a time, under its header."""
+def _headers(table: Any) -> list[str]:
+    """Names of the columns of a table."""
+    if not hasattr(table, "items"):
+        raise TypeError(f"a recording is a file, a dict of arrays or a pandas frame, not {type(table).__name__}")
+    return [_header(key)[0] for key, _ in table.items()]
+
+
+def _origin(tables: Sequence[Any], called: str) -> Any:
+    """The first date of frames whose times are dates; ``None`` where none are."""
+    indexed = [table for table in tables if "t" not in _headers(table) and hasattr(table, "index")]
+    dates = [table.index for table in indexed if table.index.dtype.kind == "M"]
+    if dates and len(dates) < len(tables):
+        raise InputError(f"{called}: some of its tables have dates and others times in s; give all of them one kind")
+    return min((index.min() for index in dates if len(index)), default=None)
+
+
+def _index(frame: Any, origin: Any, called: str) -> tuple[str, Any]:
+    """The index of a frame as a time, under its header; a date counts from the origin."""
     index = frame.index
     if index.dtype.kind == "M":
-        index = index - index[0]
+        index = index - origin
     if index.dtype.kind == "m":
         return "t", index.total_seconds()
     if index.name is None:
@@ -56,57 +74,29 @@ def _index(frame: Any, called: str) -> tuple[str, Any]:
     return str(index.name), index
 
 
-class Recording:
-    """A recording in memory: a dict of arrays, a pandas frame, or the content of a file.
+class _Channel(NamedTuple):
+    name: str
+    unit: str | None
+    #: Whether each value stays until the next one.
+    held: bool
+    values: NDArray[np.float64]
 
-    Keys or columns are ``name`` or ``name [unit]``; ``units`` states the units of others. The time is the key ``t`` (in
-    seconds, or ``t [ms]``), or the index of a frame; NaN is a missing sample. ``name`` is what reports call it.
 
-    >>> import numpy as np, greybox
-    >>> t = np.arange(100) / 50
-    >>> run = greybox.Recording({"t": t, "theta": 30 * np.sin(t), "v [V]": np.cos(t)}, units={"theta": "deg"})
-    >>> run
-    Recording('recording', 100 rows of theta [deg], v [V])
-    """
-
-    _inner: _native.Recording
-
-    def __init__(
-        self, data: RecordingLike, name: str | None = None, *, units: Mapping[str, str] | None = None
-    ) -> None:
-        units = dict(units or {})
-        read: _native.Recording | None = None
-        if isinstance(data, Recording):
-            read = data._inner
-        elif isinstance(data, (str, os.PathLike)):
-            read = _native.Recording.read(data)
-        if read is not None:
-            called = read.name if name is None else name
-            time, columns = read.t, read.channels
-        else:
-            called = "recording" if name is None else name
-            time, columns = self._columns(data, called)
-        stated = []
-        for channel, unit, values in columns:
-            stated.append((channel, units.pop(channel, unit), values))
-        if units:
-            there = ", ".join(channel for channel, _, _ in stated)
-            raise InputError(f"{called}: `units` names {', '.join(units)}, but the channels are {there}")
-        self._inner = _native.Recording(called, time, stated)
+class _Clock(NamedTuple):
+    time: NDArray[np.float64]
+    channels: list[_Channel]
 
     @staticmethod
-    def _columns(
-        data: Any, called: str
-    ) -> tuple[NDArray[np.float64], list[tuple[str, str | None, NDArray[np.float64]]]]:
-        if not hasattr(data, "items"):
-            raise TypeError(f"a recording is a file, a dict of arrays or a pandas frame, not {type(data).__name__}")
-        columns = [(*_header(key), values) for key, values in data.items()]
+    def of(table: Any, origin: Any, called: str) -> _Clock:
+        """The times and the channels of a table."""
+        headers = _headers(table)
+        columns = [(*_header(key), values) for key, values in table.items()]
         times = [column for column in columns if column[0] == "t"]
         if not times:
-            if not hasattr(data, "index"):
-                there = ", ".join(name for name, _, _ in columns)
+            if not hasattr(table, "index"):
+                there = ", ".join(headers)
                 raise InputError(f"{called}: there is no time `t` among {there}; give the times in seconds under `t`")
-            key, values = _index(data, called)
+            key, values = _index(table, origin, called)
             times = [(*_header(key), values)]
             columns = [*times, *columns]
         _, unit, values = times[0]
@@ -119,11 +109,85 @@ class Recording:
             if names.count(name) > 1:
                 raise InputError(f"{called}: there are two columns `{name}`; rename or delete one of them")
         channels = [
-            (name, unit, _values(values, name, called)) for name, unit, values in columns if name != times[0][0]
+            _Channel(name, unit, getattr(values, "dtype", None) == bool, _values(values, name, called))
+            for name, unit, values in columns
+            if name != times[0][0]
         ]
         if not channels:
             raise InputError(f"{called}: there is no column beside the time; add at least one channel")
-        return time * scale if scale != 1.0 else time, channels
+        return _Clock(time * scale if scale != 1.0 else time, channels)
+
+
+def _known(called: str, what: str, names: Iterable[str], clocks: Sequence[_Clock]) -> None:
+    """Sees that the channels that ``what`` names are there."""
+    there = [channel.name for clock in clocks for channel in clock.channels]
+    unknown = [name for name in names if name not in there]
+    if unknown:
+        raise InputError(f"{called}: `{what}` names {', '.join(unknown)}, but the channels are {', '.join(there)}")
+
+
+class Recording:
+    """A recording in memory: a dict of arrays, a pandas frame, a list of these, or the content of a file.
+
+    Keys or columns are ``name`` or ``name [unit]``; ``units`` states the units of others. The time is the key ``t`` (in
+    seconds, or ``t [ms]``), or the index of a frame; NaN is a missing sample. ``name`` is what reports call it.
+
+    >>> import numpy as np, greybox
+    >>> t = np.arange(100) / 50
+    >>> run = greybox.Recording({"t": t, "theta": 30 * np.sin(t), "v [V]": np.cos(t)}, units={"theta": "deg"})
+    >>> run
+    Recording('recording', 100 rows of theta [deg], v [V])
+
+    The tables of a list have clocks of their own, which are joined on the grid of the one with the most samples: what has
+    the same times is copied, another sample goes to the nearest instant along the line to its neighbour, and nothing is
+    made up between. A channel that ``held`` names, or of truth values, keeps each value until the next one.
+
+    >>> slow = {"t": t[::5], "on": t[::5] > 1}
+    >>> run = greybox.Recording([{"t": t, "theta [rad]": np.sin(t)}, slow])
+    >>> run, run["on"][:6]
+    (Recording('recording', 100 rows of theta [rad], on), array([ 0., nan, nan, nan, nan,  0.]))
+    """
+
+    _inner: _native.Recording
+
+    def __init__(
+        self,
+        data: RecordingLike,
+        name: str | None = None,
+        *,
+        units: Mapping[str, str] | None = None,
+        held: Sequence[str] = (),
+    ) -> None:
+        if isinstance(data, Recording):
+            read: _native.Recording | None = data._inner
+        elif isinstance(data, (str, os.PathLike)):
+            read = _native.Recording.read(data)
+        else:
+            read = None
+        if read is not None:
+            called = read.name if name is None else name
+            columns = [_Channel(channel, unit, False, values) for channel, unit, values in read.channels]
+            clocks = [_Clock(read.t, columns)]
+        else:
+            called = "recording" if name is None else name
+            tables: list[Any] = list(data) if isinstance(data, (list, tuple)) else [data]
+            origin = _origin(tables, called)
+            clocks = [_Clock.of(table, origin, called) for table in tables]
+        units = dict(units or {})
+        _known(called, "units", units, clocks)
+        _known(called, "held", held, clocks)
+        stated = [
+            (
+                clock.time,
+                [c._replace(unit=units.get(c.name, c.unit), held=c.held or c.name in held) for c in clock.channels],
+            )
+            for clock in clocks
+        ]
+        if len(stated) == 1:
+            time, channels = stated[0]
+            self._inner = _native.Recording(called, time, [(c.name, c.unit, c.values) for c in channels])
+        else:
+            self._inner = _native.Recording.from_clocks(called, stated)
 
     @property
     def name(self) -> str:
@@ -241,7 +305,8 @@ def model(source: ModelLike) -> _native.Model:
 def recordings(
     data: RecordingLike | Iterable[RecordingLike] | None, role: str, units: Mapping[str, str] | None
 ) -> list[Any]:
-    """Recordings as the native half takes them: files stay files where no units are stated."""
+    """Recordings as the native half takes them: files stay files where no units are stated. A list has one recording in
+    each place, which may be a list of the tables of one recording."""
     if data is None:
         return []
     alone = isinstance(data, (str, os.PathLike, Mapping, Recording)) or hasattr(data, "columns")

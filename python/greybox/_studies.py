@@ -37,7 +37,7 @@ def diagnose(
         holdout: recordings that only judge the result; without any, the last fifth of each recording is held out.
         units: unit of each channel that states none, such as ``{"theta": "deg"}``.
         map: channel for a name of the model, such as ``{"theta": "sensor_3 [deg]"}``.
-        channels: channels to read, and no other but those of ``map``; without any, of a log with several clocks those
+        channels: channels to read, and no other but those of ``map``; without any, of a file with several clocks those
             that the model and ``map`` name.
         seed: echoed into the report; the same seed and inputs give the same result.
         work: most work of the search, in billions of operations.

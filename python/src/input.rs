@@ -5,7 +5,7 @@ use std::path::{Path, PathBuf};
 use greybox_commands::Failure;
 use greybox_commands::loading::{self, LoadedModel, Wanted};
 use greybox_model::{Hold, Unit, WriteOptions, nearest};
-use greybox_recording::{Channel, Rename, RenameError};
+use greybox_recording::{Channel, Clock, Rename, RenameError, Series};
 use numpy::{PyArray1, PyReadonlyArray1};
 use pyo3::prelude::*;
 use pyo3::types::PyDict;
@@ -18,6 +18,9 @@ pub(crate) struct Recording(pub(crate) greybox_recording::Recording);
 
 /// Header name, unit and values of a channel.
 type Column<'py> = (String, Option<String>, PyReadonlyArray1<'py, f64>);
+
+/// The same with whether each value is held until the next one.
+type Signal<'py> = (String, Option<String>, bool, PyReadonlyArray1<'py, f64>);
 
 /// The same on its way out.
 type Told<'a, 'py> = (&'a str, Option<&'a str>, Bound<'py, PyArray1<f64>>);
@@ -42,6 +45,30 @@ impl Recording {
             })
             .collect();
         let made = greybox_recording::Recording::from_columns(name, values(&time), channels);
+        raised(py, made.map(Recording).map_err(Failure::from))
+    }
+
+    /// From tables with clocks of their own: times in s, and channels. A clock is called as its first channel.
+    #[staticmethod]
+    fn from_clocks(
+        py: Python<'_>,
+        name: &str,
+        clocks: Vec<(PyReadonlyArray1<'_, f64>, Vec<Signal<'_>>)>,
+    ) -> PyResult<Recording> {
+        let values = |array: &PyReadonlyArray1<'_, f64>| array.as_array().to_vec();
+        let series = |(name, unit, held, array): &Signal<'_>| Series {
+            name: name.clone(),
+            unit: unit.clone(),
+            held: *held,
+            values: values(array),
+        };
+        let clocks = clocks.iter().map(|(time, signals)| Clock {
+            name: signals.first().map(|(name, ..)| name.clone()).unwrap_or_default(),
+            time: values(time),
+            resolution: 0.0,
+            series: signals.iter().map(series).collect(),
+        });
+        let made = greybox_recording::Recording::from_clocks(name, clocks.collect());
         raised(py, made.map(Recording).map_err(Failure::from))
     }
 

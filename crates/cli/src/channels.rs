@@ -31,7 +31,7 @@ pub(crate) struct Channels {
         long = "channels",
         value_name = "CHANNEL",
         help = "Channel to read, such as \"/joint_states.position[elbow]\", and no other but those of --map; may be repeated \
-                [default: what model and --map name, of a log with several clocks]"
+                [default: what model and --map name, of a file with several clocks]"
     )]
     pub(crate) only: Vec<String>,
 }

@@ -19,28 +19,84 @@
 
 use crate::error::{Place, RecordingError};
 use crate::finding::{Finding, Severity, listed, number};
-use crate::recording::{Channel, Recording, SIZES};
+use crate::recording::{Channel, MIN_SAMPLES, Recording, SIZES};
 
 /// Most that an instant may be away from a sample, in steps: half of one, and the jitter at which times are a grid.
 const NEAREST: f64 = 0.51;
 
 /// A signal of a [`Clock`].
 #[derive(Debug, Clone, PartialEq)]
-pub(crate) struct Series {
-    pub(crate) name: String,
-    pub(crate) unit: Option<String>,
-    /// Whether each value is kept until the next one, instead of being a sample of something that moves.
-    pub(crate) held: bool,
+pub struct Series {
+    /// What the channel is called.
+    pub name: String,
+    /// Its unit as written; `None` = not stated.
+    pub unit: Option<String>,
+    /// Whether each value is kept until the next one (a command, a switch), instead of being a sample of something that
+    /// moves.
+    pub held: bool,
     /// One for each time of the clock; NaN = missing.
-    pub(crate) values: Vec<f64>,
+    pub values: Vec<f64>,
 }
 
-/// Times, s, in any order, and the signals that have a value for each.
+/// Times and the signals that have a value for each: one clock of [`Recording::from_clocks`].
 #[derive(Debug, Clone, PartialEq)]
-pub(crate) struct Clock {
-    pub(crate) name: String,
-    pub(crate) time: Vec<f64>,
-    pub(crate) series: Vec<Series>,
+pub struct Clock {
+    /// What the warnings call it.
+    pub name: String,
+    /// Times, s, in any order.
+    pub time: Vec<f64>,
+    /// Distance of two times that are not told apart, s: the last digit of times that were rounded; 0 = exact.
+    pub resolution: f64,
+    /// Its signals.
+    pub series: Vec<Series>,
+}
+
+impl Recording {
+    /// A recording from signals with clocks of their own, on one grid.
+    ///
+    /// The clock with the most samples in what all of them cover is the grid's. What has the same times is copied, to the
+    /// bit. Any other sample goes to the nearest instant of the grid, at most half a step Δt away, along the straight line
+    /// to its neighbour (a held value as it is); everything between is missing. Times that go back are put in order, of
+    /// those that repeat the last counts, and an infinite value is missing. The warnings tell all of it (`clocks`).
+    ///
+    /// # Errors
+    /// [`RecordingError::NoChannels`] without a signal; [`RecordingError::ColumnLength`] where a signal has not one value
+    /// for each time of its clock; [`RecordingError::NoOverlap`] where no instant is covered by all;
+    /// [`RecordingError::DuplicateName`]; else as [`Recording::from_columns`] of the signals of the grid's clock.
+    ///
+    /// ```
+    /// use greybox_recording::{Clock, Recording, Series};
+    /// let clock = |name: &str, rate: f64, count: u32| Clock {
+    ///     name: name.into(),
+    ///     time: (0..count).map(|k| f64::from(k) / rate).collect(),
+    ///     resolution: 0.0,
+    ///     series: vec![Series {
+    ///         name: format!("{name}.x"),
+    ///         unit: None,
+    ///         held: false,
+    ///         values: (0..count).map(f64::from).collect(),
+    ///     }],
+    /// };
+    /// let run = Recording::from_clocks("run", vec![clock("slow", 50.0, 51), clock("fast", 100.0, 101)])?;
+    /// assert_eq!(run.time.len(), 101);
+    /// let slow = run.channel("slow.x").unwrap();
+    /// assert_eq!((slow.values[0], slow.values[2]), (0.0, 1.0));
+    /// assert!(slow.values[1].is_nan());
+    /// # Ok::<(), greybox_recording::RecordingError>(())
+    /// ```
+    pub fn from_clocks(name: &str, clocks: Vec<Clock>) -> Result<Self, RecordingError> {
+        let lengths = clocks.iter().flat_map(|clock| clock.series.iter().map(|s| (s, clock.time.len())));
+        for (c, (series, expected)) in lengths.clone().enumerate() {
+            if series.values.len() != expected {
+                let place = Place::file(name).column(c + 1, &series.name);
+                return Err(RecordingError::ColumnLength { place, found: series.values.len(), expected });
+            }
+        }
+        if lengths.count() == 0 {
+            return Err(RecordingError::NoChannels { place: Place::file(name) });
+        }
+        recording(name, name, clocks, Vec::new())
+    }
 }
 
 /// The recording of several clocks; `label` names the file in errors, `notes` come before what is told here.
@@ -58,7 +114,8 @@ pub(crate) fn recording(
         notes.extend(clock.tidy());
     }
     notes.extend(lone(&clocks));
-    clocks.retain(|clock| !clock.is_lone());
+    let rows = clocks.iter().map(|clock| clock.time.len()).max().unwrap_or(0);
+    clocks.retain(|clock| !clock.is_lone() && !clock.series.is_empty());
     unique(label, &clocks)?;
     let (from, to) = overlap(label, &clocks)?;
     let inside = |clock: &Clock| clock.time.iter().filter(|t| (from..=to).contains(*t)).count();
@@ -66,11 +123,12 @@ pub(crate) fn recording(
     let most = counts.iter().max().copied().unwrap_or(0);
     let fastest = counts.iter().position(|count| *count == most).unwrap_or(0);
     let Some(grid) = clocks.get(fastest).map(|clock| clock.within(from, to)) else {
-        return Err(RecordingError::NoSeries { place: Place::file(label), found: "nothing".to_owned() });
+        let (place, help) = (Place::file(label), "record for longer or export all samples");
+        return Err(RecordingError::TooFewRows { place, rows, needed: MIN_SAMPLES, help });
     };
     notes.extend(cut(&clocks, from, to));
     let of_grid = grid.series.into_iter().map(Series::channel).collect();
-    let mut base = Recording::checked(label, name, grid.time, of_grid, 0.0)?;
+    let mut base = Recording::checked(label, name, grid.time, of_grid, grid.resolution)?;
     if clocks.len() == 1 {
         base.warnings.splice(0..0, notes);
         return Ok(base);
@@ -84,7 +142,9 @@ pub(crate) fn recording(
             continue;
         }
         let (columns, carried) = clock.carry(&time, step);
-        let told = carried.told(clock, &clocks[fastest]);
+        // As many as the grid's, none of them moved: the same instants.
+        let apart = carried.farthest > 0.0 || carried.lost > 0 || counts[k] < most;
+        let told = apart.then(|| carried.told(clock, &clocks[fastest]));
         notes.extend(told.iter().flat_map(|told| columns.iter().map(|column| told.clone().on(&column.name))));
         channels.extend(columns);
     }
@@ -154,10 +214,10 @@ fn cut(clocks: &[Clock], from: f64, to: f64) -> Option<Finding> {
         .into_iter()
         .filter_map(|(clock, what, at)| Some(format!("`{}` {what} at t = {} s", clock?.name, number(at))));
     let message = format!(
-        "Only what all clocks cover counts: {left_out} of {samples} messages are left out ({}).",
+        "Only what all clocks cover counts: {left_out} of {samples} samples are left out ({}).",
         bounds.collect::<Vec<_>>().join(", ")
     );
-    let help = "Read fewer topics with `--channels` where one of them begins late or ends early.";
+    let help = "Read fewer channels with `--channels` where a clock begins late or ends early.";
     Some(Finding::new(Severity::Info, "clocks", message).help(help))
 }
 
@@ -252,6 +312,7 @@ impl Clock {
             |series: &Series| Series { values: series.values[rows.clone()].to_vec(), ..series.clone() };
         Clock {
             name: self.name.clone(),
+            resolution: self.resolution,
             series: self.series.iter().map(part).collect(),
             time: self.time[rows.clone()].to_vec(),
         }
@@ -355,10 +416,7 @@ impl Carried {
         self.lost = self.lost.max(count.lost);
     }
 
-    fn told(&self, clock: &Clock, grid: &Clock) -> Option<Finding> {
-        if self.farthest == 0.0 && self.lost == 0 && clock.time.len() >= grid.time.len() {
-            return None;
-        }
+    fn told(&self, clock: &Clock, grid: &Clock) -> Finding {
         let how = match (self.sampled, self.held) {
             (true, false) => "carried along straight lines to the nearest instants of",
             _ => "moved as they are to the nearest instants of",
@@ -382,7 +440,7 @@ impl Carried {
             grid.rate(),
             number(1e3 * self.farthest),
         );
-        Some(Finding::new(Severity::Info, "clocks", message).value(1e3 * self.farthest, Some("ms")))
+        Finding::new(Severity::Info, "clocks", message).value(1e3 * self.farthest, Some("ms"))
     }
 }
 

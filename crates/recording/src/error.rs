@@ -334,15 +334,17 @@ pub enum RecordingError {
         /// How to fix it.
         help: &'static str,
     },
-    /// Signals of the file were sampled at different times.
+    /// A signal may belong to several times of the file.
     #[error(
-        "{place}: the file holds {} recordings with times of their own ({}); one file holds one recording: save each in a \
-         file of its own",
-        times.len(), times.join(", ")
+        "{place}: `{signal}` may belong to any of the times {}; save each time with its signals in a structure or group of \
+         its own, or name the channels to read with `--channels`",
+        times.join(", ")
     )]
     SeveralTimes {
         /// The file.
         place: Place,
+        /// The signal.
+        signal: String,
         /// The variables that are times.
         times: Vec<String>,
     },

@@ -1,11 +1,16 @@
 //! Which variables are the time, which the signals, and how the signals are called.
 
+mod axes;
+mod join;
+mod pairing;
+
 use crate::error::{Place, RecordingError};
 use crate::finding::{Finding, Severity, listed};
-use crate::header::{TIMES, header_cell, seconds};
-use crate::recording::{Channel, MIN_SAMPLES, Recording};
-use crate::variables::{Array, Value, Variable};
-use std::collections::HashMap;
+use crate::header::{header_cell, seconds};
+use crate::recording::{MIN_SAMPLES, Recording};
+use crate::selection::Selection;
+use crate::variables::{Array, Class, Value, Variable};
+use pairing::Unclear;
 
 /// Names of a list of column names, alone or behind the matrix's name and `_`.
 const NAMES: [&str; 6] = ["names", "labels", "columns", "channels", "header", "headers"];
@@ -22,11 +27,14 @@ struct Signal {
     /// The variable and the fields that lead to it.
     path: String,
     unit: Option<String>,
+    held: bool,
     values: Vec<f64>,
 }
 
 /// A time and the signals that have a value for each.
 struct Clock {
+    /// What the array is called.
+    name: String,
     path: String,
     time: Vec<f64>,
     /// Distance of two times that `single` cannot tell apart, s.
@@ -48,6 +56,8 @@ struct Found {
     clocks: Vec<Clock>,
     /// Arrays that no clock goes with.
     loose: Vec<Named>,
+    /// Signals that may belong to several clocks.
+    unclear: Vec<Unclear>,
     /// What is not read, in words.
     others: Vec<String>,
     objects: bool,
@@ -56,16 +66,17 @@ struct Found {
 /// The entries of a workspace or a structure.
 type Entries<'a> = Vec<(&'a str, &'a Value)>;
 
-/// The recording in the variables of a file.
+/// The recording in the variables of a file; of one whose signals have several clocks what is selected.
 pub(crate) fn recording(
     variables: &[Variable],
     label: &str,
     name: &str,
+    selection: &Selection,
 ) -> Result<Recording, RecordingError> {
-    let place = || Place::file(label);
     let mut found = Found::default();
-    found.scope("", "signal", &variables.iter().map(|v| (v.name.as_str(), &v.value)).collect(), None);
+    found.scope("", "signal", &variables.iter().map(|v| (v.name.as_str(), &v.value)).collect(), &[]);
     let mut warnings = Vec::new();
+    found.put_back();
     if found.clocks.is_empty()
         && let Some(clock) = found.first_column()
     {
@@ -77,67 +88,20 @@ pub(crate) fn recording(
         found.clocks.push(clock);
     }
     let left_out = found.listed();
-    let (mut clocks, idle): (Vec<Clock>, Vec<Clock>) =
-        found.clocks.into_iter().partition(|clock| !clock.signals.is_empty());
-    if clocks.is_empty() {
-        return Err(match idle.first() {
-            Some(clock) => RecordingError::NoSignals {
-                place: place(),
-                time: clock.path.clone(),
-                rows: clock.time.len(),
-                found: left_out,
-            },
-            None => RecordingError::NoTime {
-                place: place(),
-                found: if left_out.is_empty() { "nothing".to_owned() } else { left_out },
-                help: match found.objects {
-                    true => {
-                        "the content of MATLAB's objects (timeseries, tables, Simulink's data sets) is not kept in a form \
-                         that others can read: save the arrays, `t = ts.Time; y = ts.Data; save('run.mat', 't', 'y', '-v7')`"
-                    }
-                    false => "call the vector of times, in s, `t`",
-                },
-            },
-        });
-    }
-    let mut clock = clocks.remove(0);
-    if let Some(other) = clocks.iter().position(|other| !same_times(&clock.time, &other.time)) {
-        let times = vec![format!("`{}`", clock.path), format!("`{}`", clocks[other].path)];
-        return Err(RecordingError::SeveralTimes { place: place(), times });
-    }
-    clock.signals.extend(clocks.into_iter().flat_map(|other| other.signals));
-    tell_apart(&mut clock.signals);
-    let mut places = HashMap::new();
-    for (c, signal) in clock.signals.iter().enumerate() {
-        if let Some(first) = places.insert(&signal.name, c) {
-            return Err(RecordingError::DuplicateName {
-                place: place().column(c + 1, &signal.path),
-                name: signal.name.clone(),
-                first: first + 2,
-            });
-        }
-    }
-    let channels = clock
-        .signals
-        .into_iter()
-        .map(|Signal { name, unit, values, .. }| Channel { name, unit, values })
-        .collect();
-    let mut recording = Recording::checked(label, name, clock.time, channels, clock.resolution)?;
     if !left_out.is_empty() {
-        warnings.push(Finding::new(
-            Severity::Info,
-            "left_out",
-            format!("Left out of the file, having no value for each time: {left_out}."),
-        ));
+        let message = format!("Left out of the file, having no value for each time: {left_out}.");
+        warnings.push(Finding::new(Severity::Info, "left_out", message));
     }
-    recording.warnings.splice(0..0, warnings);
-    Ok(recording)
+    if found.clocks.iter().all(|clock| clock.signals.is_empty()) && found.unclear.is_empty() {
+        return Err(found.nothing(label, left_out));
+    }
+    join::recording(found, label, name, selection, warnings)
 }
 
 impl Found {
     /// Looks through the entries of a workspace or a structure; `called` is what a signal without a name of its own is
-    /// called, `clock` the time of what stands around it.
-    fn scope(&mut self, path: &str, called: &str, entries: &Entries<'_>, clock: Option<usize>) {
+    /// called, `around` the times of what stands around it.
+    fn scope(&mut self, path: &str, called: &str, entries: &Entries<'_>, around: &[usize]) {
         let mut arrays = Vec::new();
         for &(name, value) in entries {
             let path = joined(path, name);
@@ -152,27 +116,47 @@ impl Found {
         }
         // Numbers that stand alone are settings.
         arrays.retain(|a| a.array.values.len() > 1);
-        let time = TIMES.iter().find_map(|wanted| {
-            arrays.iter().position(|a| a.name == *wanted && is_vector(&a.array) && time_scale(a).is_some())
-        });
-        let clock = match time {
-            Some(index) => {
-                let time = arrays.remove(index);
-                self.clocks.push(Clock::new(time));
-                Some(self.clocks.len() - 1)
-            }
-            None => clock,
-        };
+        let reach = self.times(&mut arrays, around);
         for array in arrays {
-            match clock {
-                Some(clock) => {
-                    if let Err(array) = self.clocks[clock].take(array) {
-                        self.loose.push(array);
-                    }
-                }
-                None => self.loose.push(array),
-            }
+            self.give(array, &reach);
         }
+        let axes = axes::find(entries);
+        if let Some(axes) = &axes {
+            self.axes(axes, path, called);
+        }
+        let entries = entries.iter().filter(|(name, _)| axes.is_none() || !axes::NAMES.contains(name));
+        self.inside(path, called, &entries.copied().collect(), &reach);
+    }
+
+    /// Takes the times out of the arrays of a scope; those that its signals may belong to.
+    fn times(&mut self, arrays: &mut Vec<Named>, around: &[usize]) -> Vec<usize> {
+        let plain = pairing::plain_time(arrays).map(|index| self.clock(arrays.remove(index)));
+        let mut reach: Vec<usize> = plain.map_or_else(|| around.to_vec(), |plain| vec![plain]);
+        // What has the length of a time that is there already is a signal.
+        let lengths: Vec<usize> = reach.iter().map(|&c| self.clocks[c].time.len()).collect();
+        let is_further =
+            |a: &mut Named| pairing::is_further_time(a) && !lengths.contains(&a.array.values.len());
+        let further: Vec<Named> = arrays.extract_if(.., is_further).collect();
+        reach.extend(further.into_iter().map(|time| self.clock(time)));
+        reach
+    }
+
+    fn clock(&mut self, time: Named) -> usize {
+        self.clocks.push(Clock::new(time));
+        self.clocks.len() - 1
+    }
+
+    /// Gives an array to the one of the clocks in `reach` that it belongs to.
+    fn give(&mut self, array: Named, reach: &[usize]) {
+        match pairing::give(array, &mut self.clocks, reach) {
+            Ok(()) => {}
+            Err(Ok(array)) => self.loose.push(array),
+            Err(Err(unclear)) => self.unclear.push(unclear),
+        }
+    }
+
+    /// Looks through the structures and cells of a scope.
+    fn inside(&mut self, path: &str, called: &str, entries: &Entries<'_>, reach: &[usize]) {
         for &(name, value) in entries.iter().filter(|(name, _)| !matches!(*name, "units" | "unit")) {
             let path = joined(path, name);
             // `signals` is Simulink's word for the signals of the structure around it.
@@ -183,7 +167,7 @@ impl Found {
                         let (path, called) = numbered(&path, called, k, *count);
                         let entries =
                             fields.iter().filter_map(|(n, v)| Some((n.as_str(), v.get(k)?))).collect();
-                        self.scope(&path, &called, &entries, clock);
+                        self.scope(&path, &called, &entries, reach);
                     }
                 }
                 Value::Cells(cells) => {
@@ -192,7 +176,7 @@ impl Found {
                             let (path, called) = numbered(&path, called, k, cells.len());
                             let entries =
                                 fields.iter().filter_map(|(n, v)| Some((n.as_str(), v.first()?))).collect();
-                            self.scope(&path, &called, &entries, clock);
+                            self.scope(&path, &called, &entries, reach);
                         }
                     }
                 }
@@ -206,11 +190,11 @@ impl Found {
         let is_matrix = |a: &Named| a.array.dimensions.len() == 2 && !is_vector(&a.array);
         let mut matrices = (0..self.loose.len()).filter(|&k| is_matrix(&self.loose[k]));
         let (index, None) = (matrices.next()?, matrices.next()) else { return None };
-        let Array { dimensions, single, .. } = &self.loose[index].array;
-        let (long, single, which) = if dimensions[0] >= dimensions[1] {
-            (dimensions[0], *single, "column")
+        let Array { dimensions, class, .. } = &self.loose[index].array;
+        let (long, class, which) = if dimensions[0] >= dimensions[1] {
+            (dimensions[0], *class, "column")
         } else {
-            (dimensions[1], *single, "row")
+            (dimensions[1], *class, "row")
         };
         let signals = split(&self.loose[index].array, long)?;
         let (time, values) = signals.split_first()?;
@@ -225,13 +209,45 @@ impl Found {
             name: if several { format!("{name}_{}", k + 1) } else { name.clone() },
             path: path.clone(),
             unit: None,
+            held: false,
             values,
         });
         let signals = signals.collect();
-        let array = Array { dimensions: vec![time.len(), 1], values: time, single };
+        let array = Array { dimensions: vec![time.len(), 1], values: time, class };
         let named =
             Named { name: String::new(), path: format!("the first {which} of `{path}`"), unit: None, array };
         Some(Clock { signals, ..Clock::new(named) })
+    }
+
+    /// Names the further times that no signal goes with among what is left out.
+    fn put_back(&mut self) {
+        let idle = |clock: &mut Clock| clock.signals.is_empty() && !clock.is_plain();
+        let idle = self.clocks.extract_if(.., idle);
+        self.others.extend(idle.map(|clock| format!("`{}` ({} times)", clock.path, clock.time.len())));
+    }
+
+    /// Why the file is no recording.
+    fn nothing(&self, label: &str, found: String) -> RecordingError {
+        let place = Place::file(label);
+        if let Some(clock) = self.clocks.first() {
+            return RecordingError::NoSignals {
+                place,
+                time: clock.path.clone(),
+                rows: clock.time.len(),
+                found,
+            };
+        }
+        RecordingError::NoTime {
+            place,
+            found: if found.is_empty() { "nothing".to_owned() } else { found },
+            help: match self.objects {
+                true => {
+                    "the content of MATLAB's objects (timeseries, tables, Simulink's data sets) is not kept in a form \
+                     that others can read: save the arrays, `t = ts.Time; y = ts.Data; save('run.mat', 't', 'y', '-v7')`"
+                }
+                false => "call the vector of times, in s, `t`",
+            },
+        }
     }
 
     /// What is not read, in words.
@@ -249,24 +265,16 @@ impl Clock {
         let scale = time_scale(&time).unwrap_or(1.0);
         let longest = time.array.values.iter().fold(0.0f64, |most, t| most.max(t.abs()));
         Clock {
-            resolution: if time.array.single { scale * longest * f64::from(f32::EPSILON) } else { 0.0 },
+            resolution: if time.array.class == Class::Single {
+                scale * longest * f64::from(f32::EPSILON)
+            } else {
+                0.0
+            },
             time: time.array.values.into_iter().map(|t| scale * t).collect(),
+            name: time.name,
             path: time.path,
             signals: Vec::new(),
         }
-    }
-
-    /// Takes the signals of an array that has a value for each time, and gives back any other.
-    fn take(&mut self, named: Named) -> Result<(), Named> {
-        let Some(signals) = split(&named.array, self.time.len()) else { return Err(named) };
-        let several = signals.len() > 1;
-        self.signals.extend(signals.into_iter().enumerate().map(|(k, values)| Signal {
-            name: if several { format!("{}_{}", named.name, k + 1) } else { named.name.clone() },
-            path: named.path.clone(),
-            unit: named.unit.clone(),
-            values,
-        }));
-        Ok(())
     }
 }
 
@@ -315,7 +323,7 @@ fn named(entries: &Entries<'_>, name: &str, path: String, called: &str, array: &
     {
         let column = |(text, values): (&String, Vec<f64>)| {
             let (name, unit) = cell(text);
-            let array = Array { dimensions: vec![values.len(), 1], values, single: array.single };
+            let array = Array { dimensions: vec![values.len(), 1], values, class: array.class };
             Named { name, path: path.clone(), unit, array }
         };
         return names.iter().zip(signals).map(column).collect();
@@ -366,26 +374,5 @@ fn numbered(path: &str, called: &str, k: usize, count: usize) -> (String, String
     match count {
         1 => (path.to_owned(), called.to_owned()),
         _ => (format!("{path}({})", k + 1), format!("{called}_{}", k + 1)),
-    }
-}
-
-/// Whether two times are the same up to rounding.
-fn same_times(a: &[f64], b: &[f64]) -> bool {
-    let span = a.last().unwrap_or(&0.0) - a.first().unwrap_or(&0.0);
-    a.len() == b.len() && a.iter().zip(b).all(|(a, b)| (a - b).abs() <= 1e-9 * span.abs())
-}
-
-/// Signals that share a name get those of the structures around them.
-fn tell_apart(signals: &mut [Signal]) {
-    let mut times = HashMap::new();
-    for signal in signals.iter() {
-        *times.entry(signal.name.clone()).or_insert(0) += 1;
-    }
-    for signal in signals {
-        if times.get(&signal.name).is_some_and(|&times| times > 1) {
-            let words =
-                signal.path.split(|c: char| !c.is_alphanumeric() && c != '_').filter(|w| !w.is_empty());
-            signal.name = words.collect::<Vec<_>>().join("_");
-        }
     }
 }

@@ -45,7 +45,6 @@
 struct Readme;
 
 mod character;
-#[cfg(any(feature = "mcap", test))]
 mod clocks;
 mod columns;
 mod correlation;
@@ -85,6 +84,7 @@ mod stamp;
 mod variables;
 
 pub use crate::character::{Character, character};
+pub use crate::clocks::{Clock, Series};
 pub use crate::correlation::Correlation;
 pub use crate::csv::{CsvBlocks, CsvLines, parse_csv, read_csv, write_csv, write_csv_file};
 pub use crate::error::{Place, RecordingError};

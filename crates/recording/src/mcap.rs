@@ -171,6 +171,7 @@ fn clock(topic: Topic, times: &[i64], stamped: bool, first: i64) -> Clock {
     Clock {
         series: series.collect(),
         name: topic.name,
+        resolution: 0.0,
         time: times.iter().map(|time| time.saturating_sub(first) as f64 / 1e9).collect(),
     }
 }

@@ -10,6 +10,7 @@
 //! | matrix `y` beside `t`, one column per signal | `y_1`, `y_2`, … |
 //! | matrix `y` and texts `y_names`, `names`, `labels`, `columns` or `channels` | the texts, each `name` or `name [unit]`; one may be the time |
 //! | array of records with the fields `t`, `theta`, `v` | `theta`, `v` |
+//! | vectors `t_motor`, `motor_angle`, `t_load`, `load_angle` | `motor_angle`, `load_angle`, on one grid |
 //! | one matrix alone, its first column increasing | the array's name with `_1`, `_2`, …; that of a `.npy` is `y` |
 //!
 //! Numbers, truth values (0 and 1) and texts are read in both byte orders. Python objects (pickles), dates and complex
@@ -23,24 +24,30 @@ use crate::error::{Place, RecordingError};
 use crate::file::ROOM;
 use crate::layout;
 use crate::recording::Recording;
+use crate::selection::Selection;
 use crate::variables::{Value, Variable};
 
 /// Reads a recording called `name` from the bytes of an `.npz` or `.npy`.
 ///
 /// # Errors
 /// [`RecordingError::Format`], [`RecordingError::Damaged`] or [`RecordingError::TooLarge`] where the bytes cannot be read;
-/// [`RecordingError::NoTime`] or [`RecordingError::NoSignals`] where they make no recording; else as
-/// [`Recording::from_columns`].
+/// [`RecordingError::NoTime`], [`RecordingError::SeveralTimes`] or [`RecordingError::NoSignals`] where they make no recording;
+/// else as [`Recording::from_columns`] and, of several times, as [`Recording::from_clocks`].
 ///
 /// ```
 /// let error = greybox_recording::parse_npz(b"t,u\n0,1\n", "run1.npz").unwrap_err();
 /// assert!(error.to_string().starts_with("run1.npz: it is no archive of NumPy"));
 /// ```
 pub fn parse_npz(bytes: &[u8], name: &str) -> Result<Recording, RecordingError> {
-    parse(bytes, name, name)
+    parse(bytes, name, name, &Selection::default())
 }
 
-pub(crate) fn parse(bytes: &[u8], label: &str, name: &str) -> Result<Recording, RecordingError> {
+pub(crate) fn parse(
+    bytes: &[u8],
+    label: &str,
+    name: &str,
+    selection: &Selection,
+) -> Result<Recording, RecordingError> {
     let variables = variables(bytes, ROOM).map_err(|(variable, fault)| {
         let place = Place::file(label);
         match fault {
@@ -49,7 +56,7 @@ pub(crate) fn parse(bytes: &[u8], label: &str, name: &str) -> Result<Recording, 
             Fault::TooLarge => RecordingError::TooLarge { place, variable, limit_gib: ROOM >> 30 },
         }
     })?;
-    layout::recording(&variables, label, name)
+    layout::recording(&variables, label, name, selection)
 }
 
 /// The fix for what is not read.

@@ -1,5 +1,7 @@
 //! Numbers as files hold them: their kind, size and byte order.
 
+use crate::variables::Class;
+
 /// How a number is written.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub(crate) struct Number {
@@ -14,12 +16,17 @@ pub(crate) enum Kind {
     Signed,
     Unsigned,
     Float,
+    /// Truth values: 0 and 1.
+    Truth,
 }
 
 impl Number {
-    /// Whether digits end after seven or earlier.
-    pub(crate) fn is_single(self) -> bool {
-        self.kind == Kind::Float && self.size < 8
+    pub(crate) fn class(self) -> Class {
+        match (self.kind, self.size) {
+            (Kind::Truth, _) => Class::Truth,
+            (Kind::Float, 0..8) => Class::Single,
+            _ => Class::Double,
+        }
     }
 
     /// Whether it is a unit of UTF-16, as of MATLAB's texts.
@@ -57,7 +64,7 @@ impl Number {
     fn one(self, bytes: &[u8]) -> f64 {
         let raw = self.raw(bytes);
         match (self.kind, self.size) {
-            (Kind::Unsigned, _) => raw as f64,
+            (Kind::Unsigned | Kind::Truth, _) => raw as f64,
             (Kind::Signed, size) => {
                 let unused = 64 - 8 * size as u32;
                 ((raw << unused).cast_signed() >> unused) as f64

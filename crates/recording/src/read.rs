@@ -60,16 +60,16 @@ pub fn parse(
     name: &str,
     selection: &Selection,
 ) -> Result<Recording, RecordingError> {
-    #[cfg(not(feature = "mcap"))]
+    #[cfg(not(any(feature = "mcap", feature = "mat")))]
     let _ = selection;
     let ending = Path::new(name).extension().map(|e| e.to_string_lossy().to_ascii_lowercase());
     match ending.unwrap_or_default().as_str() {
         #[cfg(feature = "mat")]
-        "mat" => crate::mat::parse(bytes.into(), label, name),
+        "mat" => crate::mat::parse(bytes.into(), label, name, selection),
         #[cfg(feature = "hdf5")]
-        "h5" | "hdf5" => crate::hdf5::parse(bytes, label, name),
+        "h5" | "hdf5" => crate::hdf5::parse(bytes, label, name, selection),
         #[cfg(feature = "npz")]
-        "npz" | "npy" => crate::npz::parse(&bytes, label, name),
+        "npz" | "npy" => crate::npz::parse(&bytes, label, name, selection),
         #[cfg(feature = "mcap")]
         "mcap" => crate::mcap::parse(&bytes, label, name, selection),
         #[cfg(feature = "parquet")]

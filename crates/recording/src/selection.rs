@@ -46,7 +46,7 @@ impl Selection {
 
     /// The channels to be read among the `available` ones of a file with several clocks; `None` = all of them, since nothing
     /// is selected, or something that is not there.
-    #[cfg(any(test, feature = "mcap"))]
+    #[cfg(any(test, feature = "mcap", feature = "mat"))]
     pub(crate) fn among<'a>(&'a self, available: &[&str]) -> Option<Vec<&'a str>> {
         let has = |name: &&str| available.contains(name);
         let channels = self.channels.iter().map(String::as_str);

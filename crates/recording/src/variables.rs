@@ -28,24 +28,34 @@ pub(crate) enum Value {
 pub(crate) struct Array {
     pub(crate) dimensions: Vec<usize>,
     pub(crate) values: Vec<f64>,
-    /// Whether they are of the class `single`, whose digits end after seven.
-    pub(crate) single: bool,
+    pub(crate) class: Class,
+}
+
+/// What kind of numbers an array holds.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub(crate) enum Class {
+    /// Floating-point numbers of 64 bits, and whole ones.
+    Double,
+    /// Floating-point numbers whose digits end after seven or earlier.
+    Single,
+    /// Truth values.
+    Truth,
 }
 
 #[cfg(any(feature = "hdf5", feature = "npz"))]
 impl Array {
     /// The array of numbers that stand row by row. Of more than two dimensions the first counts the samples there, and
     /// the last here.
-    pub(crate) fn by_rows(shape: &[usize], values: Vec<f64>, single: bool) -> Array {
+    pub(crate) fn by_rows(shape: &[usize], values: Vec<f64>, class: Class) -> Array {
         match *shape {
-            [] => Array { dimensions: vec![1, 1], values, single },
-            [n] => Array { dimensions: vec![n, 1], values, single },
+            [] => Array { dimensions: vec![1, 1], values, class },
+            [n] => Array { dimensions: vec![n, 1], values, class },
             [rows, columns] => {
                 let column = |c: usize| values.iter().skip(c).step_by(columns);
                 let values = (0..columns).flat_map(column).copied().collect();
-                Array { dimensions: vec![rows, columns], values, single }
+                Array { dimensions: vec![rows, columns], values, class }
             }
-            _ => Array { dimensions: shape.iter().rev().copied().collect(), values, single },
+            _ => Array { dimensions: shape.iter().rev().copied().collect(), values, class },
         }
     }
 }

@@ -3,6 +3,8 @@
 
 mod bad_files;
 mod blocks;
+#[cfg(any(feature = "npz", feature = "hdf5", feature = "mcap"))]
+mod corpus;
 mod files;
 mod hdf5;
 mod health;
@@ -12,3 +14,5 @@ mod npz;
 mod parquet;
 mod real_recordings;
 mod signals;
+#[cfg(any(feature = "npz", feature = "hdf5", feature = "mcap"))]
+mod sound;

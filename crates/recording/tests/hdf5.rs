@@ -2,7 +2,7 @@
 #![cfg(feature = "hdf5")]
 // Helpers of a test file are tests too; the lint configuration knows only the annotated functions.
 
-use crate::files::{self, headers};
+use crate::files::{self, headers, stands_at_every, third, told};
 use greybox_recording::{Recording, RecordingError, parse_hdf5, parse_mat, read};
 use std::path::{Path, PathBuf};
 
@@ -115,15 +115,39 @@ fn what_is_left_out_is_told() {
 #[test]
 fn what_is_no_recording_is_refused_with_its_help() {
     let error = |name: &str| parse_hdf5(bytes(name), "bad.h5").unwrap_err();
-    let two = error("two_clocks.h5");
-    assert!(matches!(two, RecordingError::SeveralTimes { .. }), "{two}");
-    assert!(two.to_string().contains("`fast.t`, `slow.t`"), "{two}");
     for (name, part) in [("loop.mat", "nested too deeply"), ("again.mat", "in circles")] {
         let circle = error(name).to_string();
         assert!(circle.contains("damaged in the variable `c") && circle.contains(part), "{circle}");
     }
     let text = parse_hdf5(b"t,v\n0,1\n".to_vec(), "bad.h5").unwrap_err();
     assert!(matches!(text, RecordingError::Damaged { .. }), "{text}");
+}
+
+#[test]
+fn groups_and_scales_with_times_of_their_own_are_joined() {
+    let [t, v, theta] = samples();
+    let (late, closed) = third(&theta);
+    let groups = recording("two_clocks.h5");
+    assert_eq!(headers(&groups), ["fast_v", "slow_v"]);
+    assert_eq!(groups.time, t);
+    stands_at_every(&groups, "fast_v", 1, &v);
+    stands_at_every(&groups, "slow_v", 2, &v);
+    for (name, wanted) in [
+        ("two_scales.h5", ["v", "closed", "theta"]),
+        ("two_rasters.mat", ["v [V]", "theta [deg]", "closed [1]"]),
+    ] {
+        let recording = recording(name);
+        assert_eq!(headers(&recording), wanted, "{name}");
+        assert_eq!(recording.dt(), 0.01);
+        stands_at_every(&recording, "v", 1, &v);
+        stands_at_every(&recording, "theta", 3, &late);
+        stands_at_every(&recording, "closed", 3, &closed);
+        let told = told(&recording);
+        assert!(
+            told.contains("has its own clock (33.33 Hz)") && told.contains("(100 Hz), by at most 0 ms"),
+            "{told}"
+        );
+    }
 }
 
 #[test]

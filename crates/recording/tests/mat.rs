@@ -2,8 +2,8 @@
 #![cfg(feature = "mat")]
 // Helpers of a test file are tests too; the lint configuration knows only the annotated functions.
 
-use crate::files::headers;
-use greybox_recording::{Recording, RecordingError, parse_mat};
+use crate::files::{headers, stands_at_every, third, told};
+use greybox_recording::{Recording, RecordingError, Selection, parse_mat};
 use std::path::Path;
 
 fn bytes(name: &str) -> Vec<u8> {
@@ -66,6 +66,84 @@ fn signals_of_one_clock_are_put_together() {
     is_the_experiment(&recording, "v", "theta", 1e-12);
 }
 
+/// Time, voltage and angle of 60 samples.
+fn experiment() -> [Vec<f64>; 3] {
+    let of = |signal: fn(f64) -> f64| (0..60).map(|k| signal(0.01 * f64::from(k))).collect();
+    [of(|t| t), of(|t| (3.0 * t).sin()), of(|t| (2.0 * t).cos())]
+}
+
+#[test]
+fn structures_with_times_of_their_own_are_joined() {
+    let [t, v, theta] = experiment();
+    let recording = read("two_clocks");
+    assert_eq!(headers(&recording), ["v", "theta"]);
+    assert_eq!(recording.time, t);
+    let near = |a: f64, b: f64| assert!((a - b).abs() < 1e-15, "{a} {b}");
+    let values = |name: &str| recording.channel(name).unwrap().values.clone();
+    values("v").iter().zip(&v).for_each(|(a, b)| near(*a, *b));
+    values("theta").iter().step_by(2).zip(&theta).for_each(|(a, b)| near(*a, *b));
+    assert!(values("theta").iter().skip(1).step_by(2).all(|x| x.is_nan()));
+    let told = told(&recording);
+    assert!(told.contains("`fast.t` ends at t = 0.59 s"), "{told}");
+    assert!(
+        told.contains("`slow.t` has its own clock (50 Hz)") && told.contains("of `fast.t` (100 Hz)"),
+        "{told}"
+    );
+}
+
+#[test]
+fn each_signal_finds_its_time() {
+    let [t, v, theta] = experiment();
+    let (late, closed) = third(&theta);
+    for (name, [volts, angle], rows) in [
+        ("dspace_index", ["v [V]", "theta [deg]"], 20),
+        ("dspace_raster", ["v [V]", "theta [deg]"], 20),
+        ("timeseries", ["v", "theta [deg]"], 58),
+        ("flat", ["motor_v", "load_theta"], 58),
+    ] {
+        let recording = read(name);
+        assert!(headers(&recording).contains(&volts.to_owned()), "{name}: {:?}", headers(&recording));
+        assert!(headers(&recording).contains(&angle.to_owned()), "{name}: {:?}", headers(&recording));
+        let bare = |header: &str| header.split(' ').next().unwrap().to_owned();
+        assert_eq!(recording.time, t[..rows], "{name}");
+        close(&recording, &bare(volts), 1, &v);
+        close(&recording, &bare(angle), 3, &late);
+    }
+    stands_at_every(&read("flat"), "load_closed", 3, &closed);
+    stands_at_every(&read("flat"), "on", 1, &(0..60).map(|k| f64::from(k % 2)).collect::<Vec<f64>>());
+}
+
+/// As [`stands_at_every`], up to the last digit of another library's sine.
+#[track_caller]
+fn close(recording: &Recording, channel: &str, every: usize, samples: &[f64]) {
+    for (k, value) in recording.channel(channel).unwrap().values.iter().enumerate() {
+        match k % every {
+            0 => assert!((value - samples[k / every]).abs() < 1e-15, "{channel} {k}"),
+            _ => assert!(value.is_nan(), "{channel} {k}"),
+        }
+    }
+}
+
+#[test]
+fn the_selection_says_which_clocks_count() {
+    let selected = |channels: &[&str], named: &[&str]| {
+        let selection = Selection {
+            channels: channels.iter().map(|&c| c.to_owned()).collect(),
+            named: named.iter().map(|&n| vec![n.to_owned()]).collect(),
+        };
+        greybox_recording::parse(bytes("flat"), "flat.mat", "flat.mat", &selection).unwrap()
+    };
+    let slow = selected(&["load_theta"], &[]);
+    assert_eq!((headers(&slow), slow.dt(), slow.time.len()), (vec!["load_theta".to_owned()], 0.03, 20));
+    assert!(told(&slow).is_empty());
+    assert_eq!(headers(&selected(&["load_theta"], &["motor_v"])), ["motor_v", "load_theta"]);
+    assert_eq!(headers(&selected(&[], &["load_closed", "load_theta"])), ["load_theta", "load_closed"]);
+    assert_eq!(selected(&["none"], &[]).channels.len(), 4);
+    // A truth value stays, whereas of what moves nothing is known after its last sample.
+    assert_eq!(selected(&["motor_v", "load_closed"], &[]).time.len(), 60);
+    assert_eq!(selected(&["motor_v", "load_theta"], &[]).time.len(), 58);
+}
+
 #[test]
 fn what_is_left_out_or_assumed_is_told() {
     let left_out = read("vectors_v6");
@@ -84,10 +162,12 @@ fn what_is_left_out_or_assumed_is_told() {
 #[test]
 fn what_is_no_recording_is_refused_with_its_help() {
     let error = |name: &str| parse_mat(&bytes(name), "bad.mat").unwrap_err();
-    let two = error("two_clocks");
-    assert!(matches!(two, RecordingError::SeveralTimes { .. }), "{two}");
-    for part in ["bad.mat: ", "`fast.t`, `slow.t`", "in a file of its own"] {
-        assert!(two.to_string().contains(part), "{two}");
+    let unclear = error("dspace_unclear");
+    assert!(matches!(unclear, RecordingError::SeveralTimes { .. }), "{unclear}");
+    for part in
+        ["bad.mat: `run.Y(1).Data`", "`run.X(1).Data`, `run.X(2).Data`", "a structure or group of its own"]
+    {
+        assert!(unclear.to_string().contains(part), "{unclear}");
     }
     let timeless = error("no_time");
     for part in

@@ -85,7 +85,7 @@ fn a_command_is_laid_on_the_clock_of_the_state() {
         "`/cmd` has its own clock (20 Hz): its 24 samples were moved as they are to the nearest instants of `/joint_states` \
          (100 Hz), by at most 1 ms.",
         "those at which `/cmd` were logged",
-        "1 of 144 messages are left out",
+        "1 of 144 samples are left out",
     ] {
         assert!(told.contains(part), "{told}");
     }

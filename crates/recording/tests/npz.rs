@@ -2,8 +2,8 @@
 #![cfg(feature = "npz")]
 // Helpers of a test file are tests too; the lint configuration knows only the annotated functions.
 
-use crate::files::{self, headers};
-use greybox_recording::{Recording, RecordingError, parse_npz, read};
+use crate::files::{self, headers, stands_at_every, third, told};
+use greybox_recording::{Recording, RecordingError, Selection, parse_npz, read};
 use std::path::{Path, PathBuf};
 
 fn path(name: &str) -> PathBuf {
@@ -66,8 +66,33 @@ fn what_is_no_recording_is_refused_with_its_help() {
     let timeless = parse_npz(&bytes("no_time.npz"), "bad.npz").unwrap_err();
     assert!(matches!(timeless, RecordingError::NoTime { .. }), "{timeless}");
     assert!(timeless.to_string().contains("`v` (60×1), `theta` (60×1)"), "{timeless}");
+    let unclear = parse_npz(&bytes("unclear.npz"), "bad.npz").unwrap_err();
+    assert!(matches!(unclear, RecordingError::SeveralTimes { .. }), "{unclear}");
+    assert!(
+        unclear.to_string().starts_with("bad.npz: `gap` may belong to any of the times `t_a`, `t_b`"),
+        "{unclear}"
+    );
     let text = parse_npz(b"t,v\n0,1\n", "bad.npz").unwrap_err().to_string();
     assert!(text.contains("no archive of NumPy") && text.contains("np.savez"), "{text}");
+}
+
+#[test]
+fn times_find_their_signals_by_length_and_by_name() {
+    let [t, v, theta] = samples();
+    let (late, closed) = third(&theta);
+    for (name, fast) in [("two_times.npz", "motor_v"), ("beside.npz", "v")] {
+        let recording = recording(name);
+        assert_eq!(headers(&recording), [fast, "load_theta", "load_closed"], "{name}");
+        assert_eq!(recording.time, t[..58], "{name}");
+        stands_at_every(&recording, fast, 1, &v);
+        stands_at_every(&recording, "load_theta", 3, &late);
+        stands_at_every(&recording, "load_closed", 3, &closed);
+    }
+    let names = ["a_v", "b_theta"].map(str::to_owned).to_vec();
+    let selection = Selection { channels: names.clone(), ..Selection::default() };
+    let chosen = greybox_recording::parse(bytes("unclear.npz"), "a.npz", "a.npz", &selection).unwrap();
+    assert_eq!(headers(&chosen), names);
+    assert!(told(&chosen).contains("`t_b` has its own clock"), "{}", told(&chosen));
 }
 
 #[test]

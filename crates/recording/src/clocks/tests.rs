@@ -12,6 +12,7 @@ fn clock(name: &str, time: Vec<f64>, held: bool, signal: impl Fn(f64) -> f64) ->
         name: name.to_owned(),
         series: vec![Series { name: format!("{name}.x"), unit: None, held, values }],
         time,
+        resolution: 0.0,
     }
 }
 
@@ -119,7 +120,7 @@ fn only_what_all_clocks_cover_counts() {
     assert_eq!((together.time[0], together.time[together.time.len() - 1]), (0.5, 2.48));
     let told = told(&together);
     assert!(
-        told.contains("101 of 400 messages are left out (`b` begins at t = 0.5 s, `b` ends at t = 2.48 s)"),
+        told.contains("101 of 400 samples are left out (`b` begins at t = 0.5 s, `b` ends at t = 2.48 s)"),
         "{told}"
     );
     let early = clock("early", times(0.0, 100.0, 50), false, f64::sin);
@@ -196,5 +197,11 @@ fn names_are_unique_and_short_logs_are_refused() {
         .unwrap_err();
     assert!(matches!(short, RecordingError::TooFewRows { .. }), "{short}");
     let none = recording("log", "log", Vec::new(), Vec::new()).unwrap_err();
-    assert!(matches!(none, RecordingError::NoSeries { .. }), "{none}");
+    assert!(matches!(none, RecordingError::TooFewRows { rows: 0, .. }), "{none}");
+    let none = Recording::from_clocks("log", Vec::new()).unwrap_err();
+    assert!(matches!(none, RecordingError::NoChannels { .. }), "{none}");
+    let mut long = a();
+    long.series[0].values.push(0.0);
+    let long = Recording::from_clocks("log", vec![long]).unwrap_err();
+    assert!(matches!(long, RecordingError::ColumnLength { found: 51, expected: 50, .. }), "{long}");
 }

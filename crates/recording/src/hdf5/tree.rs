@@ -5,7 +5,7 @@
 
 use super::value::{described, number};
 use crate::header::{TIMES, seconds};
-use crate::variables::{Array, Value, Variable, rows_of};
+use crate::variables::{Array, Class, Value, Variable, rows_of};
 use ::hdf5_pure::{
     AttrValue, Dataset, Datatype, Error, File, FormatError, Group, Object, ReferenceType,
     VlenStringReadOptions,
@@ -141,7 +141,7 @@ impl Reader {
     ) -> Result<Content, Fault> {
         // All empty elements of cells may be one object.
         if attributes.contains_key("MATLAB_empty") {
-            return Ok(Content::Value(numbers(vec![0, 0], Vec::new(), false)));
+            return Ok(Content::Value(numbers(vec![0, 0], Vec::new(), Class::Double)));
         }
         self.visit(path, depth)?;
         match self.content(dataset, attributes, path, depth) {
@@ -204,7 +204,7 @@ impl Reader {
                             let values = number.read(&bytes, offset, *size as usize);
                             whole(path, values.len(), &shape)?;
                             self.charge(8 * values.len() as u64, path)?;
-                            by_rows(&shape, values, number.is_single())
+                            by_rows(&shape, values, number.class())
                         }
                         None => Value::Other(described(&member.datatype)),
                     };
@@ -220,8 +220,11 @@ impl Reader {
                     whole(path, values.len(), &shape)?;
                     match class {
                         // MATLAB's columns are HDF5's rows.
-                        Some(_) => numbers(shape.into_iter().rev().collect(), values, number.is_single()),
-                        None => by_rows(&shape, values, number.is_single()),
+                        Some(class) => {
+                            let class = if class == "logical" { Class::Truth } else { number.class() };
+                            numbers(shape.into_iter().rev().collect(), values, class)
+                        }
+                        None => by_rows(&shape, values, number.class()),
                     }
                 }
                 None => Value::Other(described(&datatype)),
@@ -337,13 +340,13 @@ fn whole(path: &str, found: usize, shape: &[usize]) -> Result<(), Fault> {
     }
 }
 
-fn numbers(dimensions: Vec<usize>, values: Vec<f64>, single: bool) -> Value {
-    Value::Numbers(Array { dimensions, values, single })
+fn numbers(dimensions: Vec<usize>, values: Vec<f64>, class: Class) -> Value {
+    Value::Numbers(Array { dimensions, values, class })
 }
 
 /// The array of numbers that stand row by row.
-fn by_rows(shape: &[usize], values: Vec<f64>, single: bool) -> Value {
-    Value::Numbers(Array::by_rows(shape, values, single))
+fn by_rows(shape: &[usize], values: Vec<f64>, class: Class) -> Value {
+    Value::Numbers(Array::by_rows(shape, values, class))
 }
 
 fn structure(fields: Fields) -> Value {
@@ -374,7 +377,7 @@ fn sort(members: &mut [Member], attributes: &Attributes) {
     members.sort_by(|a, b| (place(a), &a.name).cmp(&(place(b), &b.name)));
 }
 
-/// Calls the dimension scale that is a time `time`, where nothing is called so.
+/// Calls the dimension scale that is a time `time`, where nothing is called so, and several `time_NAME`.
 fn name_time(members: &mut [Member]) {
     let text = |m: &Member, name: &str| m.attributes.get(name).and_then(AttrValue::as_str).map(str::to_owned);
     let is_scale = |m: &Member| {
@@ -385,8 +388,9 @@ fn name_time(members: &mut [Member]) {
     if members.iter().any(|m| TIMES.contains(&m.name.as_str())) {
         return;
     }
-    let mut scales = members.iter_mut().filter(|m| is_scale(m));
-    if let (Some(scale), None) = (scales.next(), scales.next()) {
-        "time".clone_into(&mut scale.name);
+    let mut scales: Vec<&mut Member> = members.iter_mut().filter(|m| is_scale(m)).collect();
+    match scales.as_mut_slice() {
+        [scale] => "time".clone_into(&mut scale.name),
+        several => several.iter_mut().for_each(|scale| scale.name = format!("time_{}", scale.name)),
     }
 }

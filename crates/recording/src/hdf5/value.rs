@@ -40,7 +40,12 @@ pub(super) fn number(datatype: &Datatype) -> Option<Number> {
         Datatype::FloatingPoint { size, byte_order, layout } if IEEE.contains(&(*size, *layout)) => {
             Some(Number { kind: Kind::Float, size: *size as usize, big: big(byte_order)? })
         }
-        Datatype::Enumeration { base_type, .. } => number(base_type),
+        Datatype::Enumeration { base_type, members, .. } => {
+            let mut names: Vec<&str> = members.iter().map(|member| member.name.as_str()).collect();
+            names.sort_unstable();
+            let number = number(base_type)?;
+            Some(if names == ["FALSE", "TRUE"] { Number { kind: Kind::Truth, ..number } } else { number })
+        }
         _ => None,
     }
 }

@@ -6,7 +6,7 @@
 //! Nothing is reserved on the word of the file: what is read is there, what is unpacked counts against [`ROOM`].
 
 use crate::file::ROOM;
-use crate::variables::{Array, Value, Variable, rows_of};
+use crate::variables::{Array, Class, Value, Variable, rows_of};
 use flate2::bufread::ZlibDecoder;
 use std::io::Read;
 
@@ -186,7 +186,7 @@ fn unpack(element: &Element<'_>, room: &mut u64) -> Result<Vec<u8>, Fault> {
 
 /// Reads a variable, a field or a cell.
 fn matrix(element: &Element<'_>, big: bool, depth: usize, room: &mut u64) -> Result<Variable, Fault> {
-    let nothing = Array { dimensions: vec![0, 0], values: Vec::new(), single: false };
+    let nothing = Array { dimensions: vec![0, 0], values: Vec::new(), class: Class::Double };
     if element.kind != kind::MATRIX {
         return Err(damaged("there is something else than an array", element.at));
     }
@@ -199,11 +199,11 @@ fn matrix(element: &Element<'_>, big: bool, depth: usize, room: &mut u64) -> Res
     let mut source = Source { bytes: element.data, at: 0, big, origin: element.at };
     let mut flags = Source { at: 0, origin: source.origin, big, bytes: source.element()?.data };
     let flags = flags.number()?;
-    let (class, complex) = (flags & 0xff, flags & 0x800 != 0);
     // Objects of newer classes have no dimensions.
-    let dimensions = if class == class::OPAQUE { Vec::new() } else { dimensions(&source.element()?, big)? };
+    let dimensions =
+        if flags & 0xff == class::OPAQUE { Vec::new() } else { dimensions(&source.element()?, big)? };
     let name = text_of(&source.element()?, big);
-    let content = content(&mut source, class, complex, dimensions, depth, room);
+    let content = content(&mut source, flags, dimensions, depth, room);
     let value = content.map_err(|fault| match fault {
         Fault::Damaged { variable: None, what, at } if depth == 0 => {
             Fault::Damaged { variable: Some(name.clone()), what, at }
@@ -231,13 +231,13 @@ mod class {
 /// What stands behind flags, dimensions and name.
 fn content(
     source: &mut Source<'_>,
-    class: u32,
-    complex: bool,
+    flags: u32,
     dimensions: Vec<usize>,
     depth: usize,
     room: &mut u64,
 ) -> Result<Value, Fault> {
     let big = source.big;
+    let (class, complex, logical) = (flags & 0xff, flags & 0x800 != 0, flags & 0x200 != 0);
     let count = dimensions.iter().try_fold(1usize, |product, &d| product.checked_mul(d));
     let count = count.ok_or_else(|| damaged("its dimensions are too large", source.here()))?;
     match class {
@@ -258,7 +258,12 @@ fn content(
         class::DOUBLE..=class::UINT64 => {
             let element = source.element()?;
             let values = numbers(&element, big, count, room)?;
-            Ok(Value::Numbers(Array { dimensions, values, single: class == class::SINGLE }))
+            let class = match class {
+                _ if logical => Class::Truth,
+                class::SINGLE => Class::Single,
+                _ => Class::Double,
+            };
+            Ok(Value::Numbers(Array { dimensions, values, class }))
         }
         class::SPARSE => Ok(Value::Other("a sparse matrix")),
         class::FUNCTION => Ok(Value::Other("a function")),
@@ -417,7 +422,7 @@ mod tests {
                 .collect();
             let x = array(big, class::DOUBLE, &[1, 2], "x", &packed(big, &(kind::DOUBLE, &numbers)));
             let read = variables(&file(big, &[(kind::MATRIX, &x)])).unwrap();
-            let array = Array { dimensions: vec![1, 2], values: vec![1.5, -2.0], single: false };
+            let array = Array { dimensions: vec![1, 2], values: vec![1.5, -2.0], class: Class::Double };
             assert_eq!(read, [Variable { name: "x".into(), value: Value::Numbers(array) }]);
         }
     }

@@ -79,7 +79,8 @@ impl Kinds {
         let kind = match (letter, size) {
             ('f', 2 | 4 | 8) => Kind::Float,
             ('i', 1 | 2 | 4 | 8) => Kind::Signed,
-            ('u', 1 | 2 | 4 | 8) | ('b', 1) => Kind::Unsigned,
+            ('u', 1 | 2 | 4 | 8) => Kind::Unsigned,
+            ('b', 1) => Kind::Truth,
             ('U', length) => return Kinds::Text { length, wide: true, big },
             ('S', length) => return Kinds::Text { length, wide: false, big },
             ('c', size) => return Kinds::Other("complex numbers", Some(size)),
@@ -132,8 +133,8 @@ impl Data<'_> {
             Kinds::Number(number) => {
                 let values = number.read(data, offset, stride);
                 Value::Numbers(match self.by_columns && self.shape.len() > 1 {
-                    true => Array { dimensions: self.shape.clone(), values, single: number.is_single() },
-                    false => Array::by_rows(&self.shape, values, number.is_single()),
+                    true => Array { dimensions: self.shape.clone(), values, class: number.class() },
+                    false => Array::by_rows(&self.shape, values, number.class()),
                 })
             }
             Kinds::Text { wide, big, .. } => {

@@ -224,3 +224,26 @@ with h5py.File(path("two_clocks.h5"), "w") as file:
     for name, step in [("fast", 1), ("slow", 2)]:
         group = file.create_group(name)
         group["t"], group["v"] = step * t, v
+
+# Two rates: every third instant of t.
+with h5py.File(path("two_scales.h5"), "w") as file:
+    for scale, time in [("a", t), ("b", t[::3])]:
+        file[scale] = 1000 * time
+        file[scale].attrs["units"] = "ms"
+        file[scale].make_scale(scale)
+    for name, values, scale in [("v", v, "a"), ("theta", theta[::3], "b"), ("closed", k[::3] > 30, "b")]:
+        file[name] = values
+        file[name].dims[0].attach_scale(file[scale])
+
+mat = Mat("two_rasters.mat")
+run = mat.structure(mat.file, "run", "X", "Y")
+x = mat.structure(run, "X", "Data", "Raster")
+mat.references(x, "Data", [column(mat, t), column(mat, t[::3])])
+mat.references(x, "Raster", [text(mat, "fast"), text(mat, "slow")])
+y = mat.structure(run, "Y", "Name", "Data", "Unit", "Raster")
+mat.references(y, "Name", [text(mat, "theta"), text(mat, "v"), text(mat, "closed")])
+closed = lambda at, name: mat.logical(at, name, k[::3] > 30)
+mat.references(y, "Data", [column(mat, theta[::3]), column(mat, v), closed])
+mat.references(y, "Unit", [text(mat, "deg"), text(mat, "V"), text(mat, "1")])
+mat.references(y, "Raster", [text(mat, "slow"), text(mat, "fast"), text(mat, "slow")])
+mat.close()

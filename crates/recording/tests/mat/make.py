@@ -55,3 +55,25 @@ save("simulink_one", theta=structure(time=column(t), signals=structure(values=co
 save("nested", t=t, hub=structure(angle=column(theta)), link=structure(angle=column(v)))
 save("two_clocks", fast=structure(t=column(t), v=column(v)), slow=structure(t=column(2 * t), theta=column(theta)))
 save("no_time", v=v, theta=theta)
+
+# Two rates: every third instant of t.
+axis = lambda values, **fields: dict(Data=values.reshape(1, -1), **fields)
+late = t[::3]
+
+
+def dspace(name, **stated):
+    """Two times of one length; what each signal states of them."""
+    x = [axis(t[:20], Name="fast", Unit="s", Raster="fast"), axis(late, Name="slow", Unit="s", Raster="slow")]
+    y = [axis(theta[::3], Name="theta", Unit="deg"), axis(v[:20], Name="v", Unit="V")]
+    for field, values in stated.items():
+        for signal, value in zip(y, values):
+            signal[field] = value
+    save(name, run=structure(X=structures(*x), Y=structures(*y), Description="rig"))
+
+
+dspace("dspace_index", XIndex=(2.0, 1.0))
+dspace("dspace_raster", Raster=("slow", "fast"))
+dspace("dspace_unclear")
+series = lambda time, data, name: structure(Name=name, Time=column(time), Data=column(data))
+save("timeseries", v=series(t, v, "v"), theta=series(late, theta[::3], "theta [deg]"))
+save("flat", t_motor=t, motor_v=v, on=k % 2 == 1, load_t=late, load_theta=theta[::3], load_closed=k[::3] > 30)

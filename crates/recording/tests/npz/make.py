@@ -41,3 +41,9 @@ np.save(path("records.npy"), records)
 np.savez(path("records.npz"), run=records)
 np.save(path("matrix.npy"), np.column_stack([t, v, theta]))
 np.savez(path("no_time.npz"), v=v, theta=theta)
+
+# Two rates: every third instant of t.
+late = dict(load_theta=theta[::3], load_closed=k[::3] > 30)
+np.savez_compressed(path("two_times.npz"), t_motor=t, motor_v=v, t_load=t[::3], **late)
+np.savez_compressed(path("beside.npz"), t=t, v=v, t_load=t[::3], **late)
+np.savez_compressed(path("unclear.npz"), t_a=t, a_v=v, t_b=t + 0.003, b_theta=theta, gap=v - theta)
