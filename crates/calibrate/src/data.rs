@@ -266,6 +266,49 @@ impl Data {
         })
     }
 
+    /// Every n-th sample of each piece. Inputs are means over what the samples left out held, so that an integrator that they
+    /// drive ends where it did: of a held input over the n samples from each on, of others with weights that fall to zero at
+    /// the neighbours' samples. What is known of the noise is that of all samples.
+    pub fn thinned(&self, model: &Model, every: usize) -> Data {
+        let every = every.max(1);
+        let pick = |values: &[f64]| -> Vec<f64> { values.iter().step_by(every).copied().collect() };
+        let piece = |piece: &PieceData| {
+            let thin = |(u, input): (&Vec<f64>, &Input)| match input.hold {
+                Hold::Zero => {
+                    u.chunks(every).map(|held| held.iter().sum::<f64>() / held.len() as f64).collect()
+                }
+                Hold::Linear | Hold::BandLimited => hats(u, every),
+            };
+            let smooth = |s: &Smoothed| Smoothed {
+                value: pick(&s.value),
+                d1: pick(&s.d1),
+                d2: pick(&s.d2),
+                window: s.window.div_ceil(every),
+                derivative_window: s.derivative_window.div_ceil(every),
+                ..s.clone()
+            };
+            let measured: Vec<Vec<f64>> = piece.measured.iter().map(|y| pick(y)).collect();
+            PieceData {
+                recording: piece.recording,
+                rows: piece.rows.clone(),
+                start: piece.start,
+                dt: piece.dt * every as f64,
+                len: piece.len.div_ceil(every),
+                inputs: piece.inputs.iter().zip(&model.inputs).map(thin).collect(),
+                measured,
+                smooth: piece.smooth.iter().map(smooth).collect(),
+                fine: piece.inputs.iter().map(|_| OnceLock::new()).collect(),
+            }
+        };
+        Data {
+            recordings: self.recordings.clone(),
+            channels: self.channels.clone(),
+            pieces: self.pieces.iter().map(piece).collect(),
+            sigma: self.sigma.clone(),
+            spread: self.spread.clone(),
+        }
+    }
+
     /// Environments of all pieces under the given holds (one per input).
     pub fn environments(&self, holds: &[Hold]) -> Vec<Environment> {
         self.pieces
@@ -357,6 +400,17 @@ impl Data {
             })
             .unzip()
     }
+}
+
+/// Means of a signal about every n-th sample, with weights that fall linearly to zero at n samples from it.
+fn hats(u: &[f64], every: usize) -> Vec<f64> {
+    let mean = |at: usize| {
+        let (from, to) = (at.saturating_sub(every - 1), (at + every).min(u.len()));
+        let weight = |k: usize| (every - k.abs_diff(at)) as f64;
+        let sum: f64 = (from..to).map(|k| weight(k) * u[k]).sum();
+        sum / (from..to).map(weight).sum::<f64>()
+    };
+    (0..u.len()).step_by(every).map(mean).collect()
 }
 
 /// How to give the model, which looks for `channel`, one that the recording has; `name` is that of the input or state, with

@@ -29,7 +29,8 @@ use crate::error::RecursiveError;
 /// The price: one number, however far off, adds Φ⁻¹(1 − 1/(2n)) at most (2.6 of a hundred, 3.3 of a thousand), so that an alarm
 /// takes a few. Ranks are those among the last thousand numbers.
 ///
-/// After an alarm, [`restart`](Self::restart) begins anew: what it became is what it is from then on.
+/// After an alarm, [`restart`](Self::restart) begins anew: what it became is what it is from then on. Where the numbers are
+/// what they were again (the change has been taken out of them), [`resume`](Self::resume) goes on with the last ranks instead.
 ///
 /// ```
 /// use greybox_recursive::{Chart, Direction};
@@ -249,6 +250,22 @@ impl Chart {
         (1.0 + correlation) / (1.0 - correlation)
     }
 
+    /// Goes on after an alarm: the sums begin anew, and numbers are ranked among the last `kept` of before; the `changed` last
+    /// ones are forgotten. Where the numbers that come have the mean `mean`, those that are kept are moved to it.
+    pub fn resume(&mut self, kept: usize, changed: usize, mean: Option<f64>) {
+        let oldest = self.oldest.min(self.values.len());
+        self.values.rotate_left(oldest);
+        self.values.truncate(self.values.len().saturating_sub(changed));
+        self.values.drain(..self.values.len().saturating_sub(kept));
+        self.recent.truncate(self.recent.len().saturating_sub(changed));
+        if let Some(mean) = mean.filter(|m| m.is_finite()) {
+            let shift = mean - self.mean();
+            self.values.iter_mut().for_each(|v| *v += shift);
+        }
+        self.oldest = 0;
+        (self.up, self.down) = (Sum::ZERO, Sum::ZERO);
+    }
+
     /// Forgets all, and learns anew what is usual.
     pub fn restart(&mut self) {
         self.values.clear();
@@ -341,6 +358,45 @@ mod tests {
         assert!((5.0..12.0).contains(&mean(&delays)), "{}", mean(&delays));
         // (By chance the sum is above zero when the change comes: its last zero lies earlier.)
         assert!((0.0..3.0).contains(&mean(&sinces)), "{}", mean(&sinces));
+    }
+
+    /// Numbers that go on as before are ranked among those of before: as many false alarms as stated, and the next change is
+    /// seen as soon as the first.
+    #[test]
+    fn a_chart_that_goes_on_knows_what_is_usual() {
+        let mut rng = rand_pcg::Pcg64::seed_from_u64(5);
+        let mut normal = || -> f64 { StandardNormal.sample(&mut rng) };
+        let (mut delays, mut resumed) = ([0u32; 2], Chart::new(1.0, 1e5).unwrap());
+        for _ in 0..100 {
+            let mut chart = Chart::new(1.0, 1e5).unwrap();
+            for _ in 0..MOST + 300 {
+                chart.push(normal());
+            }
+            chart.resume(100, 0, None);
+            assert_eq!((chart.count(), chart.level()), (100, 0.0));
+            let last = chart.values.clone();
+            chart.resume(1000, 0, Some(f64::NAN));
+            assert_eq!(chart.values, last);
+            resumed = chart.clone();
+            chart.restart();
+            for (chart, delay) in [&mut chart, &mut resumed].into_iter().zip(&mut delays) {
+                *delay += (0..200).take_while(|_| chart.push(normal() + 2.0).is_none()).count() as u32;
+            }
+        }
+        // (A chart that begins anew takes the change for what is usual.)
+        assert!(delays[1] < 1200 && delays[0] > 10 * delays[1], "{delays:?}");
+        let (asked, mut sum) = (300.0, 0.0);
+        for _ in 0..400 {
+            let mut chart = Chart::new(1.0, asked).unwrap();
+            for k in 0..208 {
+                chart.push(normal() + if k < 200 { 0.0 } else { 30.0 });
+            }
+            chart.resume(200, 8, Some(5.0));
+            sum += (1..1_000_000).find(|_| chart.push(normal() + 5.0).is_some()).unwrap() as f64;
+        }
+        let ratio = sum / 400.0 / asked;
+        assert!((0.9..1.4).contains(&ratio), "{ratio}");
+        assert!(resumed.count() >= 100);
     }
 
     #[test]

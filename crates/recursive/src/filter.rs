@@ -269,12 +269,19 @@ impl Filter {
         }
     }
 
-    /// The state of another filter of the same shape, with its uncertainty; its sensitivities are not taken over.
+    /// The state of another filter with its uncertainty, and its sensitivities by the first parameters, as many as both have;
+    /// those by others begin anew.
     pub fn take_state(&mut self, from: &Filter) {
-        if from.n == self.n {
-            self.state.copy_from_slice(&from.state);
-            self.root.copy_from_slice(&from.root);
-            self.sensitivity.fill(0.0);
+        if from.n != self.n {
+            return;
+        }
+        self.state.copy_from_slice(&from.state);
+        self.root.copy_from_slice(&from.root);
+        self.sensitivity.fill(0.0);
+        let (p, both) = (self.p, self.p.min(from.p));
+        for i in 0..self.n {
+            self.sensitivity[i * p..i * p + both]
+                .copy_from_slice(&from.sensitivity[i * from.p..i * from.p + both]);
         }
     }
 }

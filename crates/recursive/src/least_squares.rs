@@ -135,6 +135,44 @@ impl LeastSquares {
         true
     }
 
+    /// Learns what another estimator of the same parameters knows, its prior included, of those that are `shared`; the others
+    /// are other parameters there, about which it may know anything.
+    pub fn merge(&mut self, other: &LeastSquares, shared: impl Fn(usize) -> bool) {
+        if other.n != self.n {
+            return;
+        }
+        // Ordered so that the factor's last rows are without the others.
+        let order: Vec<usize> =
+            (0..self.n).filter(|k| !shared(*k)).chain((0..self.n).filter(|k| shared(*k))).collect();
+        let own = order.iter().filter(|k| !shared(**k)).count();
+        let width = self.n + 1;
+        let mut factor = vec![0.0; self.n * width];
+        for row in other.factor.chunks_exact(width) {
+            order.iter().enumerate().for_each(|(to, from)| self.row[to] = row[*from]);
+            self.row[self.n] = row[self.n];
+            absorb(&mut factor, self.n, &mut self.row);
+        }
+        for row in factor.chunks_exact(width).skip(own) {
+            order.iter().enumerate().for_each(|(from, to)| self.row[*to] = row[from]);
+            self.row[self.n] = row[self.n];
+            absorb(&mut self.factor, self.n, &mut self.row);
+        }
+    }
+
+    /// Square of the distance of a point from the estimate, in its standard deviations: of the parameters themselves, χ² with as
+    /// many degrees of freedom as there are of them. Infinite where the lengths differ.
+    pub fn distance(&self, from: &[f64]) -> f64 {
+        if from.len() != self.n {
+            return f64::INFINITY;
+        }
+        let width = self.n + 1;
+        let left = |k: usize| -> f64 {
+            let row = &self.factor[k * width..(k + 1) * width];
+            row[self.n] - row[k..self.n].iter().zip(&from[k..]).map(|(r, x)| r * x).sum::<f64>()
+        };
+        (0..self.n).map(|k| left(k) * left(k)).sum()
+    }
+
     /// The estimate θ̂.
     pub fn estimate(&self) -> Vec<f64> {
         let mut out = vec![0.0; self.n];
@@ -237,6 +275,39 @@ mod tests {
         }
         // 1200 of them: 0.95 ± 3 · 0.0063.
         assert!((1117..=1163).contains(&within), "{within} of 1200");
+    }
+
+    /// Two stretches of which the first two parameters are the same, and the third is not: as one regression of four.
+    #[test]
+    fn what_is_shared_is_learned_from_another() {
+        let [mut first, mut second] = [(); 2].map(|()| LeastSquares::new(&[0.0; 3], &[10.0; 3]).unwrap());
+        let mut all =
+            LeastSquares::new(&[0.0; 4], &[10.0 / 2f64.sqrt(), 10.0 / 2f64.sqrt(), 10.0, 10.0]).unwrap();
+        for (row, y) in rows(30, 3) {
+            first.update(&row, y + 3.0 * row[2]);
+            all.update(&[row[0], row[1], row[2], 0.0], y + 3.0 * row[2]);
+        }
+        for (row, y) in rows(20, 4) {
+            second.update(&row, y);
+            all.update(&[row[0], row[1], 0.0, row[2]], y);
+        }
+        second.merge(&first, |k| k < 2);
+        let (x, together) = (second.estimate(), all.estimate());
+        for (k, l) in [(0, 0), (1, 1), (2, 3)] {
+            assert!((x[k] - together[l]).abs() < 1e-12, "{x:?} {together:?}");
+            assert!((second.deviations()[k] - all.deviations()[l]).abs() < 1e-12);
+        }
+        assert!(second.distance(&x) < 1e-20 && second.distance(&[0.0]).is_infinite());
+        let (moved, covariance) = ([x[0] + 0.3, x[1], x[2]], second.covariance());
+        // Along the first parameter alone: the step over its standard deviation where the others are known.
+        let others = covariance[4] * covariance[8] - covariance[5] * covariance[7];
+        let det = covariance[0] * others
+            - covariance[1] * (covariance[3] * covariance[8] - covariance[5] * covariance[6])
+            + covariance[2] * (covariance[3] * covariance[7] - covariance[4] * covariance[6]);
+        assert!((second.distance(&moved) - 0.09 * others / det).abs() < 1e-9);
+        let before = second.clone();
+        second.merge(&all, |_| true);
+        assert_eq!(second.estimate(), before.estimate());
     }
 
     /// Without excitation the covariance stays the prior's and the estimate goes back to it: no wind-up.

@@ -15,3 +15,4 @@ pub use chart::{Alarm, Chart, Direction};
 pub use error::RecursiveError;
 pub use filter::{Filter, Innovation, Measured, Predicted};
 pub use least_squares::LeastSquares;
+pub use triangle::Triangle;

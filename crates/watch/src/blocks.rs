@@ -1,6 +1,6 @@
 //! Innovations of a block of samples: what each single change would explain of them.
 
-use greybox_recursive::{Innovation, LeastSquares};
+use greybox_recursive::{Innovation, LeastSquares, Triangle};
 use serde::{Deserialize, Serialize};
 
 /// Standard deviation of an effect, in those of a block's innovations, up to which all effects together are fitted.
@@ -10,8 +10,9 @@ const WIDE: f64 = 1e3;
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub(crate) struct Block {
     effects: usize,
-    /// Per channel the rows [ψ | ν].
-    rows: Vec<Vec<f64>>,
+    /// Per channel the triangular factor of the rows [ψ | ν].
+    channels: Vec<Triangle>,
+    row: Vec<f64>,
 }
 
 /// What a block says of every single change δ: Σ ψν and Σ ψ².
@@ -43,6 +44,10 @@ impl Scores {
         sum
     }
 
+    pub(crate) fn deviates(&self) -> Vec<f64> {
+        (0..self.gradient.len()).map(|h| self.deviate(h)).collect()
+    }
+
     /// Σψν/√Σψ²: of variance one where the innovations are white, and far from zero where this change happened.
     pub(crate) fn deviate(&self, effect: usize) -> f64 {
         let information = self.information[effect];
@@ -58,55 +63,69 @@ impl Scores {
 
 impl Block {
     pub(crate) fn new(effects: usize, channels: usize) -> Block {
-        Block { effects, rows: vec![Vec::new(); channels] }
+        Block {
+            effects,
+            channels: vec![Triangle::new(effects + 1); channels],
+            row: Vec::with_capacity(effects + 1),
+        }
     }
 
     /// Whether it is one of so many effects and channels.
     pub(crate) fn is_consistent(&self, effects: usize, channels: usize) -> bool {
         self.effects == effects
-            && self.rows.len() == channels
-            && self.rows.iter().all(|r| r.len().is_multiple_of(effects + 1))
+            && self.channels.len() == channels
+            && self.channels.iter().all(|c| c.size() == Some(effects + 1))
     }
 
     pub(crate) fn push(&mut self, channel: usize, innovation: &Innovation<'_>) {
-        let rows = &mut self.rows[channel];
-        rows.extend_from_slice(innovation.row);
-        rows.push(innovation.value);
+        self.row.clear();
+        self.row.extend_from_slice(innovation.row);
+        self.row.push(innovation.value);
+        self.channels[channel].push(&self.row);
+    }
+
+    pub(crate) fn merge(&mut self, other: &Block) {
+        self.channels.iter_mut().zip(&other.channels).for_each(|(a, b)| a.merge(b));
     }
 
     pub(crate) fn clear(&mut self) {
-        self.rows.iter_mut().for_each(Vec::clear);
+        self.channels.iter_mut().for_each(Triangle::clear);
     }
 
-    fn rows(&self, channel: usize) -> impl Iterator<Item = (&[f64], f64)> {
-        self.rows[channel].chunks_exact(self.effects + 1).map(|row| (&row[..self.effects], row[self.effects]))
+    /// Rows [ψ | ν] of a channel, as many as tell all sums of products.
+    fn rows<'a>(&'a self, channel: &'a Triangle) -> impl Iterator<Item = (&'a [f64], f64)> {
+        (0..=self.effects).map(|k| {
+            let row = channel.row(k);
+            (&row[..self.effects], row[self.effects])
+        })
     }
 
-    fn all(&self) -> impl Iterator<Item = (&[f64], f64)> {
-        (0..self.rows.len()).flat_map(|c| self.rows(c))
+    pub(crate) fn all(&self) -> impl Iterator<Item = (&[f64], f64)> {
+        self.channels.iter().flat_map(|c| self.rows(c))
     }
 
     pub(crate) fn scores(&self) -> Scores {
         let mut scores = Scores::zero(self.effects);
-        for (row, value) in self.all() {
-            for (h, psi) in row.iter().enumerate() {
-                scores.gradient[h] += psi * value;
-                scores.information[h] += psi * psi;
+        for channel in &self.channels {
+            for h in 0..self.effects {
+                scores.gradient[h] += channel.product(h, self.effects);
+                scores.information[h] += channel.product(h, h);
             }
-            scores.squares += value * value;
-            scores.count += 1.0;
+            scores.squares += channel.product(self.effects, self.effects);
+            scores.count += channel.count() as f64;
         }
         scores
     }
 
+    /// Σψᵢψⱼ for all j.
+    pub(crate) fn information(&self, effect: usize) -> Vec<f64> {
+        (0..self.effects).map(|j| self.channels.iter().map(|c| c.product(effect, j)).sum()).collect()
+    }
+
     /// RMS of each channel's innovations; NaN where none were measured.
     pub(crate) fn rms(&self) -> Vec<f64> {
-        (0..self.rows.len())
-            .map(|c| {
-                let n = self.rows(c).count() as f64;
-                (self.rows(c).map(|(_, v)| v * v).sum::<f64>() / n).sqrt()
-            })
-            .collect()
+        let last = self.effects;
+        self.channels.iter().map(|c| (c.product(last, last) / c.count() as f64).sqrt()).collect()
     }
 
     /// ln of each channel's mean square that all changes together do not explain; NaN where none were measured.
@@ -116,19 +135,20 @@ impl Block {
         let scaled = |row: &[f64]| -> Vec<f64> { row.iter().zip(&scale).map(|(r, s)| r * s).collect() };
         let zero = vec![0.0; self.effects];
         let Ok(mut fit) = LeastSquares::new(&zero, &vec![WIDE; self.effects]) else {
-            return vec![f64::NAN; self.rows.len()];
+            return vec![f64::NAN; self.channels.len()];
         };
         for (row, value) in self.all() {
             fit.update(&scaled(row), value);
         }
         let changes = fit.estimate();
-        (0..self.rows.len())
-            .map(|c| {
+        self.channels
+            .iter()
+            .map(|channel| {
                 let left = |(row, value): (&[f64], f64)| {
                     let explained: f64 = scaled(row).iter().zip(&changes).map(|(r, d)| r * d).sum();
                     (value - explained).powi(2)
                 };
-                (self.rows(c).map(left).sum::<f64>() / self.rows(c).count() as f64).ln()
+                (self.rows(channel).map(left).sum::<f64>() / channel.count() as f64).ln()
             })
             .collect()
     }
@@ -160,6 +180,8 @@ pub(crate) fn together(blocks: &[Scores], fewest: usize) -> usize {
 pub(crate) struct Ended {
     pub(crate) t: f64,
     pub(crate) scores: Scores,
+    /// Of every effect.
+    pub(crate) deviates: Vec<f64>,
     /// Per channel.
     pub(crate) scatter: Vec<f64>,
     pub(crate) block: Block,
@@ -167,9 +189,8 @@ pub(crate) struct Ended {
 
 impl Ended {
     /// The values of all charts.
-    pub(crate) fn values(&self) -> Vec<f64> {
-        let deviates = (0..self.scores.gradient.len()).map(|h| self.scores.deviate(h));
-        deviates.chain(self.scatter.iter().copied()).collect()
+    pub(crate) fn values(&self) -> impl Iterator<Item = f64> {
+        self.deviates.iter().chain(&self.scatter).copied()
     }
 }
 

@@ -5,8 +5,9 @@ use greybox_recursive::Direction;
 
 use crate::blocks::Ended;
 use crate::event::{Change, Estimates, Learned, Parameter, Subject};
+use crate::learn::Place;
 use crate::naming::{Explanation, alternatives, dispersion, likeliest};
-use crate::saved::Settling;
+use crate::saved::Known;
 use crate::watch::Watch;
 
 impl Watch {
@@ -19,17 +20,17 @@ impl Watch {
         }
     }
 
-    /// The best explanation as a change.
-    pub(crate) fn effect_change(&self, ended: &Ended, explanations: &[Explanation]) -> Change {
+    /// The best explanation as a change from a place.
+    pub(crate) fn effect_change(&self, ended: &Ended, explanations: &[Explanation], from: &Place) -> Change {
         let (model, free, nz) = (&self.machine.model, &self.now.usual.free, self.machine.system.nz);
         let best = explanations[0];
         let (before, unit) = match best.effect.checked_sub(free.len()) {
             None => {
                 let index = free[best.effect].index;
-                (self.now.usual.values[index], model.parameters[index].unit.clone())
+                (from.values[index], model.parameters[index].unit.clone())
             }
-            Some(j) if j < nz => (0.0, None),
-            Some(j) => (0.0, Some(model.measurements[j - nz].unit.of_difference())),
+            Some(j) if j < nz => (from.forces[j], None),
+            Some(j) => (from.offsets[j - nz], Some(model.measurements[j - nz].unit.of_difference())),
         };
         Change {
             t: ended.t,
@@ -46,12 +47,11 @@ impl Watch {
 
     /// The parameter that the followed model has moved the most, in its standard deviations, and those beside it whose
     /// likelihood is a twentieth of its or more.
-    pub(crate) fn parameter_change(&self, ended: &Ended) -> Change {
-        let now = &self.now;
-        let deviations = now.fit.deviations();
+    pub(crate) fn parameter_change(&self, ended: &Ended, known: &Known, from: &Place) -> Change {
+        let (now, Known { values, deviations, .. }) = (&self.now, known);
         let moved = |k: usize| {
             let index = now.usual.free[k].index;
-            now.values[index] - now.usual.values[index]
+            values[index] - from.values[index]
         };
         let gains: Vec<f64> = (0..deviations.len()).map(|k| (moved(k) / deviations[k]).powi(2)).collect();
         let (most, alternatives) = likeliest(&gains);
@@ -63,23 +63,21 @@ impl Watch {
             or: alternatives.into_iter().map(|k| self.subject(k)).collect(),
             direction: if moved(most) > 0.0 { Direction::Up } else { Direction::Down },
             since: ended.t,
-            before: reported(unit, now.usual.values[index]),
-            now: reported(unit, now.values[index]),
+            before: reported(unit, from.values[index]),
+            now: reported(unit, values[index]),
             std: difference(unit, deviations[most]),
             unit: unit.map(|u| u.text.clone()),
         }
     }
 
-    /// A channel that scatters more or less than it did, in standard deviations of before.
-    pub(crate) fn scatter_change(&self, ended: &Ended, change: &Settling, channel: usize) -> Change {
-        let mean = change.means[ended.scores.gradient.len() + channel];
-        let ratio = (0.5 * (ended.scatter[channel] - mean)).exp();
+    /// A channel that scatters by a factor of what it did.
+    pub(crate) fn scatter_change(&self, ended: &Ended, since: f64, channel: usize, ratio: f64) -> Change {
         Change {
             t: ended.t,
             subject: Subject::Noise(self.machine.model.measurements[channel].channel.clone()),
             or: Vec::new(),
             direction: if ratio > 1.0 { Direction::Up } else { Direction::Down },
-            since: change.since,
+            since,
             before: 1.0,
             now: ratio,
             std: 0.0,
@@ -127,6 +125,7 @@ impl Watch {
         let missing = model.states.iter().enumerate().map(|(j, state)| {
             let (value, std) = ended.scores.change(n + j);
             let std = std * self.now.inflation.sqrt();
+            let value = value + self.now.usual.place.forces[j];
             Parameter { name: state.name.clone(), value, std, unit: None }
         });
         Estimates {

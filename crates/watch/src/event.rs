@@ -14,7 +14,8 @@ pub enum Event {
     Estimates(Estimates),
     /// Something has changed.
     Changed(Change),
-    /// What changed has settled, and is usual from here on: the same change, known better.
+    /// What changed has settled, and is usual from here on: the same change, known better. Where something else has changed on
+    /// the way, it is told just before that.
     Settled(Change),
     /// Samples were not as they should be.
     Irregular(Irregular),
@@ -106,7 +107,7 @@ pub struct Change {
     pub direction: Direction,
     /// When it began, by maximum likelihood.
     pub since: f64,
-    /// Value before: zero for forces and offsets, one for the scatter.
+    /// Value before: one for the scatter.
     pub before: f64,
     /// Value since then. Of a parameter that has settled, where the followed model has it; else to first order.
     pub now: f64,
@@ -117,9 +118,10 @@ pub struct Change {
 }
 
 impl Change {
-    /// The change over the value before, where there is one.
+    /// The change over the value before, where there is one: a force or an offset is compared with nothing.
     pub fn relative(&self) -> Option<f64> {
-        (self.before != 0.0).then(|| (self.now - self.before) / self.before.abs())
+        let of_itself = matches!(self.subject, Subject::Parameter(_) | Subject::Noise(_));
+        (of_itself && self.before != 0.0).then(|| (self.now - self.before) / self.before.abs())
     }
 }
 

@@ -15,8 +15,14 @@ use crate::options::{BLOCK_SAMPLES, BLOCKS, Options};
 
 /// Steps of the fit.
 const ITERATIONS: usize = 60;
+/// Thinning from which on one step of the fourth order from sample to sample replaces those of higher ones.
+const CLOSE: usize = 8;
+/// Samples that are enough for the fit, as many as its shortest horizon corrects by; and samples that it takes at least in a
+/// period of the fastest channel.
+const ENOUGH: usize = 5000;
+const IN_PERIOD: f64 = 50.0;
 /// Standard deviation of a parameter of which nothing is known beforehand, over what the first seconds tell of it.
-const WIDE: f64 = 100.0;
+pub(crate) const WIDE: f64 = 100.0;
 
 /// A parameter that may move.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
@@ -54,12 +60,17 @@ pub(crate) enum Steps {
 }
 
 impl Steps {
-    /// Of a method that a recording chose; one that chooses its steps itself takes the steps of the fifth order.
-    fn of(method: Method) -> Steps {
+    /// Of a method that a recording thinned so much chose; one that chooses its steps itself takes the steps of the fifth order.
+    /// Between samples that are much closer, the fourth order is as good with as many evaluations.
+    fn of(method: Method, thinning: usize) -> Steps {
+        let least = |substeps: usize| substeps.div_ceil(thinning);
         match method {
-            Method::Rk4 { substeps } => Steps::Rk4(substeps),
-            Method::Dp5 { substeps } => Steps::Dp5(substeps),
-            Method::Dop853 { substeps } => Steps::Dop853(substeps),
+            Method::Rk4 { .. } | Method::Dp5 { .. } | Method::Dop853 { .. } if thinning >= CLOSE => {
+                Steps::Rk4(method.evaluations().max(4).div_ceil(4 * thinning))
+            }
+            Method::Rk4 { substeps } => Steps::Rk4(least(substeps)),
+            Method::Dp5 { substeps } => Steps::Dp5(least(substeps)),
+            Method::Dop853 { substeps } => Steps::Dop853(least(substeps)),
             Method::Adaptive { .. } => Steps::Dp5(4),
         }
     }
@@ -80,11 +91,55 @@ impl Steps {
     }
 }
 
+/// Where a model is, SI.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+pub(crate) struct Place {
+    /// All parameters of the model.
+    pub(crate) values: Vec<f64>,
+    /// A constant force per equation, in the unit of its highest derivative.
+    pub(crate) forces: Vec<f64>,
+    /// An offset per sensor.
+    pub(crate) offsets: Vec<f64>,
+}
+
+impl Place {
+    /// All that may change: parameters, forces, offsets.
+    pub(crate) fn effects(&self, free: &[Free]) -> Vec<f64> {
+        let parameters = free.iter().map(|f| self.values[f.index]);
+        parameters.chain(self.forces.iter().copied()).chain(self.offsets.iter().copied()).collect()
+    }
+
+    /// Goes to the effects `to`, or those of them that come first; how far. A bound is never reached, only half of the way
+    /// to it.
+    pub(crate) fn go(&mut self, free: &[Free], to: &[f64]) -> Vec<f64> {
+        let parameters = free.iter().map(|f| (Some(f.index), f.lower, f.upper));
+        let others = self.forces.len() + self.offsets.len();
+        let bounds: Vec<_> = parameters.chain((0..others).map(|_| (None, None, None))).collect();
+        let (forces, np) = (self.forces.len(), free.len());
+        let mut change = Vec::with_capacity(to.len());
+        for (k, (to, (index, lower, upper))) in to.iter().zip(bounds).enumerate() {
+            let at = match index {
+                Some(index) => &mut self.values[index],
+                None if k - np < forces => &mut self.forces[k - np],
+                None => &mut self.offsets[k - np - forces],
+            };
+            let to = match (lower, upper) {
+                (Some(low), _) if *to <= low => 0.5 * (*at + low),
+                (_, Some(high)) if *to >= high => 0.5 * (*at + high),
+                _ => *to,
+            };
+            change.push(to - *at);
+            *at = to;
+        }
+        change
+    }
+}
+
 /// What is usual.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub(crate) struct Usual {
-    /// All parameters of the model, SI.
-    pub(crate) values: Vec<f64>,
+    /// Where the model is.
+    pub(crate) place: Place,
     pub(crate) free: Vec<Free>,
     /// Standard deviation of each sensor, SI.
     pub(crate) noise: Vec<f64>,
@@ -124,7 +179,9 @@ pub(crate) fn learn(model: &Model, recording: &Recording, options: &Options) -> 
     if free.is_empty() {
         return Err(WatchError::NothingFree);
     }
-    let setup = Setup::new(model, data.clone(), free)?;
+    let thinning = thinning(&data);
+    let thin = if thinning > 1 { Arc::new(data.thinned(model, thinning)) } else { data.clone() };
+    let setup = Setup::new(model, thin, free)?;
     if !setup.system.rhs.delays.is_empty() || !setup.system.output.delays.is_empty() {
         return Err(WatchError::Delayed);
     }
@@ -136,14 +193,21 @@ pub(crate) fn learn(model: &Model, recording: &Recording, options: &Options) -> 
     let (x, covariance) = filter.start(&fitted.at, 0);
     let nx = x.len();
     let deviations = (0..nx).map(|i| covariance[i * nx + i].sqrt()).collect();
-    let usual = usual(&fitted, &filter.rate_noise(&fitted.at), weight);
+    let usual = usual(&fitted, &filter.rate_noise(&fitted.at), weight, thinning);
     let setup = fitted.at.setup;
     let indices = setup.free.iter().map(|f| f.index).collect();
     let machine = Machine::new(model.clone(), setup.system.clone(), usual.steps.method(), indices);
     Ok(First { machine, usual, start: (x, deviations), samples: samples(&data, recording.time[0]) })
 }
 
-fn usual(fitted: &Fitted, noise: &[RateNoise], weight: f64) -> Usual {
+/// Samples from one to the next that the fit takes: as long as enough are left, and many in a period of the fastest channel.
+fn thinning(data: &Data) -> usize {
+    let period = data.periods().into_iter().fold(f64::INFINITY, f64::min);
+    let slow = (period / IN_PERIOD) as usize;
+    (data.samples() / ENOUGH).min(slow).max(1)
+}
+
+fn usual(fitted: &Fitted, noise: &[RateNoise], weight: f64, thinning: usize) -> Usual {
     let at = &fitted.at;
     let n = fitted.pass.gradient.len();
     let finite = |v: f64| v.is_finite().then_some(v);
@@ -170,14 +234,18 @@ fn usual(fitted: &Fitted, noise: &[RateNoise], weight: f64) -> Usual {
             }
         })
         .collect();
-    let dt = at.setup.data.pieces.iter().max_by_key(|p| p.len).map_or(1.0, |p| p.dt);
+    let dt = at.setup.data.pieces.iter().max_by_key(|p| p.len).map_or(1.0, |p| p.dt) / thinning as f64;
     Usual {
-        values: at.parameters.clone(),
+        place: Place {
+            values: at.parameters.clone(),
+            forces: vec![0.0; at.setup.system.nz],
+            offsets: vec![0.0; at.setup.system.ny],
+        },
         free,
         noise: at.errors.noise(),
         rates: noise.iter().map(|r| Rate { entry: r.entry, intensity: r.intensity, slow: r.slow }).collect(),
         dt,
-        steps: Steps::of(at.setup.method),
+        steps: Steps::of(at.setup.method, thinning),
     }
 }
 

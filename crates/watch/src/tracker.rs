@@ -3,7 +3,7 @@
 use greybox_recursive::{Filter, Innovation, Measured, Predicted, RecursiveError};
 use serde::{Deserialize, Serialize};
 
-use crate::learn::{Sample, Usual};
+use crate::learn::{Place, Sample, Usual};
 use crate::machine::{Machine, Span, Step};
 
 /// What innovations are regressed on.
@@ -22,12 +22,22 @@ pub(crate) struct Tracker {
     effects: Effects,
 }
 
+/// Memory of a step, used anew by each.
+#[derive(Debug, Clone, Default)]
+pub(crate) struct Scratch {
+    step: Step,
+    wide: Vec<f64>,
+    rows: Vec<f64>,
+    noise: Vec<f64>,
+    before: Vec<f64>,
+    after: Vec<f64>,
+}
+
 /// What one sample is predicted with.
 pub(crate) struct Conditions<'a> {
     pub(crate) machine: &'a Machine,
     pub(crate) usual: &'a Usual,
-    /// All parameters, SI.
-    pub(crate) values: &'a [f64],
+    pub(crate) place: &'a Place,
     /// Seconds that the state remembers.
     pub(crate) memory: f64,
 }
@@ -60,52 +70,78 @@ impl Tracker {
     pub(crate) fn advance(
         &mut self,
         by: &Conditions<'_>,
-        from: &Sample,
-        to: &Sample,
+        (from, to): (&Sample, &Sample),
+        scratch: &mut Scratch,
         learn: impl FnMut(usize, Innovation<'_>),
     ) -> bool {
-        let (machine, usual) = (by.machine, by.usual);
-        let system = &machine.system;
-        let (nx, ny, np) = (system.nx, system.ny, machine.free().len());
-        let width = self.count(machine);
         // As many steps as samples should have been.
         let seconds = to.t - from.t;
-        let steps = (seconds / usual.dt).round().max(1.0);
+        let steps = (seconds / by.usual.dt).round().max(1.0);
         let dt = seconds / steps;
-        let mut step = Step::default();
-        let mut wide = vec![0.0; nx * width];
-        let mut before = from.inputs.clone();
+        scratch.before.clone_from(&from.inputs);
         for k in 0..steps as usize {
-            let after = machine.inputs_between(&from.inputs, &to.inputs, (k + 1) as f64 / steps);
-            let span = Span { from: from.t + dt * k as f64, dt, before: &before, after: &after };
-            let mut noise = vec![0.0; nx];
-            for rate in &usual.rates {
-                noise[rate.entry] = rate.variance(self.filter.state(), dt).sqrt();
-            }
-            if !machine.step(by.values, self.filter.state(), &span, &mut step) {
+            let share = (k + 1) as f64 / steps;
+            by.machine.inputs_between(&from.inputs, &to.inputs, share, &mut scratch.after);
+            if !self.predict(by, from.t + dt * k as f64, dt, scratch) {
                 return false;
             }
-            for i in 0..nx {
-                wide[i * width..i * width + np].copy_from_slice(&step.by_parameters[i * np..(i + 1) * np]);
-            }
-            if self.effects == Effects::Everything {
-                for j in 0..system.nz {
-                    wide[(system.offsets[j] + system.orders[j] - 1) * width + np + j] = dt;
-                }
-            }
-            let predicted = Predicted {
-                state: &step.state,
-                by_state: &step.by_state,
-                by_parameters: &wide,
-                noise: &noise,
-                memory: (-dt / by.memory).exp(),
-            };
-            if !self.filter.predict(&predicted) {
-                return false;
-            }
-            before = after;
+            std::mem::swap(&mut scratch.before, &mut scratch.after);
         }
-        let mut rows = vec![0.0; ny * width];
+        self.correct(by, to, scratch, learn);
+        self.filter.state().iter().all(|v| v.is_finite())
+    }
+
+    /// Goes over `dt` seconds.
+    fn predict(&mut self, by: &Conditions<'_>, from: f64, dt: f64, scratch: &mut Scratch) -> bool {
+        let Scratch { step, wide, noise, before, after, .. } = scratch;
+        let system = &by.machine.system;
+        let (nx, np, width) = (system.nx, by.machine.free().len(), self.count(by.machine));
+        noise.clear();
+        noise.resize(nx, 0.0);
+        for rate in &by.usual.rates {
+            noise[rate.entry] = rate.variance(self.filter.state(), dt).sqrt();
+        }
+        let span = Span { from, dt, before, after };
+        if !by.machine.step(&by.place.values, self.filter.state(), &span, step) {
+            return false;
+        }
+        wide.clear();
+        wide.resize(nx * width, 0.0);
+        for i in 0..nx {
+            wide[i * width..i * width + np].copy_from_slice(&step.by_parameters[i * np..(i + 1) * np]);
+        }
+        for (j, force) in by.place.forces.iter().enumerate() {
+            let top = system.offsets[j] + system.orders[j] - 1;
+            if self.effects == Effects::Everything {
+                wide[top * width + np + j] = dt;
+            }
+            step.state[top] += force * dt;
+            for c in 0..system.ny {
+                step.outputs[c] += step.outputs_by_state[c * nx + top] * force * dt;
+            }
+        }
+        self.filter.predict(&Predicted {
+            state: &step.state,
+            by_state: &step.by_state,
+            by_parameters: wide,
+            noise,
+            memory: (-dt / by.memory).exp(),
+        })
+    }
+
+    /// Corrects the state by what was measured.
+    fn correct(
+        &mut self,
+        by: &Conditions<'_>,
+        to: &Sample,
+        scratch: &mut Scratch,
+        learn: impl FnMut(usize, Innovation<'_>),
+    ) {
+        let Scratch { step, rows, .. } = scratch;
+        let system = &by.machine.system;
+        let (nx, ny, np, width) = (system.nx, system.ny, by.machine.free().len(), self.count(by.machine));
+        rows.clear();
+        rows.resize(ny * width, 0.0);
         for c in 0..ny {
             rows[c * width..c * width + np]
                 .copy_from_slice(&step.outputs_by_parameters[c * np..(c + 1) * np]);
@@ -114,13 +150,12 @@ impl Tracker {
             }
         }
         let measured = (0..ny).map(|c| Measured {
-            error: to.measured[c].map_or(f64::NAN, |y| y - step.outputs[c]),
+            error: to.measured[c].map_or(f64::NAN, |y| y - step.outputs[c] - by.place.offsets[c]),
             by_state: &step.outputs_by_state[c * nx..(c + 1) * nx],
             by_parameters: &rows[c * width..(c + 1) * width],
-            noise: usual.noise[c],
+            noise: by.usual.noise[c],
         });
         self.filter.correct(measured, learn);
-        self.filter.state().iter().all(|v| v.is_finite())
     }
 }
 

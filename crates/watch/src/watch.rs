@@ -6,23 +6,16 @@ use greybox_recursive::{Chart, LeastSquares};
 
 use crate::blocks::{Block, Ended};
 use crate::error::WatchError;
-use crate::event::{Change, Clock, Event, Irregular, Subject};
-use crate::first_pass::{FirstPass, first_pass};
-use crate::learn::{First, Sample, learn};
+use crate::event::{Clock, Event, Irregular};
+use crate::first_pass::first_pass;
+use crate::learn::{First, Place, Sample, learn};
 use crate::machine::Machine;
-use crate::naming::explanations;
 use crate::options::Options;
-use crate::saved::{Saved, Settling, VERSION};
-use crate::tracker::{Conditions, Effects, Tracker};
+use crate::saved::{Known, Saved, VERSION};
+use crate::tracker::{Conditions, Effects, Scratch, Tracker};
 
 /// The change that a chart is quickest for, in standard deviations of one block.
 const CHANGE: f64 = 1.0;
-/// Blocks that are remembered to tell how large a change is.
-const REMEMBERED: usize = 512;
-/// Share of the memory after which a change is known so well that its linearisation is good.
-const COARSE: f64 = 0.1;
-/// Most blocks that irregularities wait until they are reported.
-const MOST_WAIT: u32 = 256;
 
 /// A machine that is watched.
 ///
@@ -35,13 +28,26 @@ const MOST_WAIT: u32 = 256;
 /// approach). What a wrong model leaves in the scores at all times is part of what the charts, which compare ranks, take as usual.
 /// Where a chart exceeds its limit, the change is named that explains the blocks since its onset best; after one memory,
 /// the parameter that the followed model has moved most.
+///
+/// After an alarm the usual model is set free: everything that may change is estimated from the blocks since then, and the scores
+/// are recursive residuals, which a change that settles leaves as they were. So the charts go on.
 #[derive(Debug, Clone)]
 pub struct Watch {
     pub(crate) machine: Machine,
     pub(crate) now: Saved,
+    scratch: Scratch,
+    /// Memory of a sample: where the model is that follows the machine, its effects, and a row of its regression.
+    followed: Place,
+    at: Vec<f64>,
+    row: Vec<f64>,
 }
 
 impl Watch {
+    fn new(machine: Machine, now: Saved) -> Watch {
+        let followed = now.usual.place.clone();
+        Watch { machine, now, scratch: Scratch::default(), followed, at: Vec::new(), row: Vec::new() }
+    }
+
     /// Learns from the first seconds of a machine what is usual: parameters, noise, model error.
     ///
     /// # Errors
@@ -50,55 +56,69 @@ impl Watch {
     pub fn learn(model: &Model, first: &Recording, options: &Options) -> Result<(Watch, Event), WatchError> {
         options.check()?;
         let first = learn(model, first, options)?;
-        let FirstPass { block_seconds, rest, inflation } = first_pass(&first, options)?;
+        let pass = first_pass(&first, options)?;
         let First { machine, usual, start, samples } = first;
-        let (state, deviation) = (&start.0[..], &start.1[..]);
-        let reference = Tracker::new(&machine, (state, deviation), Effects::Everything)?;
-        let adaptive = Tracker::new(&machine, (state, deviation), Effects::Parameters)?;
+        let adaptive = Tracker::new(&machine, (&start.0, &start.1), Effects::Parameters)?;
         let (mean, std): (Vec<f64>, Vec<f64>) =
-            usual.free.iter().map(|f| (usual.values[f.index], f.std)).unzip();
-        let effects = reference.count(&machine);
-        let charts = effects + machine.system.ny;
-        let chart = Chart::new(CHANGE, charts as f64 * 86_400.0 / block_seconds / options.alarms_per_day)?;
-        let last = samples[0].clone();
+            usual.free.iter().map(|f| (usual.place.values[f.index], f.std)).unzip();
+        let charts = pass.tracker.count(&machine) + machine.system.ny;
+        let between = charts as f64 * 86_400.0 / pass.block_seconds / options.alarms_per_day;
         let now = Saved {
             version: VERSION,
             alarms_per_day: options.alarms_per_day,
             memory: options.memory,
-            block_seconds,
-            values: usual.values.clone(),
+            block_seconds: pass.block_seconds,
+            values: usual.place.values.clone(),
             fit: LeastSquares::new(&mean, &std)?,
             usual,
-            rest,
-            inflation,
-            reference,
+            rest: pass.rest,
+            inflation: pass.inflation,
+            wide: pass.wide,
+            reference: pass.tracker,
             adaptive,
-            charts: vec![chart; charts],
-            block: Block::new(effects, machine.system.ny),
-            began: last.t,
+            released: None,
+            louder: None,
+            charts: vec![Chart::new(CHANGE, between)?; charts],
+            block: pass.begun.0,
+            began: pass.begun.1,
             history: Vec::new(),
-            last,
+            last: samples.into_iter().next_back().ok_or(WatchError::Diverged)?,
             settling: None,
             irregular: Irregular::default(),
             wait: (0, 1),
         };
-        let mut watch = Watch { machine, now };
-        for sample in samples.into_iter().skip(1) {
-            if sample.t - watch.now.last.t > block_seconds {
-                watch.begin_anew(sample);
-            } else if let Some(ended) = watch.advance(sample) {
-                // (What a chart takes for a change here is still part of what is usual.)
-                let values = ended.values();
-                watch.now.charts.iter_mut().zip(values).for_each(|(chart, v)| {
-                    if chart.push(v).is_some() {
-                        chart.restart();
-                    }
-                });
-            }
-        }
-        watch.now.irregular = Irregular::default();
+        let mut watch = Watch::new(machine, now);
+        pass.blocks.iter().for_each(|block| watch.learn_block(block));
+        let now = &mut watch.now;
+        now.adaptive.filter.take_state(&now.reference.filter);
+        let change = now.usual.place.clone().go(&now.usual.free, &now.fit.estimate());
+        now.usual.free.iter().zip(&change).for_each(|(f, d)| now.values[f.index] += d);
+        now.adaptive.filter.follow(&change);
         let learned = watch.learned();
         Ok((watch, Event::Learned(learned)))
+    }
+
+    /// Takes a block of the learned seconds for what is usual.
+    fn learn_block(&mut self, block: &Block) {
+        let now = &mut self.now;
+        let scores = block.scores();
+        let values = scores.deviates().into_iter().chain(block.scatter(&scores));
+        now.charts.iter_mut().zip(values).for_each(|(chart, v)| {
+            // (What a chart takes for a change here is still part of what is usual.)
+            if chart.push(v).is_some() {
+                chart.restart();
+            }
+        });
+        now.fit.forget((-now.block_seconds / now.memory).exp());
+        let weight = 1.0 / now.inflation.sqrt();
+        let at = now.usual.place.effects(&now.usual.free);
+        let np = now.usual.free.len();
+        for (row, value) in block.all() {
+            let row: Vec<f64> = row[..np].iter().map(|r| weight * r).collect();
+            let here: f64 = row.iter().zip(&at).map(|(r, a)| r * a).sum();
+            now.fit.update(&row, weight * value + here);
+        }
+        now.remember(scores);
     }
 
     /// Goes on from a saved state.
@@ -107,11 +127,8 @@ impl Watch {
     /// [`WatchError::OtherModel`] where the state is another model's; [`WatchError::Setup`] where the model does not compile.
     pub fn restore(model: &Model, saved: Saved) -> Result<Watch, WatchError> {
         let other = |what: String| Err(WatchError::OtherModel { what });
-        if saved.version != VERSION {
-            return other(format!("it has version {}, and this is version {VERSION}", saved.version));
-        }
         let system = System::compile(model).map_err(greybox_calibrate::SetupError::from)?;
-        if saved.usual.values.len() != system.np || saved.usual.noise.len() != system.ny {
+        if saved.usual.place.values.len() != system.np || saved.usual.noise.len() != system.ny {
             return other("it has other parameters or channels".to_owned());
         }
         if saved.last.inputs.len() != system.nu || saved.rest.0.len() != system.nx {
@@ -125,7 +142,7 @@ impl Watch {
         }
         let free = saved.usual.free.iter().map(|f| f.index).collect();
         let machine = Machine::new(model.clone(), system.into(), saved.usual.steps.method(), free);
-        Ok(Watch { machine, now: saved })
+        Ok(Watch::new(machine, saved))
     }
 
     /// The state, to be saved.
@@ -174,7 +191,12 @@ impl Watch {
     /// The state begins anew where nothing is known of it but what it was on the average.
     fn begin_anew(&mut self, sample: Sample) {
         let now = &mut self.now;
-        for tracker in [&mut now.reference, &mut now.adaptive] {
+        let mut trackers = vec![&mut now.reference, &mut now.adaptive];
+        if let Some(before) = now.settling.as_mut().and_then(|s| s.before.as_mut()) {
+            trackers.push(&mut before.tracker);
+            before.block.clear();
+        }
+        for tracker in trackers {
             tracker.restart((&now.rest.0, &now.rest.1));
         }
         now.block.clear();
@@ -183,145 +205,123 @@ impl Watch {
 
     /// Takes a sample; a block that has ended.
     fn advance(&mut self, sample: Sample) -> Option<Ended> {
+        let kept = self.keep(&sample);
+        let kept_up = self.follow(&sample);
         let now = &mut self.now;
-        let block = &mut now.block;
-        let usual = Conditions {
-            machine: &self.machine,
-            usual: &now.usual,
-            values: &now.usual.values,
-            memory: now.memory,
-        };
-        let kept = now.reference.advance(&usual, &now.last, &sample, |c, i| block.push(c, &i));
-        let free = &now.usual.free;
-        let at: Vec<f64> = free.iter().map(|f| now.values[f.index]).collect();
-        let followed = Conditions { values: &now.values, ..usual };
-        let fit = &mut now.fit;
-        fit.forget((-(sample.t - now.last.t) / now.memory).exp());
-        let weight = 1.0 / now.inflation.sqrt();
-        let mut row = vec![0.0; at.len()];
-        let kept_up = now.adaptive.advance(&followed, &now.last, &sample, |_, i| {
-            row.iter_mut().zip(i.row).for_each(|(r, psi)| *r = weight * psi);
-            let here: f64 = row.iter().zip(&at).map(|(r, a)| r * a).sum();
-            fit.update(&row, weight * i.value + here);
-        });
         if !kept || !kept_up {
             now.irregular.diverged += 1;
+            // Parameters with which the model cannot be simulated are none to go on from.
+            if !kept && let Some(released) = &mut now.released {
+                released.fit.restart();
+                now.usual.place.go(&now.usual.free, &released.fit.estimate());
+                released.restart(now.usual.place.effects(&now.usual.free));
+            }
             if !kept_up {
-                // Parameters with which the model cannot be simulated are none to go on from.
-                now.values.clone_from(&now.usual.values);
+                now.values.clone_from(&now.usual.place.values);
                 now.fit.restart();
             }
             self.begin_anew(sample);
             return None;
         }
-        let estimate = fit.estimate();
-        let mut change = vec![0.0; at.len()];
-        for (k, f) in free.iter().enumerate() {
-            // A bound is never reached, only half of the way to it.
-            let to = match (f.lower, f.upper) {
-                (Some(low), _) if estimate[k] <= low => 0.5 * (at[k] + low),
-                (_, Some(high)) if estimate[k] >= high => 0.5 * (at[k] + high),
-                _ => estimate[k],
-            };
-            change[k] = to - at[k];
-            now.values[f.index] = to;
-        }
-        now.adaptive.filter.follow(&change);
         let t = sample.t;
         now.last = sample;
         if t - now.began < now.block_seconds - 0.5 * now.usual.dt {
             return None;
         }
         now.began = t;
+        Some(self.end_block(t))
+    }
+
+    /// The usual model takes a sample, and while a change settles, what was usual before. `false` where it leaves every bound.
+    fn keep(&mut self, sample: &Sample) -> bool {
+        let (machine, now, scratch) = (&self.machine, &mut self.now, &mut self.scratch);
+        let by = Conditions { machine, usual: &now.usual, place: &now.usual.place, memory: now.memory };
+        let (samples, block) = ((&now.last, sample), &mut now.block);
+        let kept = now.reference.advance(&by, samples, scratch, |c, i| block.push(c, &i));
+        if let Some(before) = now.settling.as_mut().and_then(|s| s.before.as_mut()) {
+            let (tracker, block) = (&mut before.tracker, &mut before.block);
+            let by = Conditions { place: &before.place, ..by };
+            if !tracker.advance(&by, samples, scratch, |c, i| block.push(c, &i)) {
+                tracker.restart((&now.rest.0, &now.rest.1));
+                block.clear();
+            }
+        }
+        kept
+    }
+
+    /// The model that follows the machine takes a sample. `false` where it leaves every bound.
+    fn follow(&mut self, sample: &Sample) -> bool {
+        let (machine, now, scratch) = (&self.machine, &mut self.now, &mut self.scratch);
+        // (While a change settles, parameters alone are to explain it.)
+        let before = now.settling.as_ref().and_then(|s| s.before.as_ref());
+        let others = before.map_or(&now.usual.place, |b| &b.place);
+        let place = &mut self.followed;
+        place.values.clone_from(&now.values);
+        place.forces.clone_from(&others.forces);
+        place.offsets.clone_from(&others.offsets);
+        let at = &mut self.at;
+        at.clear();
+        at.extend(now.usual.free.iter().map(|f| now.values[f.index]));
+        let fit = &mut now.fit;
+        fit.forget((-(sample.t - now.last.t) / now.memory).exp());
+        let weight = 1.0 / now.inflation.sqrt();
+        let row = &mut self.row;
+        let by = Conditions { machine, usual: &now.usual, place, memory: now.memory };
+        let kept_up = now.adaptive.advance(&by, (&now.last, sample), scratch, |_, i| {
+            row.clear();
+            row.extend(i.row.iter().map(|psi| weight * psi));
+            let here: f64 = row.iter().zip(&*at).map(|(r, a)| r * a).sum();
+            fit.update(row, weight * i.value + here);
+        });
+        if kept_up {
+            fit.estimate_into(at);
+            let change = place.go(&now.usual.free, at);
+            now.values.clone_from(&place.values);
+            now.adaptive.filter.follow(&change);
+        }
+        kept_up
+    }
+
+    /// A block ends: what it says, and where what is usual moves by it.
+    fn end_block(&mut self, t: f64) -> Ended {
+        let now = &mut self.now;
         let empty = Block::new(now.reference.count(&self.machine), self.machine.system.ny);
         let block = std::mem::replace(&mut now.block, empty);
         let scores = block.scores();
-        now.history.push(scores.clone());
-        if now.history.len() > REMEMBERED {
-            now.history.remove(0);
+        now.remember(scores.clone());
+        let scatter = block.scatter(&scores);
+        let deviates = match &now.released {
+            Some(released) => released.deviates(&block),
+            None => scores.deviates(),
+        };
+        let place = &mut now.usual.place;
+        if let Some(released) = &mut now.released {
+            let goes_on = released.learn(&block, &place.effects(&now.usual.free));
+            let change = place.go(&now.usual.free, &released.fit.estimate());
+            now.reference.filter.follow(&change);
+            if !goes_on {
+                now.released = None;
+            }
         }
-        Some(Ended { t, scatter: block.scatter(&scores), scores, block })
-    }
-
-    /// What a block has to say.
-    fn judge(&mut self, ended: &Ended, events: &mut Vec<Event>) {
-        let (wait, next) = self.now.wait;
-        self.now.wait = match (wait, self.now.irregular.is_empty()) {
-            (0, true) => (0, 1),
-            (0, false) => {
-                events.push(Event::Irregular(std::mem::take(&mut self.now.irregular)));
-                (next, (2 * next).min(MOST_WAIT))
+        if let Some(louder) = &mut now.louder {
+            let noise = &mut now.usual.noise[louder.channel];
+            match louder.learn(scatter[louder.channel], *noise) {
+                Some(next) => *noise = next,
+                None => now.louder = None,
             }
-            (wait, _) => (wait - 1, next),
-        };
-        events.push(Event::Estimates(self.estimates(ended)));
-        match self.now.settling.take() {
-            Some(change) if ended.t >= change.until => {
-                events.push(Event::Settled(self.settle(ended, &change)))
-            }
-            Some(mut change) => {
-                if change.again.take_if(|again| ended.t >= *again).is_some() {
-                    self.now.fit.restart();
-                }
-                self.now.settling = Some(change);
-            }
-            None => events.extend(self.alarm(ended).map(Event::Changed)),
         }
-    }
-
-    /// Puts a block on the charts, and says what has changed where one exceeds its limit.
-    fn alarm(&mut self, ended: &Ended) -> Option<Change> {
-        let now = &mut self.now;
-        let means: Vec<f64> = now.charts.iter().map(Chart::mean).collect();
-        let alarms: Vec<_> = now.charts.iter_mut().zip(ended.values()).map(|(c, v)| c.push(v)).collect();
-        let alarms = alarms.iter().enumerate().filter_map(|(i, alarm)| alarm.map(|a| (i, a)));
-        let (loudest, alarm) = alarms.max_by(|(_, a), (_, b)| a.excess.total_cmp(&b.excess))?;
-        let effects = ended.scores.gradient.len();
-        let noise = loudest.checked_sub(effects);
-        let mut change = Settling {
-            until: ended.t + now.memory,
-            again: noise.is_none().then_some(ended.t + COARSE * now.memory),
-            noise,
-            since: ended.t - alarm.since as f64 * now.block_seconds,
-            means,
-        };
-        let found = match noise {
-            Some(channel) => self.scatter_change(ended, &change, channel),
-            None => {
-                let all = explanations(&now.history, &change.means, alarm.since as usize);
-                change.since = ended.t - all[0].blocks as f64 * now.block_seconds;
-                // What was known of the machine before the change is no longer so.
-                now.fit.restart();
-                self.effect_change(ended, &all)
-            }
-        };
-        self.now.settling = Some(change);
-        Some(found)
-    }
-
-    /// From here on what has changed is usual.
-    fn settle(&mut self, ended: &Ended, change: &Settling) -> Change {
-        let found = match change.noise {
-            Some(channel) => self.scatter_change(ended, change, channel),
-            None => {
-                let blocks = ((ended.t - change.since) / self.now.block_seconds).round() as usize;
-                let all = explanations(&self.now.history, &change.means, blocks);
-                let np = self.now.usual.free.len();
-                if all[0].effect < np {
-                    self.parameter_change(ended)
-                } else {
-                    self.effect_change(ended, &all)
-                }
-            }
-        };
-        let found = Change { since: change.since, ..found };
-        let now = &mut self.now;
-        if matches!(found.subject, Subject::Parameter(_)) {
-            now.usual.values.clone_from(&now.values);
-            now.reference.filter.take_state(&now.adaptive.filter);
+        if let Some(settling) = &mut now.settling
+            && let Some(before) = &mut settling.before
+        {
+            before.history.push(before.block.scores());
+            before.block.clear();
+            settling.know(Known {
+                t,
+                fit: now.released.as_ref().map(|r| r.fit.clone()),
+                values: now.values.clone(),
+                deviations: now.fit.deviations(),
+            });
         }
-        now.charts.iter_mut().for_each(Chart::restart);
-        now.history.clear();
-        found
+        Ended { t, scores, deviates, scatter, block }
     }
 }

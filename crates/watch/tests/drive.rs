@@ -4,7 +4,7 @@ use greybox_model::Model;
 use greybox_recording::{Channel, Recording};
 use greybox_recursive::Direction;
 use greybox_simulate::rigs::Throttle;
-use greybox_watch::{Change, Event, Irregular, Options, Subject, Watch, WatchError};
+use greybox_watch::{Change, Event, Irregular, Options, Saved, Subject, Watch, WatchError};
 use rand::SeedableRng;
 use rand_distr::{Distribution, StandardNormal};
 
@@ -135,6 +135,46 @@ fn a_step_of_the_damping_is_seen_at_once_then_named_and_measured() {
         assert!(settled.relative().is_some_and(|r| (0.09..0.11).contains(&r)), "{settled:?}");
         assert!((settled.now - 0.066).abs() < 4.0 * settled.std && settled.std < 5e-5, "{settled:?}");
     }
+}
+
+/// Half a memory after the damping another change: seen while the first one settles, which is told together with it; each is named
+/// by itself, and nothing is said afterwards.
+#[test]
+fn a_change_is_seen_while_another_settles() {
+    let machine = Machine {
+        damping: |t| if t < EVENT { 0.06 } else { 0.066 },
+        offset: |t| if t < EVENT + 15.0 { 0.0 } else { 0.004 },
+        ..SOUND
+    };
+    for seed in 0..4 {
+        let events = watched(machine, 300.0, seed, &Options::default());
+        let [Event::Changed(_), Event::Settled(damping), Event::Changed(second), Event::Settled(offset)] =
+            &events[..]
+        else {
+            panic!("{events:?}")
+        };
+        assert_eq!(damping.subject, Subject::Parameter("b".into()));
+        assert!((damping.now - 0.066).abs() < 5.0 * damping.std, "{damping:?}");
+        assert_eq!(damping.t, second.t);
+        assert!((0.0..6.0).contains(&(second.t - EVENT - 15.0)), "{second:?}");
+        let twins = [Subject::Offset("angle".into()), Subject::Force("angle".into())];
+        assert!(twins.contains(&offset.subject), "{offset:?}");
+        if offset.subject == twins[0] {
+            assert!((offset.now - offset.before - 0.004).abs() < 5e-4, "{offset:?}");
+        }
+    }
+}
+
+/// A state of an earlier version is told as such.
+#[test]
+fn a_state_of_another_version_is_refused() {
+    let (watch, _) = learned(&run(SOUND, 70.0, 6), &Options::default());
+    let text = serde_json::to_string(watch.saved()).unwrap();
+    assert!(serde_json::from_str::<Saved>(&text).is_ok());
+    // (Such a state also lacks what came later.)
+    let old = text.replace("\"version\":2", "\"version\":1").replace("\"wide\"", "\"other\"");
+    let error = serde_json::from_str::<Saved>(&old).unwrap_err();
+    assert!(error.to_string().contains("version 1"), "{error}");
 }
 
 /// A hundredth of the damping in a minute: seen before it is more than a fiftieth.
