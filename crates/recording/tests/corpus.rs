@@ -3,17 +3,19 @@
 use crate::sound;
 use std::path::{Path, PathBuf};
 
-/// The files of a target.
-fn corpus(target: &str) -> Vec<PathBuf> {
-    let folder = Path::new(env!("CARGO_MANIFEST_DIR")).join("../../fuzz/corpus").join(target);
-    let entries = std::fs::read_dir(&folder).unwrap_or_else(|e| panic!("{}: {e}", folder.display()));
-    entries.map(|entry| entry.unwrap().path()).collect()
+/// The files of a target; none where the crate stands alone.
+fn corpus(target: &str) -> Option<Vec<PathBuf>> {
+    let place = Path::new("fuzz").join("corpus").join(target);
+    let mut folders = Path::new(env!("CARGO_MANIFEST_DIR")).ancestors().map(|folder| folder.join(&place));
+    let entries = std::fs::read_dir(folders.find(|folder| folder.is_dir())?).unwrap();
+    Some(entries.map(|entry| entry.unwrap().path()).collect())
 }
 
 #[track_caller]
 fn replayed(target: &str, name: &str) {
+    let Some(files) = corpus(target) else { return };
     let (mut read, mut refused) = (0, 0);
-    for file in corpus(target) {
+    for file in files {
         match sound::read(name, &std::fs::read(&file).unwrap(), None) {
             Ok(_) => read += 1,
             Err(_) => refused += 1,
