@@ -815,3 +815,36 @@ fn without_delays(model: &Model) -> Model {
     }
     prompt
 }
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use greybox_recording::Channel;
+
+    /// A held input keeps its integral, a line stays a line away from its ends, and measured values are those of their samples.
+    #[test]
+    fn thinned_data_keep_what_drives_the_machine() {
+        let model = Model::from_toml(
+            "[inputs]\nu = { unit = \"m/s\", hold = \"zero\" }\nw = { unit = \"m/s\", hold = \"linear\" }\n[states]\nx = { unit = \"m\" }\n[equations]\nrate = \"x' = u + w\"\n",
+            "rate.toml",
+        )
+        .unwrap();
+        let column = |name: &str, of: fn(f64) -> f64| Channel {
+            name: name.into(),
+            unit: None,
+            values: (0..40).map(|k| of(f64::from(k))).collect(),
+        };
+        let time = (0..40).map(|k| 0.5 * f64::from(k)).collect();
+        let channels = vec![column("u", |k| k * k % 7.0), column("w", |k| 3.0 * k), column("x", f64::sqrt)];
+        let recording = Recording::from_columns("rate.csv", time, channels).unwrap();
+        let data = Data::new(&model, &[recording]).unwrap();
+        let thin = data.thinned(&model, 4);
+        let (all, piece) = (&data.pieces[0], &thin.pieces[0]);
+        assert_eq!((piece.len, piece.dt, piece.smooth[0].value.len()), (10, 2.0, 10));
+        let integral = |u: &[f64], dt: f64| u.iter().sum::<f64>() * dt;
+        assert!((integral(&piece.inputs[0], 2.0) - integral(&all.inputs[0], 0.5)).abs() < 1e-12);
+        assert!((1..9).all(|k| (piece.inputs[1][k] - all.inputs[1][4 * k]).abs() < 1e-12));
+        assert!((0..10).all(|k| piece.measured[0][k] == all.measured[0][4 * k]));
+        assert_eq!(thin.sigma, data.sigma);
+    }
+}

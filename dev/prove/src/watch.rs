@@ -312,13 +312,13 @@ fn judged(case: &Case, events: &[Event], options: &Options) -> Trial {
                 }
             }
             Event::Changed(_) => trial.further.0 += 1,
-            Event::Settled(change) if trial.delay.is_some() && trial.settled.is_none() => {
-                // (The first change is told together with the second one.)
-                if change.t > at + trial.delay.unwrap_or(0.0) {
-                    let right = is_right(&change.subject);
-                    trial.settled = Some(right);
-                    trial.wrong = !right && !change.or.iter().any(is_right);
-                }
+            // (The first change is told together with the second one.)
+            Event::Settled(change)
+                if trial.settled.is_none() && trial.delay.is_some_and(|delay| change.t > at + delay) =>
+            {
+                let right = is_right(&change.subject);
+                trial.settled = Some(right);
+                trial.wrong = !right && !change.or.iter().any(is_right);
             }
             _ => {}
         }
