@@ -277,7 +277,7 @@ impl Data {
                 Hold::Zero => {
                     u.chunks(every).map(|held| held.iter().sum::<f64>() / held.len() as f64).collect()
                 }
-                Hold::Linear | Hold::BandLimited => hats(u, every),
+                Hold::Linear | Hold::BandLimited => triangular_means(u, every),
             };
             let smooth = |s: &Smoothed| Smoothed {
                 value: pick(&s.value),
@@ -403,7 +403,7 @@ impl Data {
 }
 
 /// Means of a signal about every n-th sample, with weights that fall linearly to zero at n samples from it.
-fn hats(u: &[f64], every: usize) -> Vec<f64> {
+fn triangular_means(u: &[f64], every: usize) -> Vec<f64> {
     let mean = |at: usize| {
         let (from, to) = (at.saturating_sub(every - 1), (at + every).min(u.len()));
         let weight = |k: usize| (every - k.abs_diff(at)) as f64;

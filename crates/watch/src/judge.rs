@@ -43,6 +43,8 @@ impl Watch {
         if let Some(change) = self.now.settling.take_if(|change| ended.t >= change.until) {
             let found = self.settle(ended, change, ended.t);
             events.push(Event::Settled(found));
+            self.now.released = None;
+            self.now.charts.iter_mut().for_each(Chart::restart);
         }
     }
 
@@ -84,7 +86,12 @@ impl Watch {
         };
         let effects = ended.scores.gradient.len();
         let noise = loudest.checked_sub(effects);
+        let is_second = now.settling.is_some();
         for (k, chart) in now.charts.iter_mut().enumerate() {
+            if is_second {
+                chart.restart();
+                continue;
+            }
             let centred = noise.is_none() && k < effects;
             let mean = centred.then(|| mean_about_an_estimate(&now.history, k, alarm.since as usize));
             chart.resume(KEPT, alarm.since as usize, mean.flatten());

@@ -30,7 +30,7 @@ const CHANGE: f64 = 1.0;
 /// the parameter that the followed model has moved most.
 ///
 /// After an alarm the usual model is set free: everything that may change is estimated from the blocks since then, and the scores
-/// are recursive residuals, which a change that settles leaves as they were. So the charts go on.
+/// are recursive residuals, which a change that settles leaves as they were. So the charts go on until it has settled.
 #[derive(Debug, Clone)]
 pub struct Watch {
     pub(crate) machine: Machine,
