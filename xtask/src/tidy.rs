@@ -302,6 +302,17 @@ fn no_file_names_a_path_of_one_machine() {
     assert!(found.is_empty(), "paths of one machine:\n{}", found.join("\n"));
 }
 
+/// What git leaves where a merge is to be decided by hand.
+#[test]
+fn no_merge_is_left_undecided() {
+    let is_mark = |line: &&str| ["<<<<<<< ", ">>>>>>> "].iter().any(|mark| line.starts_with(mark));
+    // (What is no text holds none.)
+    let is_undecided =
+        |path: &PathBuf| std::fs::read_to_string(path).is_ok_and(|text| text.lines().any(|l| is_mark(&l)));
+    let left: Vec<PathBuf> = files().into_iter().filter(is_undecided).collect();
+    assert!(left.is_empty(), "{left:?}");
+}
+
 /// Words that stood where the field has a term, and the term.
 const REPLACED: [(&str, &str); 18] = [
     ("anneal", "restart_short_segments"),
