@@ -266,9 +266,15 @@ impl Data {
         })
     }
 
-    /// Every n-th sample of each piece. Inputs are means over what the samples left out held, so that an integrator that they
-    /// drive ends where it did: of a held input over the n samples from each on, of others with weights that fall to zero at
-    /// the neighbours' samples. What is known of the noise is that of all samples.
+    /// Every n-th sample of each piece (n = `every`, at least 1), nΔt apart, all in SI as before. Inputs are means over what is left
+    /// out, so that an integrator that they drive ends where it did:
+    ///
+    /// ```text
+    /// ū(kn) = 1/n Σ u(kn + i), 0 ≤ i < n               an input that is held
+    /// ū(kn) = Σ (n − |i|) u(kn + i) / Σ (n − |i|), |i| < n    any other
+    /// ```
+    ///
+    /// (over the samples that there are). What is known of the noise is that of all samples.
     pub fn thinned(&self, model: &Model, every: usize) -> Data {
         let every = every.max(1);
         let pick = |values: &[f64]| -> Vec<f64> { values.iter().step_by(every).copied().collect() };

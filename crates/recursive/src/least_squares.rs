@@ -136,7 +136,15 @@ impl LeastSquares {
     }
 
     /// Learns what another estimator of the same parameters knows, its prior included, of those that are `shared`; the others
-    /// are other parameters there, about which it may know anything.
+    /// are other parameters there, about which it may know anything. With the other's triangular factor R and right side z, the
+    /// shared parameters ordered last, its last rows are of them alone, and they are taken as rows here:
+    ///
+    /// ```text
+    /// ‖R x − z‖² = ‖R₁₁ x₁ + R₁₂ x₂ − z₁‖² + ‖R₂₂ x₂ − z₂‖² ,   x₂ shared
+    /// ```
+    ///
+    /// (G. J. Bierman, *Factorization Methods for Discrete Sequential Estimation*, 1977, ch. VI). Nothing is learned from an
+    /// estimator of another number of parameters.
     pub fn merge(&mut self, other: &LeastSquares, shared: impl Fn(usize) -> bool) {
         if other.n != self.n {
             return;
@@ -159,8 +167,13 @@ impl LeastSquares {
         }
     }
 
-    /// Square of the distance of a point from the estimate, in its standard deviations: of the parameters themselves, χ² with as
-    /// many degrees of freedom as there are of them. Infinite where the lengths differ.
+    /// Square of the distance of a point x from the estimate x̂ in its covariance P,
+    ///
+    /// ```text
+    /// (x − x̂)ᵀ P⁻¹ (x − x̂) = ‖R x − z‖² :
+    /// ```
+    ///
+    /// of the true parameters, χ² with as many degrees of freedom as there are of them. Infinite where the lengths differ.
     pub fn distance(&self, from: &[f64]) -> f64 {
         if from.len() != self.n {
             return f64::INFINITY;
