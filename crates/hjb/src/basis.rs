@@ -121,17 +121,37 @@ impl Monomials {
             return vec![f64::NAN; self.states];
         }
         let mut gradient = vec![0.0; self.states];
-        for (e, w) in self.exponents().zip(weights) {
-            for (i, g) in gradient.iter_mut().enumerate() {
-                *g += w * derivative(e, x, i);
+        for (row, w) in self.jacobian(x).chunks(self.states).zip(weights) {
+            for (g, d) in gradient.iter_mut().zip(row) {
+                *g += w * d;
             }
         }
         gradient
     }
 
-    /// ∂φⱼ/∂xᵢ of every function, N rows of n.
+    /// ∂φⱼ/∂xᵢ of every function, N rows of n: products of powers of x, which are computed once.
     pub(crate) fn jacobian(&self, x: &[f64]) -> Vec<f64> {
-        self.exponents().flat_map(|e| (0..self.states).map(move |i| derivative(e, x, i))).collect()
+        let degree = self.exponents.iter().max().map_or(0, |e| usize::from(*e));
+        let powers: Vec<f64> = x
+            .iter()
+            .flat_map(|x| (0..=degree).scan(1.0, move |power, _| Some(std::mem::replace(power, *power * x))))
+            .collect();
+        let power = |i: usize, e: u8| powers[i * (degree + 1) + usize::from(e)];
+        let mut jacobian = vec![0.0; self.exponents.len()];
+        for (row, e) in jacobian.chunks_mut(self.states).zip(self.exponents()) {
+            // What stands before xᵢ, from the left; then what stands behind it, from the right.
+            let mut product = 1.0;
+            for (i, d) in row.iter_mut().enumerate() {
+                *d = product;
+                product *= power(i, e[i]);
+            }
+            product = 1.0;
+            for (i, d) in row.iter_mut().enumerate().rev() {
+                *d *= if e[i] == 0 { 0.0 } else { f64::from(e[i]) * power(i, e[i] - 1) * product };
+                product *= power(i, e[i]);
+            }
+        }
+        jacobian
     }
 
     /// The weights of xᵀ P x in this basis, zero for all other functions; `p(i, j)` is symmetric.
@@ -180,15 +200,6 @@ fn spread(one: &mut [u8], at: usize, left: u8, out: &mut Vec<u8>) {
         one[at] = e;
         spread(one, at + 1, left - e, out);
     }
-}
-
-fn derivative(e: &[u8], x: &[f64], i: usize) -> f64 {
-    if e[i] == 0 {
-        return 0.0;
-    }
-    let others = e.iter().zip(x).enumerate().filter(|(k, _)| *k != i);
-    let rest: f64 = others.map(|(_, (e, x))| x.powi(i32::from(*e))).product();
-    f64::from(e[i]) * x[i].powi(i32::from(e[i]) - 1) * rest
 }
 
 #[cfg(test)]

@@ -80,6 +80,10 @@ impl Domain {
     /// The first `count` points of Halton's sequence (J. Halton 1960), evenly spread whatever their number, the same
     /// every time.
     ///
+    /// Three per function of the basis were enough on a family of plants of two to eight states, where a grid has to have
+    /// as many values of each state as the degree of the basis to determine the weights at all:
+    /// `cargo xtask reproduce --only Sampling`.
+    ///
     /// # Errors
     /// [`HjbError::Points`] for none or too many.
     pub fn halton(&self, count: usize) -> Result<Vec<Vec<f64>>, HjbError> {

@@ -100,23 +100,29 @@ pub fn policy_iteration(
     Ok(policy)
 }
 
-/// The x that minimises ‖M x − y‖, columns scaled to unit norm; `None` when M has not full rank.
+/// The x that minimises ‖M x − y‖ for as many rows as columns or more, columns scaled to unit norm; `None` when M has not
+/// full rank.
 fn least_squares(m: &DMatrix<f64>, y: &[f64]) -> Option<Vec<f64>> {
     let (rows, columns) = m.shape();
     let norms: Vec<f64> = m.column_iter().map(|c| c.norm()).collect();
     if norms.iter().any(|n| *n == 0.0 || !n.is_finite()) {
         return None;
     }
-    let mut scaled = m.clone();
+    let mut scaled = m.clone().insert_column(columns, 0.0);
     for (mut column, norm) in scaled.column_iter_mut().zip(&norms) {
         column /= *norm;
     }
-    let qr = MatRef::from_column_major_slice(scaled.as_slice(), rows, columns).col_piv_qr();
+    scaled.column_mut(columns).copy_from_slice(y);
+    // Nearly all of the work is in the factor of all rows, [M y] = Q [R z], which goes by blocks where it need not
+    // pivot; the pivots that tell the rank are then those of R.
+    let whole = MatRef::from_column_major_slice(scaled.as_slice(), rows, columns + 1).qr();
+    let triangle = whole.thin_R();
+    let qr = triangle.get(..columns, ..columns).col_piv_qr();
     let r = qr.R();
     let (first, last) = (r[(0, 0)].abs(), r[(columns - 1, columns - 1)].abs());
     if last <= 1e-13 * first {
         return None;
     }
-    let solution = qr.solve_lstsq(MatRef::from_column_major_slice(y, rows, 1));
+    let solution = qr.solve_lstsq(triangle.get(..columns, columns..));
     Some(norms.iter().enumerate().map(|(j, n)| solution[(j, 0)] / n).collect())
 }

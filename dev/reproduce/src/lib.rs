@@ -20,6 +20,7 @@ mod index;
 pub mod link;
 mod optimal;
 mod pages;
+mod sampling;
 mod sliding;
 mod story;
 
@@ -190,6 +191,7 @@ fn registry() -> Vec<Entry> {
     let mut entries = chapter2::entries();
     entries.extend(chapter3::entries());
     entries.extend(chapter4::entries());
+    entries.push(sampling::entry());
     entries.push(story::entry());
     entries
 }

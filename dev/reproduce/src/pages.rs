@@ -11,10 +11,13 @@ use super::Outcome;
 const PAGE: &str = "reproduction.md";
 const MEASURED: &str = "<!-- Written by cargo xtask reproduce --write-docs: what is measured. -->";
 const STORY: &str = "<!-- Written by cargo xtask reproduce --write-docs: the story. -->";
+const SAMPLING: &str = "<!-- Written by cargo xtask reproduce --write-docs: points against dimension. -->";
 /// Below this a value is rounding, and its size means nothing.
 const ROUNDING: f64 = 1e-9;
-/// Columns of the story's table that the page shows: design, model, steps, settling, error left, peak to peak, effort.
-const SHOWN: [usize; 7] = [0, 1, 2, 3, 5, 6, 9];
+/// Columns of the story's table of runs that the page shows: design, model, steps, settling, error left, peak to peak,
+/// effort.
+const STORY_SHOWN: [usize; 7] = [0, 1, 2, 3, 5, 6, 9];
+const SAMPLING_SHOWN: [usize; 10] = [0, 1, 2, 3, 4, 5, 6, 7, 8, 9];
 
 /// Puts the tables of a whole run into the page.
 ///
@@ -40,9 +43,12 @@ pub(crate) fn is_current(root: &Path, outcomes: &[Outcome]) -> Result<bool> {
     Ok(true)
 }
 
-fn tables(outcomes: &[Outcome]) -> Result<[(&'static str, String); 2]> {
-    let story = outcomes.iter().find(|o| o.fixture.id == "Story").context("the story was not made")?;
-    Ok([(MEASURED, measured(outcomes)), (STORY, runs(story)?)])
+fn tables(outcomes: &[Outcome]) -> Result<[(&'static str, String); 3]> {
+    Ok([
+        (MEASURED, measured(outcomes)),
+        (STORY, table(outcomes, "Story", 1, &STORY_SHOWN)?),
+        (SAMPLING, table(outcomes, "Sampling", 0, &SAMPLING_SHOWN)?),
+    ])
 }
 
 /// Every judged value with its bounds.
@@ -65,15 +71,17 @@ fn measured(outcomes: &[Outcome]) -> String {
     out
 }
 
-/// The runs of the story.
-fn runs(story: &Outcome) -> Result<String> {
-    let table = story.piece.tables.get(1).context("the story has no table of its runs")?;
+/// Columns of a table of a piece.
+fn table(outcomes: &[Outcome], id: &str, index: usize, shown: &[usize]) -> Result<String> {
+    let outcome =
+        outcomes.iter().find(|o| o.fixture.id == id).with_context(|| format!("{id} was not made"))?;
+    let table = outcome.piece.tables.get(index).with_context(|| format!("{id} has no table {index}"))?;
     let row = |cells: &[String], to: &dyn Fn(&str) -> String| {
-        let shown = SHOWN.iter().map(|i| cells.get(*i).map_or_else(String::new, |c| to(c)));
+        let shown = shown.iter().map(|i| cells.get(*i).map_or_else(String::new, |c| to(c)));
         format!("| {} |\n", shown.collect::<Vec<_>>().join(" | "))
     };
     let mut out = row(&table.headings, &str::to_owned);
-    out.push_str(&format!("|{}\n", " --- |".repeat(SHOWN.len())));
+    out.push_str(&format!("|{}\n", " --- |".repeat(shown.len())));
     for cells in &table.rows {
         out.push_str(&row(cells, &|cell| match cell.replace('−', "-").parse::<f64>() {
             Ok(value) => short(value),
