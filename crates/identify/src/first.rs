@@ -78,13 +78,19 @@ fn windowed<'a>(structure: &Structure, ground: &'a Ground<'_>) -> Option<Vec<Win
     let signals = Rc::new(ground.signals(structure, &prompt)?);
     if prompt.is_empty() {
         let all = WINDOWS.map(|share| (length(share), prompt.clone(), signals.clone()));
-        return Some(all.map(|(length, dead_times, signals)| Windowed { length, dead_times, signals }).into());
+        return Some(
+            all.map(|(length, dead_times, signals)| Windowed { length, dead_times, signals }).into(),
+        );
     }
     let everything = vec![true; structure.terms.len()];
     let axes: Vec<Axis> = structure
         .dead_times
         .iter()
-        .map(|d| Axis { longest: d.longest, coarse: (d.longest / 16.0).min(period / 8.0).max(step), fine: 0.25 * step })
+        .map(|d| Axis {
+            longest: d.longest,
+            coarse: (d.longest / 16.0).min(period / 8.0).max(step),
+            fine: 0.25 * step,
+        })
         .collect();
     WINDOWS
         .iter()
@@ -140,7 +146,9 @@ pub(crate) fn first_estimates(structure: &Structure, ground: &Ground<'_>) -> Res
     let allowed: Vec<bool> = structure.terms.iter().map(|t| t.order <= chosen + 1).collect();
     let starts: Vec<State> = best(&allowed).into_iter().map(|s| s.1).collect();
     if starts.is_empty() {
-        return Err(IdentifyError::TooShort { samples: (ground.longest(structure) / ground.step()) as usize });
+        return Err(IdentifyError::TooShort {
+            samples: (ground.longest(structure) / ground.step()) as usize,
+        });
     }
     Ok(First { starts, allowed, by_order })
 }
@@ -252,4 +260,3 @@ fn estimate(
     }
     Some((badness, state))
 }
-

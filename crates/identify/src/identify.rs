@@ -11,7 +11,7 @@ use greybox_recording::Recording;
 use crate::dead_time;
 use crate::error::IdentifyError;
 use crate::first::{First, Ground, first_estimates};
-use crate::options::Options;
+use crate::options::{DelayedState, Options};
 use crate::output_error::{self, Refined, State};
 use crate::precision::{self, Precision};
 use crate::setting::{Setting, derivative, is_of_the_language};
@@ -359,42 +359,8 @@ pub(crate) fn structure(recordings: &[Recording], options: &Options) -> Result<S
         })
         .collect();
     let terms = options.library.terms(&mut setting);
-    let mut extras = Vec::new();
-    if let Some(delay) = &options.delay {
-        if !options.states.contains(&delay.state) {
-            return Err(IdentifyError::DelayedState {
-                name: delay.state.clone(),
-                states: options.states.join(", "),
-            });
-        }
-        if options.inputs.is_empty() {
-            return Err(IdentifyError::DelayWithoutInput);
-        }
-        if !(delay.longest > 0.0 && delay.longest.is_finite()) {
-            let found = delay.longest;
-            return Err(IdentifyError::Range { what: "the longest delay", found, range: "(0, ∞) s" });
-        }
-        if let Some(found) = delay.gain.filter(|gain| !gain.is_finite()) {
-            return Err(IdentifyError::Range {
-                what: "the gain of the delayed feedback",
-                found,
-                range: "the finite numbers",
-            });
-        }
-        if options.has_one_scale() {
-            return Err(IdentifyError::DelayWithEnergies);
-        }
-        if delay.longest >= recorded {
-            return Err(IdentifyError::LongestDelay { longest: delay.longest, recorded });
-        }
-        extras.push(Extra {
-            expression: format!("-kp*delay({}, tau)", delay.state),
-            parameters: vec![
-                ("kp".to_string(), delay.gain.unwrap_or(1.0), delay.gain.is_some()),
-                ("tau".to_string(), 0.25 * delay.longest, false),
-            ],
-        });
-    }
+    let extras = options.delay.iter().map(|delay| feedback(delay, options, recorded));
+    let extras = extras.collect::<Result<Vec<Extra>, IdentifyError>>()?;
     let files: Vec<&str> = recordings.iter().map(|r| r.name.as_str()).collect();
     Ok(Structure {
         title: format!("identified from {}", files.join(", ")),
@@ -412,6 +378,38 @@ pub(crate) fn structure(recordings: &[Recording], options: &Options) -> Result<S
         terms,
         extras,
         dead_times,
+    })
+}
+
+/// A delayed feedback beside the input of every equation; `recorded` is the longest stretch without a gap, s.
+fn feedback(delay: &DelayedState, options: &Options, recorded: f64) -> Result<Extra, IdentifyError> {
+    if !options.states.contains(&delay.state) {
+        let (name, states) = (delay.state.clone(), options.states.join(", "));
+        return Err(IdentifyError::DelayedState { name, states });
+    }
+    if options.inputs.is_empty() {
+        return Err(IdentifyError::DelayWithoutInput);
+    }
+    if !(delay.longest > 0.0 && delay.longest.is_finite()) {
+        let found = delay.longest;
+        return Err(IdentifyError::Range { what: "the longest delay", found, range: "(0, ∞) s" });
+    }
+    if let Some(found) = delay.gain.filter(|gain| !gain.is_finite()) {
+        let (what, range) = ("the gain of the delayed feedback", "the finite numbers");
+        return Err(IdentifyError::Range { what, found, range });
+    }
+    if options.has_one_scale() {
+        return Err(IdentifyError::DelayWithEnergies);
+    }
+    if delay.longest >= recorded {
+        return Err(IdentifyError::LongestDelay { longest: delay.longest, recorded });
+    }
+    Ok(Extra {
+        expression: format!("-kp*delay({}, tau)", delay.state),
+        parameters: vec![
+            ("kp".to_string(), delay.gain.unwrap_or(1.0), delay.gain.is_some()),
+            ("tau".to_string(), 0.25 * delay.longest, false),
+        ],
     })
 }
 

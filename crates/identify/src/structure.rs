@@ -127,7 +127,8 @@ pub(crate) struct Structure {
 impl Structure {
     /// The parameters outside the choice, and whether each is known: those of the extras, then the dead times.
     pub(crate) fn outside(&self) -> impl Iterator<Item = (&str, bool)> {
-        let extras = self.extras.iter().flat_map(|e| &e.parameters).map(|(name, _, known)| (name.as_str(), *known));
+        let extras =
+            self.extras.iter().flat_map(|e| &e.parameters).map(|(name, _, known)| (name.as_str(), *known));
         extras.chain(self.dead_times.iter().map(|d| (d.parameter.as_str(), false)))
     }
 
@@ -228,10 +229,12 @@ impl Structure {
                 .filter_map(|(i, t)| {
                     Some((self.has_coefficient(i), &t.parameter, self.late(&t.part(e)?.expression)))
                 })
-                .map(|(has_coefficient, parameter, expression)| match (has_coefficient, expression.as_str()) {
-                    (false, expression) => expression.to_string(),
-                    (true, "1") => parameter.clone(),
-                    (true, expression) => format!("{parameter}*{expression}"),
+                .map(|(has_coefficient, parameter, expression)| {
+                    match (has_coefficient, expression.as_str()) {
+                        (false, expression) => expression.to_string(),
+                        (true, "1") => parameter.clone(),
+                        (true, expression) => format!("{parameter}*{expression}"),
+                    }
                 })
                 .collect();
             left.extend(self.extras.iter().map(|x| x.expression.clone()));
@@ -356,6 +359,33 @@ mod tests {
             extras: Vec::new(),
             dead_times: Vec::new(),
         }
+    }
+
+    #[test]
+    fn an_input_with_a_dead_time_is_late_wherever_it_stands() {
+        let mut late = structure();
+        late.equations[0] =
+            Equation { input: Some("w".to_string()), normalised: false, ..late.equations[0].clone() };
+        late.dead_times = ["u", "w"]
+            .map(|input| DeadTime {
+                input: input.to_string(),
+                parameter: format!("tau_{input}"),
+                longest: 0.5,
+            })
+            .to_vec();
+        assert_eq!(late.late("u"), "delay(u, tau_u)");
+        assert_eq!(late.late("x^2"), "x^2");
+        assert_eq!(late.late("(x*u - w)"), "(x*delay(u, tau_u) - delay(w, tau_w))");
+        // x″ of the first equation alone, without u, and u in the second.
+        let mut active = vec![true, true, true, false, false, false, true, false, false, false];
+        let values = vec![1.0; active.len()];
+        let text = late.toml(&active, &values, &[0.1, 0.2]);
+        assert!(text.contains("= delay(w, tau_w)\"") && text.contains("p*delay(u, tau_u) = 0"), "{text}");
+        assert!(text.contains("tau_u = { value = 0.1") && text.contains("tau_w = { value = 0.2"), "{text}");
+        // What enters no equation has no dead time.
+        active[6] = false;
+        assert!(!late.toml(&active, &values, &[0.1, 0.2]).contains("tau_u"));
+        assert_eq!(late.unknown_past(), 0.5);
     }
 
     #[test]

@@ -644,10 +644,8 @@ pub(crate) const BEGIN_DEAD_TIME: &str =
 type BookTable = (&'static str, &'static str, fn(&[Outcome]) -> String);
 
 /// The tables of the book.
-const TABLES: [BookTable; 2] = [
-    (machines::PREFIX, BEGIN, machines::table),
-    (dead_time::PREFIX, BEGIN_DEAD_TIME, dead_time::table),
-];
+const TABLES: [BookTable; 2] =
+    [(machines::PREFIX, BEGIN, machines::table), (dead_time::PREFIX, BEGIN_DEAD_TIME, dead_time::table)];
 
 /// Puts the figures of the machines into the book: of each table of which a case was run, all must have been.
 pub(crate) fn write(root: &Path, outcomes: &[Outcome]) -> Result<()> {

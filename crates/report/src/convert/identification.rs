@@ -17,7 +17,8 @@ use crate::contract::{
 };
 use crate::format;
 use crate::identified::{
-    Blocks, DeadTime, Delay, Doubtful, Equation, IdentifyReport, Order, OrderValue, Term, Variable, VariableRole,
+    Blocks, DeadTime, Delay, Doubtful, Equation, IdentifyReport, Order, OrderValue, Term, Variable,
+    VariableRole,
 };
 use crate::page::{self, IdentifyPage, Residual};
 use crate::sentence;

@@ -3,7 +3,6 @@
 use askama::Template;
 
 use super::{Assets, Common, Island, LawView, Scene, Shown, findings, inputs, meta};
-use crate::contract::Ordered;
 use crate::expression::{self, escape};
 use crate::identified::{DeadTime, Delay, Equation, IdentifyReport, Order, Term, VariableRole};
 use crate::page::{IdentifyPage, MechanismPlot};
@@ -246,7 +245,11 @@ fn delay_view(state: &str, d: &Delay) -> DelayView {
         None => ("95 % interval of the gain", "held at the value given".to_owned()),
     });
     rows.extend(d.correlation.map(|rho| ("Correlation of delay and gain", format::significant(rho, 2))));
-    DelayView { title_html: format!("Feedback of {}", expression::html(state)), rows, warning: d.warning.clone() }
+    DelayView {
+        title_html: format!("Feedback of {}", expression::html(state)),
+        rows,
+        warning: d.warning.clone(),
+    }
 }
 
 fn dead_time_view(input: &str, d: &DeadTime) -> DelayView {

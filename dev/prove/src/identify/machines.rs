@@ -42,7 +42,7 @@ pub(super) struct Machine {
     /// How many samples each input acts late, in tenths; none: not at all. The machine then moves before the recording begins.
     pub(super) late: Vec<usize>,
     /// What the inputs do between samples: straight lines, or nothing.
-    pub(super) held: bool,
+    held: bool,
     rates: Rates,
 }
 
@@ -67,6 +67,11 @@ fn excitation(
 }
 
 impl Machine {
+    /// The same, with inputs that act late by `late` tenths of a sample each.
+    pub(super) fn delayed(self, late: &[usize], held: bool) -> Machine {
+        Machine { late: late.to_vec(), held, ..self }
+    }
+
     /// A recording from rest.
     pub(super) fn record(&self, seed: u64) -> Result<Recording> {
         // Tenths of a sample: no step crosses a bend or jump of a late input.
