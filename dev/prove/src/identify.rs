@@ -365,16 +365,16 @@ const CASES: [(&str, usize, CaseFn); 27] = [
     ("machine: pendulum on a cart, force on the cart", 100, machines::cart_case),
     ("machine: arm of two links, a torque at each joint", 100, machines::arm_case),
     ("dead time: mass on a stiffening spring, 7.3 samples", 100, |s| {
-        dead_time::spring_case(s, 73, false, 0.1)
+        dead_time::spring_case(s, 73, false, 0.006)
     }),
     ("dead time: the same, the force held between samples", 100, |s| {
-        dead_time::spring_case(s, 73, true, 0.1)
+        dead_time::spring_case(s, 73, true, 0.006)
     }),
     ("dead time: the same, no dead time although one is asked for", 100, |s| {
-        dead_time::spring_case(s, 0, false, 0.1)
+        dead_time::spring_case(s, 0, false, 0.004)
     }),
     ("dead time: chain of two masses, a force on each, 3.4 and 11.8 samples", 100, |s| {
-        dead_time::chain_case(s, [34, 118], [0.1, 0.1])
+        dead_time::chain_case(s, [34, 118], [0.016, 0.016])
     }),
 ];
 
