@@ -190,7 +190,7 @@ fn a_dead_time_that_may_be_none_or_ended_at_the_longest_is_said() {
     assert!(last.contains("do not tell it from none") && last.contains("at most 0.0016 s"), "{last}");
     let longest = late(0.5, Value::Null);
     let last = longest.summary.last().unwrap();
-    assert!(last.contains("ended on the longest looked for, 0.5 s"), "{last}");
+    assert!(last.contains("ended on the longest looked for, 0.500 s"), "{last}");
     assert!(last.contains("--dead-time v=SECONDS"), "{last}");
     assert!(late(0.1, json!([0.09, 0.11])).dead_time["v"].warning.is_none());
 }
