@@ -152,6 +152,12 @@ class Identification(_Paged):
         return there
 
     @property
+    def dead_time(self) -> Named[Record]:
+        """The dead times of inputs by the name of the input; empty where none was looked for."""
+        there: Named[Record] = self.report.get("dead_time", Named())
+        return there
+
+    @property
     def model_text(self) -> str:
         """The text of the identified model: model.toml."""
         return self._model

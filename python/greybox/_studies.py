@@ -111,6 +111,7 @@ def identify(
     delay: str | None = None,
     gain: float | None = None,
     longest: float = 1.0,
+    dead_time: str | Sequence[str] | Mapping[str, float | None] = (),
     replicates: int = 100,
     seed: int = 0,
     progress: Progress | None = None,
@@ -130,9 +131,14 @@ def identify(
         hold: what the inputs do between samples; found from the recordings where none is given.
         delay: state that is also fed back with an unknown delay, ``gain`` where its gain is known, ``longest`` (s) how
             far to look.
+        dead_time: inputs with a dead time of their own to be found; by name with the longest to look for (s, ``None``: a
+            typical oscillation of the states, at most a tenth of the longest recording).
         replicates: resampled data sets behind the inclusion probabilities.
         seed: of every random choice.
     """
+    if isinstance(dead_time, str):
+        dead_time = [dead_time]
+    longest_of = dead_time if isinstance(dead_time, Mapping) else dict.fromkeys(dead_time)
     coordinates = [states] if isinstance(states, str) else list(states)
     wanted = {
         "states": coordinates,
@@ -145,6 +151,7 @@ def identify(
         "delay": delay,
         "gain": gain,
         "longest": longest,
+        "dead_time": list(longest_of.items()),
         "replicates": replicates,
         "seed": seed,
     }

@@ -4,7 +4,7 @@ use greybox_calibrate::Data;
 use greybox_commands::{Failure, calibrate as calibration, check as checks, diagnose as diagnosis};
 use greybox_commands::{identify as identification, loading, simulate as simulation};
 use greybox_diagnose::Options;
-use greybox_identify::{DelayedState, Library, Monomials};
+use greybox_identify::{DeadTime, DelayedState, Library, Monomials};
 use greybox_model::Model as Equations;
 use greybox_report::convert::identification::Sources as Told;
 use greybox_report::page;
@@ -81,6 +81,7 @@ pub(crate) struct Wanted {
     delay: Option<String>,
     gain: Option<f64>,
     longest: f64,
+    dead_time: Vec<(String, Option<f64>)>,
     replicates: usize,
     seed: u64,
 }
@@ -110,6 +111,11 @@ impl Wanted {
             order: self.order.unwrap_or(usual.order),
             hold: self.hold.as_deref().map(hold).transpose()?,
             delay,
+            dead_times: self
+                .dead_time
+                .iter()
+                .map(|(input, longest)| DeadTime { input: input.clone(), longest: *longest })
+                .collect(),
             replicates: self.replicates,
             seed: self.seed,
             ..usual

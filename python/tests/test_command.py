@@ -38,11 +38,13 @@ def test_a_calibration_is_the_command_s(cart, command, tmp_path):
 
 def test_an_identification_is_the_command_s(cart, command, tmp_path):
     flags = ["--states", "x", "--inputs", "f", "--order", "2", "--library", "separate,friction", "--replicates", "5"]
+    flags += ["--dead-time", "f=0.2"]
     command("identify", cart["files"][0], *flags, "--out", tmp_path)
-    wanted = {"order": 2, "library": ["separate", "friction"], "replicates": 5, "derivatives": [2]}
+    wanted = {"order": 2, "library": ["separate", "friction"], "replicates": 5, "derivatives": [2], "dead_time": {"f": 0.2}}
     found = greybox.identify(cart["files"][0], "x", "f", **wanted)
     assert found.to_json() == (tmp_path / "report.json").read_text()
     assert found.model_text == (tmp_path / "model.toml").read_text()
+    assert found.dead_time["f"].longest == 0.2
     with pytest.raises(greybox.InputError, match="2 orders of leading derivatives"):
         greybox.identify(cart["files"][0], "x", "f", derivatives=[2, 1])
 

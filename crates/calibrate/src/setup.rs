@@ -422,7 +422,20 @@ impl Setup {
 
     /// About `count` segments over all pieces.
     pub fn level(&self, count: usize) -> Segmentation {
-        let segments = segments(&self.data.lengths(), count, LEAST);
+        self.level_after(count, 0.0)
+    }
+
+    /// The same without the first `skip` seconds of every piece: where an input acts late and its past is not recorded, the
+    /// equations there are not known.
+    pub fn level_after(&self, count: usize, skip: f64) -> Segmentation {
+        let skipped: Vec<usize> =
+            self.data.pieces.iter().map(|p| ((skip / p.dt).ceil() as usize).min(p.len)).collect();
+        let lengths: Vec<usize> = self.data.lengths().iter().zip(&skipped).map(|(n, s)| n - s).collect();
+        let mut segments = segments(&lengths, count, LEAST);
+        for segment in &mut segments {
+            segment.range.start += skipped[segment.piece];
+            segment.range.end += skipped[segment.piece];
+        }
         let priors = segments.iter().map(|s| self.start_prior(s.piece, s.range.start)).collect();
         Segmentation { segments, priors }
     }

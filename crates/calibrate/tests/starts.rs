@@ -49,6 +49,23 @@ fn a_late_sensor_shows_where_the_machine_was() {
     assert!(corrected < 0.05 * off, "{corrected} {off}");
 }
 
+/// Segments that begin only where the past of a late input is known: as many, of what is left.
+#[test]
+fn segments_may_leave_out_the_beginning_of_every_piece() {
+    let (n, dt) = (600, 0.01);
+    let f = force(7, n, dt, 1.0, 5.0);
+    let model = Model::from_toml(OSCILLATOR, "plain.toml").unwrap();
+    let measured = measure(&model, &f, dt, &[0.0, 0.0]);
+    let setup = setup(&model, &f, dt, &measured);
+    assert_eq!(setup.level_after(4, 0.0).segments, setup.level(4).segments);
+    // 0.255 s: 26 samples.
+    let late = setup.level_after(4, 0.255);
+    assert_eq!((late.segments[0].range.start, late.segments[3].range.end), (26, n));
+    assert!(late.segments.windows(2).all(|s| s[0].range.end == s[1].range.start));
+    assert_eq!(late.priors[0], setup.start_prior(0, 26));
+    assert!(setup.level_after(4, 100.0).segments.is_empty());
+}
+
 /// A free decay whose frequency depends on its amplitude: the start is found beside the one that one-sided smoothing
 /// believes in, in free runs and in fits that begin elsewhere.
 #[test]

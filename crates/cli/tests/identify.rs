@@ -319,6 +319,53 @@ fn delayed() -> String {
     text
 }
 
+/// 40 s of 2x″ + x′ + 6x + 0.1x³ = f whose force is recorded 0.07 s before it acts.
+fn late() -> String {
+    let prompt =
+        recorded(["f [N]", "x [m]"], 1.0, 40.0, 0.0, |x, v, f| (f - 6.0 * x - 0.1 * x.powi(3) - v) / 2.0);
+    let rows: Vec<Vec<&str>> = prompt.lines().skip(1).map(|row| row.split(',').collect()).collect();
+    let mut text = "t,f [N],x [m]\n".to_owned();
+    for (row, later) in rows.iter().zip(&rows[7..]) {
+        writeln!(text, "{},{},{}", row[0], later[1], row[2]).unwrap();
+    }
+    text
+}
+
+#[test]
+fn a_dead_time_is_told_and_the_model_with_it_is_one_for_the_other_commands() {
+    let bench = Bench::empty();
+    bench.write("train.csv", &late());
+    let request =
+        ["identify", "train.csv", "--states", "x", "--inputs", "f", "--library", "total", "--order", "3"];
+    let asked = ["--dead-time", "f=0.3", "--hold", "linear", "--replicates", "5", "--out", "found"];
+    let outcome = bench.greybox(&[&request[..], &asked].concat());
+    assert_eq!(outcome.code, 0, "{}", outcome.stderr);
+    let page = include_str!("../../../docs/src/identify.md");
+    for said in ["= f(t − 0.0", "The dead time of f is (0.0"] {
+        let line = outcome.stdout.lines().find(|line| line.contains(said)).unwrap();
+        assert!(page.contains(line), "the book has another output: {line}");
+    }
+    let report: Value = serde_json::from_str(&bench.read("found/report.json")).unwrap();
+    let dead_time = &report["dead_time"]["f"];
+    let (value, low) = (dead_time["value"].as_f64().unwrap(), dead_time["ci95"][0].as_f64().unwrap());
+    assert!((value - 0.07).abs() < 3.0 * (value - low) && value - low < 0.005, "{dead_time}");
+    assert_eq!((&dead_time["longest"], &dead_time["parameter"]), (&0.3.into(), &"tau_f".into()));
+    assert!(dead_time["warning"].is_null(), "{dead_time}");
+    let model = bench.read("found/model.toml");
+    assert!(model.contains("delay(f, tau_f)") && model.contains("95 % interval 0.0"), "{model}");
+    assert!(bench.read("found/report.html").contains("Dead time"));
+    for command in [
+        &["simulate", "found/model.toml", "train.csv", "--out", "again.csv"][..],
+        &["calibrate", "found/model.toml", "train.csv", "--out", "calibrated"],
+        &["diagnose", "found/model.toml", "train.csv", "--out", "diagnosed"],
+    ] {
+        let outcome = bench.greybox(command);
+        assert_eq!(outcome.code, 0, "{command:?}: {}", outcome.stderr);
+    }
+    let verdict: Value = serde_json::from_str(&bench.read("diagnosed/report.json")).unwrap();
+    assert_eq!(verdict["verdict"], "consistent");
+}
+
 #[test]
 fn a_delay_has_its_interval_and_its_bound() {
     let bench = Bench::empty();
@@ -345,7 +392,7 @@ fn requests_that_cannot_be_met() {
     let rows = motion.lines().skip(1).map(|row| format!("{row},0.5,{}\n", row.len()));
     bench.write("run.csv", &format!("t,f [N],x [m],still [m],bad name\n{}", rows.collect::<String>()));
     bench.write("model.toml", "[states]\n[equations]\n");
-    let cases: [(&[&str], &[&str]); 21] = [
+    let cases: [(&[&str], &[&str]); 25] = [
         (&["--inputs", "f"], &["--states"]),
         (&["--states", "", "--inputs", "f"], &["no state is named"]),
         (&["--states", "z", "--inputs", "f"], &["run.csv", "no channel `z`", "`f`, `x`", "help:"]),
@@ -359,6 +406,16 @@ fn requests_that_cannot_be_met() {
         (&["--states", "x", "--delay", "x"], &["an input must be named"]),
         (&["--states", "x", "--inputs", "f", "--delay", "x", "--longest", "-1"], &["longest delay is -1"]),
         (&["--states", "x", "--inputs", "f", "--gain", "2"], &["--delay"]),
+        (&["--states", "x", "--inputs", "f", "--dead-time", "x"], &["`x`", "not among the inputs (f)"]),
+        (&["--states", "x", "--inputs", "f", "--dead-time", "f=-1"], &["longest dead time is -1"]),
+        (
+            &["--states", "x", "--inputs", "f", "--dead-time", "f=soon"],
+            &["`soon` is not a number of seconds"],
+        ),
+        (
+            &["--states", "x", "--inputs", "f", "--dead-time", "f", "--delay", "x"],
+            &["not looked for together"],
+        ),
         (&["--states", "x", "--inputs", "f", "--order", "0"], &["order of the library is 0", "1 to 12"]),
         (&["--states", "x", "--inputs", "f", "--derivatives", "3"], &["leading derivative is 3"]),
         (&["--states", "x", "--inputs", "f", "--library", "cubic"], &["cubic", "tensor, total, separate"]),

@@ -376,6 +376,8 @@ impl From<IdentifyError> for Failure {
             IdentifyError::Twice { name, .. }
             | IdentifyError::Name { name, .. }
             | IdentifyError::DelayedState { name, .. }
+            | IdentifyError::LateInput { name, .. }
+            | IdentifyError::TwoDeadTimes { name }
             | IdentifyError::Still { name } => Failure::input(message).at("channel", name),
             _ => Failure::input(message),
         }

@@ -90,6 +90,26 @@ pub enum IdentifyError {
         /// The states.
         states: String,
     },
+    /// An input with a dead time that is none of the inputs.
+    #[error("the input `{name}` with a dead time is not among the inputs ({inputs})")]
+    LateInput {
+        /// As given.
+        name: String,
+        /// The inputs.
+        inputs: String,
+    },
+    /// One input with two dead times.
+    #[error("the input `{name}` is given two dead times: name it once")]
+    TwoDeadTimes {
+        /// The input.
+        name: String,
+    },
+    /// A delayed feedback and a dead time.
+    #[error(
+        "a delayed feedback and the dead time of an input are not looked for together; leave one of them out, or write both \
+         into a model and calibrate it"
+    )]
+    DelayAndDeadTime,
     /// Delays are looked for that no recording can show.
     #[error(
         "delays up to {longest} s are looked for, but the longest stretch without a gap lasts {recorded:.4} s: look for \
@@ -133,6 +153,11 @@ pub enum IdentifyError {
         "a delayed feedback is not looked for in blocks, whose starts do not know the past; read whole recordings"
     )]
     DelayInBlocks,
+    /// A dead time and recordings read in blocks.
+    #[error(
+        "the dead time of an input is not looked for in blocks, whose starts do not know the past; read whole recordings"
+    )]
+    DeadTimeInBlocks,
     /// No block was given.
     #[error("there is no block to identify anything from")]
     NoBlocks,

@@ -7,15 +7,15 @@ use greybox_calibrate::{
 };
 use greybox_model::{Hold, Model, Unit};
 use greybox_recording::Recording;
-use greybox_sparse::{folds, select};
 
-use crate::choose::Roles;
+use crate::dead_time;
 use crate::error::IdentifyError;
-use crate::options::Options;
+use crate::first::{First, Ground, first_estimates};
+use crate::options::{DelayedState, Options};
 use crate::output_error::{self, Refined, State};
 use crate::precision::{self, Precision};
 use crate::setting::{Setting, derivative, is_of_the_language};
-use crate::structure::{Equation, Extra, Signal, Structure};
+use crate::structure::{DeadTime, Equation, Extra, Signal, Structure};
 use crate::weak;
 
 /// A chosen term.
@@ -90,6 +90,30 @@ pub struct FoundDelay {
     pub correlation: Option<f64>,
 }
 
+/// The identified dead time τ of an input u: every equation that u enters has u(t − τ).
+#[derive(Debug, Clone, PartialEq)]
+pub struct FoundDeadTime {
+    /// The input.
+    pub input: String,
+    /// Name of τ in the model.
+    pub parameter: String,
+    /// τ, s.
+    pub value: f64,
+    /// Its 95 % interval, which does not go below zero; none where τ ended on the longest looked for.
+    pub ci95: Option<(f64, f64)>,
+    /// The Cramér–Rao bound of its standard deviation at the noise found, s.
+    pub bound: Option<f64>,
+    /// Longest τ looked for, s.
+    pub longest: f64,
+}
+
+impl FoundDeadTime {
+    /// Whether τ ended on the longest looked for.
+    pub fn is_at_longest(&self) -> bool {
+        self.value >= self.longest * (1.0 - 1e-6)
+    }
+}
+
 /// Free runs over the recordings of one role.
 #[derive(Debug, Clone)]
 pub struct Role {
@@ -129,6 +153,10 @@ pub struct Identification {
     pub order: OrderChoice,
     /// Delays.
     pub delays: Vec<FoundDelay>,
+    /// Dead times of the inputs that were asked for and that enter an equation.
+    pub dead_times: Vec<FoundDeadTime>,
+    /// Inputs whose dead times were asked for but that enter no equation.
+    pub without_effect: Vec<String>,
     /// Fit on the training recordings.
     pub train: Role,
     /// Fit on held-out recordings.
@@ -199,15 +227,14 @@ pub(crate) fn search(
     options: &Options,
     listener: &dyn ProgressListener,
 ) -> Result<Search, IdentifyError> {
-    let plain = structure(fit_on, options)?;
-    let structures = if options.has_one_scale() { plain.scaled_together() } else { vec![plain] };
-    let plain = &structures[0];
+    let mut plain = structure(fit_on, options)?;
     let all = vec![true; plain.terms.len()];
     let ones: Vec<f64> = plain.terms.iter().map(|t| if t.optional { 0.0 } else { 1.0 }).collect();
-    let extras: Vec<f64> = plain.extras.iter().flat_map(|e| &e.parameters).map(|p| p.1).collect();
-    let whole = plain.model(&all, &ones, &extras)?;
+    let whole = plain.model(&all, &ones, &plain.outside_values())?;
     let data = Arc::new(Data::new(&whole, fit_on)?);
-    let samples = data.samples();
+    plain.dead_times.iter_mut().filter(|d| d.longest.is_infinite()).for_each(|d| d.longest = reach(&data));
+    let past = plain.unknown_past();
+    let samples = data.pieces.iter().map(|p| p.len - ((past / p.dt).ceil() as usize).min(p.len)).sum();
     if plain.terms.len() * 4 > samples {
         return Err(IdentifyError::TooManyTerms { candidates: plain.terms.len(), samples });
     }
@@ -217,12 +244,13 @@ pub(crate) fn search(
 
     listener.stage("weak form");
     let smoothed_states = SmoothedStates::new(&whole, &data);
-    let values = weak::evaluate(plain, &whole, &data, &smoothed_states).ok_or(IdentifyError::NoFit)?;
+    let ground = Ground { model: &whole, data: &data, smoothed_states: &smoothed_states, options };
+    let structures = if options.has_one_scale() { plain.scaled_together() } else { vec![plain] };
     let work = Arc::new(Work::within(options.work));
     listener.begins(&work);
     let mut proposed: Vec<(Structure, First)> = Vec::new();
     for structure in structures {
-        let first = first_estimates(&structure, &whole, &data, &values, options)?;
+        let first = first_estimates(&structure, &ground)?;
         proposed.push((structure, first));
     }
 
@@ -238,6 +266,12 @@ pub(crate) fn search(
         output_error::with_inputs_of_strength_one(structure, refined, &mut first.allowed);
     let (structure, refined) = output_error::scaled_by_inputs(structure, refined, &mut first.allowed);
     Ok(Search { structure, data, first, refined })
+}
+
+/// The longest dead time looked for where none is stated, s: a typical oscillation, at most a tenth of the longest stretch.
+fn reach(data: &Data) -> f64 {
+    let longest = data.pieces.iter().map(|p| p.len as f64 * p.dt).fold(0.0, f64::max);
+    weak::period(data).min(0.1 * longest)
 }
 
 fn split(train: &[Recording], holdout: &[Recording]) -> (Vec<Recording>, Vec<Recording>, HoldoutSource) {
@@ -312,45 +346,21 @@ pub(crate) fn structure(recordings: &[Recording], options: &Options) -> Result<S
         angles,
         taken,
     };
+    let lengths = recordings.iter().flat_map(|r| &r.pieces).map(|p| p.len as f64 * p.dt);
+    let recorded = lengths.fold(0.0, f64::max);
+    dead_time::check(options, recorded)?;
+    let dead_times = options
+        .dead_times
+        .iter()
+        .map(|d| DeadTime {
+            input: d.input.clone(),
+            parameter: setting.name(format!("tau_{}", d.input)),
+            longest: d.longest.unwrap_or(f64::INFINITY),
+        })
+        .collect();
     let terms = options.library.terms(&mut setting);
-    let mut extras = Vec::new();
-    if let Some(delay) = &options.delay {
-        if !options.states.contains(&delay.state) {
-            return Err(IdentifyError::DelayedState {
-                name: delay.state.clone(),
-                states: options.states.join(", "),
-            });
-        }
-        if options.inputs.is_empty() {
-            return Err(IdentifyError::DelayWithoutInput);
-        }
-        if !(delay.longest > 0.0 && delay.longest.is_finite()) {
-            let found = delay.longest;
-            return Err(IdentifyError::Range { what: "the longest delay", found, range: "(0, ∞) s" });
-        }
-        if let Some(found) = delay.gain.filter(|gain| !gain.is_finite()) {
-            return Err(IdentifyError::Range {
-                what: "the gain of the delayed feedback",
-                found,
-                range: "the finite numbers",
-            });
-        }
-        if options.has_one_scale() {
-            return Err(IdentifyError::DelayWithEnergies);
-        }
-        let lengths = recordings.iter().flat_map(|r| &r.pieces).map(|p| p.len as f64 * p.dt);
-        let recorded = lengths.fold(0.0, f64::max);
-        if delay.longest >= recorded {
-            return Err(IdentifyError::LongestDelay { longest: delay.longest, recorded });
-        }
-        extras.push(Extra {
-            expression: format!("-kp*delay({}, tau)", delay.state),
-            parameters: vec![
-                ("kp".to_string(), delay.gain.unwrap_or(1.0), delay.gain.is_some()),
-                ("tau".to_string(), 0.25 * delay.longest, false),
-            ],
-        });
-    }
+    let extras = options.delay.iter().map(|delay| feedback(delay, options, recorded));
+    let extras = extras.collect::<Result<Vec<Extra>, IdentifyError>>()?;
     let files: Vec<&str> = recordings.iter().map(|r| r.name.as_str()).collect();
     Ok(Structure {
         title: format!("identified from {}", files.join(", ")),
@@ -367,6 +377,39 @@ pub(crate) fn structure(recordings: &[Recording], options: &Options) -> Result<S
             .collect(),
         terms,
         extras,
+        dead_times,
+    })
+}
+
+/// A delayed feedback beside the input of every equation; `recorded` is the longest stretch without a gap, s.
+fn feedback(delay: &DelayedState, options: &Options, recorded: f64) -> Result<Extra, IdentifyError> {
+    if !options.states.contains(&delay.state) {
+        let (name, states) = (delay.state.clone(), options.states.join(", "));
+        return Err(IdentifyError::DelayedState { name, states });
+    }
+    if options.inputs.is_empty() {
+        return Err(IdentifyError::DelayWithoutInput);
+    }
+    if !(delay.longest > 0.0 && delay.longest.is_finite()) {
+        let found = delay.longest;
+        return Err(IdentifyError::Range { what: "the longest delay", found, range: "(0, ∞) s" });
+    }
+    if let Some(found) = delay.gain.filter(|gain| !gain.is_finite()) {
+        let (what, range) = ("the gain of the delayed feedback", "the finite numbers");
+        return Err(IdentifyError::Range { what, found, range });
+    }
+    if options.has_one_scale() {
+        return Err(IdentifyError::DelayWithEnergies);
+    }
+    if delay.longest >= recorded {
+        return Err(IdentifyError::LongestDelay { longest: delay.longest, recorded });
+    }
+    Ok(Extra {
+        expression: format!("-kp*delay({}, tau)", delay.state),
+        parameters: vec![
+            ("kp".to_string(), delay.gain.unwrap_or(1.0), delay.gain.is_some()),
+            ("tau".to_string(), 0.25 * delay.longest, false),
+        ],
     })
 }
 
@@ -412,175 +455,8 @@ fn check_term(term: &str, options: &Options) -> Result<(), IdentifyError> {
     Ok(())
 }
 
-/// What the weak form says.
-#[derive(Debug, Clone)]
-pub(crate) struct First {
-    /// Starting points, one per window length.
-    pub starts: Vec<State>,
-    /// Candidates that the output error may choose from.
-    pub allowed: Vec<bool>,
-    /// Criterion by order.
-    pub by_order: Vec<(usize, f64)>,
-}
-
 /// Inclusion probability from which a term is in doubt, and its complement.
 const DOUBT: f64 = 0.05;
-
-/// Window lengths of the weak form, in typical oscillations.
-const WINDOWS: [f64; 3] = [0.3, 0.6, 1.2];
-
-fn first_estimates(
-    structure: &Structure,
-    model: &Model,
-    data: &Data,
-    values: &weak::Values,
-    options: &Options,
-) -> Result<First, IdentifyError> {
-    let period = weak::period(data);
-    let longest = data.pieces.iter().map(|p| p.len).max().unwrap_or(0);
-    let dt = data.pieces.iter().map(|p| p.dt).fold(f64::INFINITY, f64::min);
-    let window = |share: f64| (share * period).clamp(16.0 * dt, 0.2 * longest as f64 * dt);
-    let everything = vec![true; structure.terms.len()];
-    let trials = trials(options);
-    let best = |allowed: &[bool]| -> Vec<(f64, State)> {
-        let mut starts: Vec<(f64, State)> = WINDOWS
-            .iter()
-            .flat_map(|share| trials.iter().map(move |t| (window(*share), *t)))
-            .filter_map(|(window, trial)| estimate(structure, model, data, values, window, trial, allowed))
-            .collect();
-        // Without a delay one start per window; with one, the most probable delays.
-        if !structure.extras.is_empty() {
-            starts.sort_by(|a, b| a.0.total_cmp(&b.0));
-            starts.truncate(WINDOWS.len());
-        }
-        starts
-    };
-    let trial = match trials.as_slice() {
-        [None] => None,
-        _ => best(&everything)
-            .first()
-            .and_then(|s| trials[0].map(|t| weak::Trial { delay: s.1.extras[1], ..t })),
-    };
-    let by_order = order_search(structure, model, data, values, window(WINDOWS[1]), trial, options);
-    let chosen = by_order.iter().min_by(|a, b| a.1.total_cmp(&b.1)).map_or(options.order, |o| o.0);
-    // One order more than the first estimate asks for: its errors hide weak terms.
-    let allowed: Vec<bool> = structure.terms.iter().map(|t| t.order <= chosen + 1).collect();
-    let starts: Vec<State> = best(&allowed).into_iter().map(|s| s.1).collect();
-    if starts.is_empty() {
-        return Err(IdentifyError::TooShort { samples: longest });
-    }
-    Ok(First { starts, allowed, by_order })
-}
-
-/// Thesis Algorithm 1 on the weak form: AIC on the second half of the windows for every order of the library, summed
-/// over the equations.
-fn order_search(
-    structure: &Structure,
-    model: &Model,
-    data: &Data,
-    values: &weak::Values,
-    window: f64,
-    trial: Option<weak::Trial>,
-    options: &Options,
-) -> Vec<(usize, f64)> {
-    let mut total: Vec<(usize, f64)> = (1..=options.order).map(|n| (n, 0.0)).collect();
-    for group in structure.groups() {
-        let rows = group.iter().map(|&e| weak::rows(structure, model, data, values, e, window, trial));
-        let Some(rows) = rows.collect::<Option<Vec<weak::Rows>>>() else { continue };
-        let weak::Regression { target, columns, protected } =
-            weak::regression(structure, &rows, trial.and_then(|t| t.gain));
-        let overlap = rows.iter().map(|r| r.overlap).max().unwrap_or(1);
-        let mut pieces = Vec::new();
-        let mut from = 0;
-        for rows in &rows {
-            pieces.extend(rows.pieces.iter().map(|p| from + p.start..from + p.end));
-            from += rows.target.len();
-        }
-        let views: Vec<&[f64]> = columns.iter().map(|c| c.1.as_slice()).collect();
-        let sizes: Vec<usize> = (1..=options.order)
-            .map(|n| columns.iter().filter(|c| c.0.is_none_or(|t| structure.terms[t].order <= n)).count())
-            .collect();
-        let settings = select::Options {
-            folds: 5,
-            gap: overlap,
-            sample_size: select::SampleSize::Effective,
-            ..select::Options::normalised()
-        };
-        // Too many columns for the windows there are: the orders below are still searched.
-        let mut last = sizes.len();
-        while last > 0 {
-            let found = greybox_sparse::Rows::new(&views[..sizes[last - 1]], &target)
-                .and_then(|table| {
-                    let split = folds::train_test(&pieces, 0.5, overlap)?;
-                    select::Problem::new(table, &sizes[..last], &protected, split)
-                })
-                .and_then(|problem| select::search(&problem, &settings));
-            if let Ok(search) = found {
-                for (sum, order) in total.iter_mut().zip(&search.orders) {
-                    sum.1 += order.aic;
-                }
-                break;
-            }
-            last -= 1;
-        }
-        total.truncate(last);
-    }
-    total
-}
-
-/// Delays to try, where one is asked for.
-fn trials(options: &Options) -> Vec<Option<weak::Trial>> {
-    const DELAYS: usize = 16;
-    let Some(delay) = &options.delay else { return vec![None] };
-    let state = options.states.iter().position(|s| *s == delay.state).unwrap_or(0);
-    (1..=DELAYS)
-        .map(|i| {
-            let share = i as f64 / DELAYS as f64;
-            Some(weak::Trial { state, delay: share * delay.longest, gain: delay.gain })
-        })
-        .collect()
-}
-
-/// The weak form's choice with windows of one length, and how well it does.
-fn estimate(
-    structure: &Structure,
-    model: &Model,
-    data: &Data,
-    values: &weak::Values,
-    window: f64,
-    trial: Option<weak::Trial>,
-    allowed: &[bool],
-) -> Option<(f64, State)> {
-    let mut state = State {
-        active: structure.terms.iter().map(|t| !t.optional).collect(),
-        values: structure.terms.iter().map(|t| if t.optional { 0.0 } else { 1.0 }).collect(),
-        extras: structure.extras.iter().flat_map(|e| &e.parameters).map(|p| p.1).collect(),
-    };
-    let mut badness = 0.0;
-    for group in structure.groups() {
-        let rows = group.iter().map(|&e| weak::rows(structure, model, data, values, e, window, trial));
-        let rows: Vec<weak::Rows> = rows.collect::<Option<_>>()?;
-        let gain = trial.and_then(|t| t.gain);
-        let (reduced, terms) = weak::reduce(structure, &rows, gain);
-        let solution = reduced.choose(&Roles::new(&terms, &structure.terms, allowed));
-        badness += reduced.samples * (solution.rss / reduced.samples).ln()
-            + solution.columns.len() as f64 * reduced.samples.ln();
-        for (&c, &v) in solution.columns.iter().zip(&solution.values) {
-            match terms[c] {
-                Some(t) => {
-                    state.active[t] = true;
-                    state.values[t] = v;
-                }
-                // The delayed state stands on the left as −k_p.
-                None => state.extras[0] = -v,
-            }
-        }
-        if let Some(t) = trial {
-            state.extras[1] = t.delay;
-        }
-    }
-    Some((badness, state))
-}
 
 /// A start whose simulations cost so many times as much as another's has a model that can hardly be simulated.
 const HARD: u64 = 10;
@@ -674,7 +550,7 @@ pub(crate) fn conclude(
             let terms = of_equation()
                 .filter(|(i, ..)| state.active[*i])
                 .map(|(i, t, part)| FoundTerm {
-                    expression: part.expression.clone(),
+                    expression: structure.late(&part.expression),
                     parameter: t.parameter.clone(),
                     powers: t.powers.clone(),
                     value: state.values[i],
@@ -699,7 +575,7 @@ pub(crate) fn conclude(
                 .filter_map(|(i, _, part)| {
                     let inclusion = *precision.inclusion.get(i)?;
                     (inclusion > DOUBT && inclusion < 1.0 - DOUBT).then(|| DoubtfulTerm {
-                        expression: part.expression.clone(),
+                        expression: structure.late(&part.expression),
                         chosen: state.active[i],
                         inclusion,
                     })
@@ -721,6 +597,7 @@ pub(crate) fn conclude(
             correlation: precision.extra_correlation,
         })
         .collect();
+    let dead_times = dead_times(structure, &model, state, precision);
     let chosen = structure
         .terms
         .iter()
@@ -733,6 +610,13 @@ pub(crate) fn conclude(
         equations,
         order: OrderChoice { chosen, criterion: "aic", by_order: first.by_order.clone() },
         delays,
+        without_effect: structure
+            .dead_times
+            .iter()
+            .filter(|d| dead_times.iter().all(|found| found.input != d.input))
+            .map(|d| d.input.clone())
+            .collect(),
+        dead_times,
         noise_floor: data.sigma.iter().zip(&data.spread).map(|(s, d)| s / d).collect(),
         misfit: refined.scale.iter().zip(&data.sigma).map(|(r, s)| r / s).collect(),
         rounds: refined.rounds,
@@ -746,4 +630,31 @@ pub(crate) fn conclude(
         holdout_source: source,
         window,
     })
+}
+
+/// The dead times of the inputs that enter an equation.
+fn dead_times(
+    structure: &Structure,
+    model: &Model,
+    state: &State,
+    precision: &Precision,
+) -> Vec<FoundDeadTime> {
+    let first = structure.first_dead_time();
+    let enters = |d: &DeadTime| model.parameter(&d.parameter).is_some();
+    let those = structure.dead_times.iter().enumerate().filter(|(_, d)| enters(d));
+    those
+        .map(|(i, d)| {
+            let value = state.extras[first + i];
+            let found = FoundDeadTime {
+                input: d.input.clone(),
+                parameter: d.parameter.clone(),
+                value,
+                ci95: None,
+                bound: precision.extra_bound(first + i),
+                longest: d.longest,
+            };
+            let ci95 = precision.extra_interval(first + i, value).map(|(low, high)| (low.max(0.0), high));
+            FoundDeadTime { ci95: ci95.filter(|_| !found.is_at_longest()), ..found }
+        })
+        .collect()
 }

@@ -2,8 +2,10 @@
 
 mod choose;
 mod correlation;
+mod dead_time;
 mod energy;
 mod error;
+mod first;
 mod identify;
 mod library;
 mod options;
@@ -17,9 +19,9 @@ mod weak;
 pub use error::IdentifyError;
 pub use greybox_calibrate::HoldoutSource;
 pub use identify::{
-    Blocks, DoubtfulTerm, FoundDelay, FoundEquation, FoundTerm, Identification, OrderChoice,
+    Blocks, DoubtfulTerm, FoundDeadTime, FoundDelay, FoundEquation, FoundTerm, Identification, OrderChoice,
     ProgressListener, Quiet, Role, identify,
 };
 pub use library::{Library, Monomials};
-pub use options::{DelayedState, MOST_WORK, Options};
+pub use options::{DeadTime, DelayedState, MOST_WORK, Options};
 pub use stream::{Linearisation, Statistics, Streamed, identify_blocks};

@@ -24,6 +24,8 @@ pub struct Options {
     pub hold: Option<Hold>,
     /// A delayed feedback of a state.
     pub delay: Option<DelayedState>,
+    /// Inputs that act late, each by a dead time of its own.
+    pub dead_times: Vec<DeadTime>,
     /// Replicates of the block bootstrap behind the inclusion probabilities.
     pub replicates: usize,
     /// Seed of the bootstrap.
@@ -48,6 +50,7 @@ impl Options {
             order: if several { 4 } else { 6 },
             hold: None,
             delay: None,
+            dead_times: Vec::new(),
             replicates: 100,
             seed: 0,
             work: MOST_WORK,
@@ -71,4 +74,14 @@ pub struct DelayedState {
     pub gain: Option<f64>,
     /// Longest delay looked for, s.
     pub longest: f64,
+}
+
+/// The dead time τ ≥ 0 of an input: every equation that the input u enters has u(t − τ).
+#[derive(Debug, Clone, PartialEq)]
+pub struct DeadTime {
+    /// The input.
+    pub input: String,
+    /// Longest τ looked for, s; none: a typical oscillation of the states, at most a tenth of the longest stretch without
+    /// a gap.
+    pub longest: Option<f64>,
 }

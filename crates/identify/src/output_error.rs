@@ -28,7 +28,7 @@ pub(crate) struct State {
     pub active: Vec<bool>,
     /// Coefficients of all candidates (zero outside).
     pub values: Vec<f64>,
-    /// Values of the extras' parameters.
+    /// Values of the parameters outside the choice: those of the extras, then the dead times.
     pub extras: Vec<f64>,
 }
 
@@ -63,8 +63,9 @@ pub(crate) fn setup(
         .filter(|(_, p)| !p.fixed)
         .map(|(index, p)| {
             let leading = structure.terms.iter().any(|t| !t.optional && t.parameter == p.name);
+            let dead_time = structure.dead_times.iter().find(|d| d.parameter == p.name);
             let (lower, upper) = match (leading, p.value >= 0.0) {
-                (false, _) => (f64::NEG_INFINITY, f64::INFINITY),
+                (false, _) => dead_time.map_or((f64::NEG_INFINITY, f64::INFINITY), |d| (0.0, d.longest)),
                 (true, true) => (0.02 * p.value, 50.0 * p.value),
                 (true, false) => (50.0 * p.value, 0.02 * p.value),
             };
@@ -88,7 +89,7 @@ fn read_back(structure: &Structure, state: &mut State, setup: &Setup, fit: &Fit)
             (false, _) => 0.0,
         };
     }
-    for ((name, _, _), v) in structure.extras.iter().flat_map(|e| &e.parameters).zip(&mut state.extras) {
+    for ((name, _), v) in structure.outside().zip(&mut state.extras) {
         *v = value(name).unwrap_or(*v);
     }
 }
@@ -397,12 +398,17 @@ impl Refined {
     }
 }
 
-/// Numbers of segments of the successive levels; a delay's history must not be cut, so that a model with
-/// one starts with whole records.
+/// Numbers of segments of the successive levels; the history of a delayed state must not be cut, so that a model with
+/// one starts with whole records. The past of a delayed input is known at every cut.
 const LEVELS: [usize; 4] = [60, 15, 4, 1];
 
 fn levels(structure: &Structure) -> &'static [usize] {
     if structure.extras.is_empty() { &LEVELS } else { &LEVELS[3..] }
+}
+
+/// About `count` segments; none begins where the past of an input is not in the recording.
+pub(crate) fn level(structure: &Structure, setup: &Setup, count: usize) -> Segmentation {
+    setup.level_after(count, structure.unknown_past())
 }
 
 /// Most steps of a first fit.
@@ -411,7 +417,7 @@ pub(crate) const FIRST_STEPS: usize = 15;
 /// A first fit of `start` on short segments.
 pub(crate) fn begin(structure: &Structure, data: &Arc<Data>, start: State, work: Work) -> Option<Refined> {
     let setup = Setup { work: Arc::new(work), ..setup(structure, data, &start, None)? };
-    let level = setup.level(levels(structure)[0]);
+    let level = level(structure, &setup, levels(structure)[0]);
     let scale: Vec<f64> = data.sigma.iter().zip(&data.spread).map(|(s, d)| s.max(1e-6 * d)).collect();
     let point = Point { parameters: setup.values(), starts: setup.starts(&level, &setup.values()) };
     let limits = Limits { iterations: FIRST_STEPS, tolerance: 1e-4 };
@@ -563,7 +569,7 @@ pub(crate) fn refine(structure: &Structure, begun: Refined, allowed: &[bool]) ->
         if spent(&refined) {
             return refined;
         }
-        let level = refined.setup.level(count);
+        let level = level(structure, &refined.setup, count);
         if level.segments != refined.level.segments {
             let longer = fit_at(&refined, structure, level, Limits { iterations: 25, tolerance: 1e-5 });
             if longer.worse(&refined, 1.5) {

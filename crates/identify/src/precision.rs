@@ -15,11 +15,11 @@ use crate::structure::Structure;
 pub(crate) struct Precision {
     /// Half-width of the 95 % interval per candidate; none where it is not estimated.
     pub half: Vec<Option<f64>>,
-    /// The same for the parameters of the extras.
+    /// The same for the parameters outside the choice.
     pub extra_half: Vec<Option<f64>>,
     /// Their Cramér–Rao standard deviations.
     pub extra_bound: Vec<Option<f64>>,
-    /// Correlation of the first two parameters of the extras.
+    /// Correlation of the first two of them: gain and delay of a feedback.
     pub extra_correlation: Option<f64>,
     /// Share of bootstrap replicates that choose each candidate; empty without replicates.
     pub inclusion: Vec<f64>,
@@ -31,12 +31,12 @@ impl Precision {
         self.half.get(term).copied().flatten().map(|h| (value - h, value + h))
     }
 
-    /// 95 % interval of a parameter of the extras.
+    /// 95 % interval of a parameter outside the choice.
     pub(crate) fn extra_interval(&self, index: usize, value: f64) -> Option<(f64, f64)> {
         self.extra_half.get(index).copied().flatten().map(|h| (value - h, value + h))
     }
 
-    /// Cramér–Rao standard deviation of a parameter of the extras.
+    /// Cramér–Rao standard deviation of a parameter outside the choice.
     pub(crate) fn extra_bound(&self, index: usize) -> Option<f64> {
         self.extra_bound.get(index).copied().flatten()
     }
@@ -101,8 +101,7 @@ pub(crate) fn assess(
             .collect()
     };
     let width = &spread.half;
-    let extras: Vec<Option<usize>> =
-        structure.extras.iter().flat_map(|e| &e.parameters).map(|p| position(&p.0)).collect();
+    let extras: Vec<Option<usize>> = structure.outside().map(|(name, _)| position(name)).collect();
     let of_extras = |values: &[f64]| extras.iter().map(|i| i.map(|i| values[i])).collect();
     let extra_correlation = match extras.as_slice() {
         [Some(a), Some(b), ..] => Some(spread.covariance(*a, *b) / (gauss[*a] * gauss[*b])),

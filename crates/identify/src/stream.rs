@@ -129,7 +129,8 @@ impl Linearisation {
     /// Candidates and a first model from one block.
     ///
     /// # Errors
-    /// As [`identify()`](crate::identify()); [`IdentifyError::DelayInBlocks`] where a delayed feedback is asked for.
+    /// As [`identify()`](crate::identify()); [`IdentifyError::DelayInBlocks`] and
+    /// [`IdentifyError::DeadTimeInBlocks`] where a delay is asked for.
     pub fn begin(
         block: &Recording,
         options: &Options,
@@ -137,6 +138,9 @@ impl Linearisation {
     ) -> Result<Self, IdentifyError> {
         if options.delay.is_some() {
             return Err(IdentifyError::DelayInBlocks);
+        }
+        if !options.dead_times.is_empty() {
+            return Err(IdentifyError::DeadTimeInBlocks);
         }
         let search = search(std::slice::from_ref(block), options, listener)?;
         let samples = search.data.samples();

@@ -1,6 +1,6 @@
 //! What an equation may be made of: candidate terms, and the model a choice of them writes.
 
-use greybox_model::{Hold, Model, ModelError};
+use greybox_model::{Expr, Func, Hold, Model, ModelError};
 
 /// What the weak form integrates: ∫ w s⁽ᵈ⁾ dτ, derivative d of a signal s.
 #[derive(Debug, Clone, PartialEq)]
@@ -71,6 +71,17 @@ pub(crate) struct Extra {
     pub parameters: Vec<(String, f64, bool)>,
 }
 
+/// The dead time τ of an input: wherever an equation has the input u, it has u(t − τ).
+#[derive(Debug, Clone, PartialEq)]
+pub(crate) struct DeadTime {
+    /// The input.
+    pub input: String,
+    /// Name of τ in the model.
+    pub parameter: String,
+    /// Longest τ looked for, s; infinite as long as it is open.
+    pub longest: f64,
+}
+
 /// One equation: Σ coefficient × term + extras = input.
 #[derive(Debug, Clone, PartialEq)]
 pub(crate) struct Equation {
@@ -109,9 +120,53 @@ pub(crate) struct Structure {
     pub terms: Vec<Term>,
     /// Parts outside the choice.
     pub extras: Vec<Extra>,
+    /// Inputs with a dead time.
+    pub dead_times: Vec<DeadTime>,
 }
 
 impl Structure {
+    /// The parameters outside the choice, and whether each is known: those of the extras, then the dead times.
+    pub(crate) fn outside(&self) -> impl Iterator<Item = (&str, bool)> {
+        let extras =
+            self.extras.iter().flat_map(|e| &e.parameters).map(|(name, _, known)| (name.as_str(), *known));
+        extras.chain(self.dead_times.iter().map(|d| (d.parameter.as_str(), false)))
+    }
+
+    /// Their first values.
+    pub(crate) fn outside_values(&self) -> Vec<f64> {
+        let extras = self.extras.iter().flat_map(|e| &e.parameters).map(|p| p.1);
+        extras.chain(self.dead_times.iter().map(|_| 0.0)).collect()
+    }
+
+    /// Where the dead times stand among the parameters outside the choice.
+    pub(crate) fn first_dead_time(&self) -> usize {
+        self.extras.iter().map(|e| e.parameters.len()).sum()
+    }
+
+    /// What a recording begins with that no fit can use: the longest dead time, s, over which the past of an input is
+    /// not in the recording.
+    pub(crate) fn unknown_past(&self) -> f64 {
+        self.dead_times.iter().map(|d| d.longest).fold(0.0, f64::max)
+    }
+
+    /// An expression with every input that has a dead time as late as that.
+    pub(crate) fn late(&self, expression: &str) -> String {
+        let delayed = |d: &DeadTime| format!("delay({}, {})", d.input, d.parameter);
+        if let Some(dead_time) = self.dead_times.iter().find(|d| d.input == expression) {
+            return delayed(dead_time);
+        }
+        let Ok(parsed) = greybox_model::parse(expression) else { return expression.to_string() };
+        if !self.dead_times.iter().any(|d| parsed.expr.contains(&d.input, 0)) {
+            return expression.to_string();
+        }
+        let variable = |name: &str| Expr::Var { name: name.into(), primes: 0 };
+        let late = parsed.expr.substitute(&|name, primes| {
+            let dead_time = self.dead_times.iter().find(|d| d.input == name && primes == 0)?;
+            Some(Expr::Call(Func::Delay, vec![variable(name), variable(&dead_time.parameter)]))
+        });
+        format!("({late})")
+    }
+
     /// The model with the terms in `active` and their `values` (one per candidate).
     ///
     /// # Errors
@@ -149,10 +204,22 @@ impl Structure {
                 let _ = writeln!(text, "{} = {{ value = {:?} }}", term.parameter, values[i]);
             }
         }
-        for ((name, _, known), value) in self.extras.iter().flat_map(|e| &e.parameters).zip(extras) {
-            let _ = writeln!(text, "{name} = {{ value = {value:?}, fixed = {known} }}");
+        let equations = self.equations_text(active);
+        for (i, ((name, known), value)) in self.outside().zip(extras).enumerate() {
+            // An input that enters no equation has no dead time.
+            if i < self.first_dead_time() || equations.contains(&format!(", {name})")) {
+                let _ = writeln!(text, "{name} = {{ value = {value:?}, fixed = {known} }}");
+            }
         }
         text.push_str("\n[equations]\n");
+        text.push_str(&equations);
+        text
+    }
+
+    /// The equations with the terms in `active`, one a line.
+    fn equations_text(&self, active: &[bool]) -> String {
+        use std::fmt::Write;
+        let mut text = String::new();
         for (e, equation) in self.equations.iter().enumerate() {
             let mut left: Vec<String> = self
                 .terms
@@ -160,17 +227,19 @@ impl Structure {
                 .enumerate()
                 .filter(|(i, _)| active[*i])
                 .filter_map(|(i, t)| {
-                    Some((self.has_coefficient(i), &t.parameter, t.part(e)?.expression.as_str()))
+                    Some((self.has_coefficient(i), &t.parameter, self.late(&t.part(e)?.expression)))
                 })
-                .map(|(has_coefficient, parameter, expression)| match (has_coefficient, expression) {
-                    (false, expression) => expression.to_string(),
-                    (true, "1") => parameter.clone(),
-                    (true, expression) => format!("{parameter}*{expression}"),
+                .map(|(has_coefficient, parameter, expression)| {
+                    match (has_coefficient, expression.as_str()) {
+                        (false, expression) => expression.to_string(),
+                        (true, "1") => parameter.clone(),
+                        (true, expression) => format!("{parameter}*{expression}"),
+                    }
                 })
                 .collect();
             left.extend(self.extras.iter().map(|x| x.expression.clone()));
             let left = left.join(" + ").replace("+ -", "- ");
-            let right = equation.input.as_deref().unwrap_or("0");
+            let right = equation.input.as_ref().map_or_else(|| "0".to_string(), |input| self.late(input));
             let _ = writeln!(text, "{} = \"{left} = {right}\"", equation.name);
         }
         text
@@ -288,7 +357,35 @@ mod tests {
                 .to_vec(),
             terms,
             extras: Vec::new(),
+            dead_times: Vec::new(),
         }
+    }
+
+    #[test]
+    fn an_input_with_a_dead_time_is_late_wherever_it_stands() {
+        let mut late = structure();
+        late.equations[0] =
+            Equation { input: Some("w".to_string()), normalised: false, ..late.equations[0].clone() };
+        late.dead_times = ["u", "w"]
+            .map(|input| DeadTime {
+                input: input.to_string(),
+                parameter: format!("tau_{input}"),
+                longest: 0.5,
+            })
+            .to_vec();
+        assert_eq!(late.late("u"), "delay(u, tau_u)");
+        assert_eq!(late.late("x^2"), "x^2");
+        assert_eq!(late.late("(x*u - w)"), "(x*delay(u, tau_u) - delay(w, tau_w))");
+        // x″ of the first equation alone, without u, and u in the second.
+        let mut active = vec![true, true, true, false, false, false, true, false, false, false];
+        let values = vec![1.0; active.len()];
+        let text = late.toml(&active, &values, &[0.1, 0.2]);
+        assert!(text.contains("= delay(w, tau_w)\"") && text.contains("p*delay(u, tau_u) = 0"), "{text}");
+        assert!(text.contains("tau_u = { value = 0.1") && text.contains("tau_w = { value = 0.2"), "{text}");
+        // What enters no equation has no dead time.
+        active[6] = false;
+        assert!(!late.toml(&active, &values, &[0.1, 0.2]).contains("tau_u"));
+        assert_eq!(late.unknown_past(), 0.5);
     }
 
     #[test]

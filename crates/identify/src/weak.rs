@@ -5,6 +5,7 @@
 //! are taken of the smoothed states. Errors in these regressors bias the coefficients a little, and the
 //! choice of terms with them: that is why what is found here is only where the output error starts.
 
+use std::borrow::Cow;
 use std::collections::{BTreeMap, BTreeSet};
 use std::ops::Range;
 
@@ -15,6 +16,60 @@ use greybox_model::{Expr, Hold, Model};
 
 use crate::choose::Reduced;
 use crate::structure::{Integral, Structure};
+
+/// What the weak form sees of one piece.
+pub(crate) struct Stretch<'a> {
+    /// Sample interval, s.
+    dt: f64,
+    /// The inputs as they act: each a dead time later than it was recorded.
+    inputs: Vec<Cow<'a, [f64]>>,
+    /// The measurements.
+    measured: Vec<&'a [f64]>,
+    /// The measurements smoothed.
+    smooth: Vec<&'a [f64]>,
+    /// The smoothed states, where a channel measures them.
+    states: Vec<Option<&'a [f64]>>,
+}
+
+impl Stretch<'_> {
+    fn len(&self) -> usize {
+        self.measured.first().map_or(0, |m| m.len())
+    }
+}
+
+/// The pieces with the input i `late[i]` seconds late, without the first `skip` seconds of each.
+///
+/// Between samples a late input is read off a straight line. Where it is linear between its samples, that is the input;
+/// where it is held, it is the mean over the interval, so that its integral is that of the input.
+pub(crate) fn stretches<'a>(
+    data: &'a Data,
+    smoothed_states: &'a SmoothedStates,
+    late: &[f64],
+    skip: f64,
+) -> Vec<Stretch<'a>> {
+    data.pieces
+        .iter()
+        .zip(&smoothed_states.states)
+        .filter_map(|(piece, states)| {
+            let from = (skip / piece.dt).ceil() as usize;
+            (from < piece.len).then(|| Stretch {
+                dt: piece.dt,
+                inputs: piece
+                    .inputs
+                    .iter()
+                    .zip(late)
+                    .map(|(u, late)| match *late > 0.0 {
+                        true => Cow::Owned(earlier(u, piece.dt, *late).split_off(from)),
+                        false => Cow::Borrowed(&u[from..]),
+                    })
+                    .collect(),
+                measured: piece.measured.iter().map(|y| &y[from..]).collect(),
+                smooth: piece.smooth.iter().map(|y| &y.value[from..]).collect(),
+                states: states.iter().map(|x| x.as_ref().map(|x| &x[from..])).collect(),
+            })
+        })
+        .collect()
+}
 
 /// Columns of one equation's regression.
 pub(crate) struct Rows {
@@ -59,20 +114,20 @@ fn earlier(signal: &[f64], dt: f64, delay: f64) -> Vec<f64> {
 }
 
 /// Signals along the smoothed states.
-pub(crate) struct Values {
+pub(crate) struct Signals<'a> {
+    stretches: Vec<Stretch<'a>>,
     /// Index of each signal.
     index: BTreeMap<String, usize>,
-    /// `[piece][signal][sample]`.
+    /// `[stretch][signal][sample]`.
     values: Vec<Vec<Vec<f64>>>,
 }
 
 /// Values of all signals that the candidate terms integrate.
-pub(crate) fn evaluate(
+pub(crate) fn evaluate<'a>(
     structure: &Structure,
     model: &Model,
-    data: &Data,
-    smoothed_states: &SmoothedStates,
-) -> Option<Values> {
+    stretches: Vec<Stretch<'a>>,
+) -> Option<Signals<'a>> {
     let orders: Vec<usize> = model.states.iter().map(|s| s.order).collect();
     let offsets: Vec<usize> = orders
         .iter()
@@ -100,25 +155,23 @@ pub(crate) fn evaluate(
     let index = signals.into_iter().enumerate().map(|(i, signal)| (signal.clone(), i)).collect();
     let kinds = vec![LeafKind::Input; nx + model.inputs.len()];
     let tape = Tape::compile(&exprs, kinds, &resolve).ok()?;
-    let values = data
-        .pieces
+    let values = stretches
         .iter()
-        .zip(&smoothed_states.states)
-        .map(|(piece, smoothed_states)| {
-            if smoothed_states.iter().any(Option::is_none) {
+        .map(|stretch| {
+            if stretch.states.iter().any(Option::is_none) {
                 return None;
             }
             let leaf = |i: usize| -> Lane<'_> {
                 if i < nx {
-                    Lane::Series(smoothed_states[i].as_deref().unwrap_or(&[]))
+                    Lane::Series(stretch.states[i].unwrap_or(&[]))
                 } else {
-                    Lane::Series(&piece.inputs[i - nx])
+                    Lane::Series(&stretch.inputs[i - nx])
                 }
             };
-            Some(tape.eval_batch(piece.len, &leaf))
+            Some(tape.eval_batch(stretch.len(), &leaf))
         })
         .collect::<Option<_>>()?;
-    Some(Values { index, values })
+    Some(Signals { stretches, index, values })
 }
 
 /// How a signal that acts as `hold` says runs between its samples.
@@ -134,13 +187,13 @@ fn join(hold: Hold) -> Join {
 pub(crate) fn rows(
     structure: &Structure,
     model: &Model,
-    data: &Data,
-    values: &Values,
+    signals: &Signals<'_>,
     equation: usize,
     window: f64,
     trial: Option<Trial>,
 ) -> Option<Rows> {
-    let dt = data.pieces.iter().map(|p| p.dt).fold(f64::INFINITY, f64::min);
+    let stretches = &signals.stretches;
+    let dt = stretches.iter().map(|p| p.dt).fold(f64::INFINITY, f64::min);
     let order = model.states[equation].order;
     let intervals = ((window / dt).round() as usize).max(8);
     let kernel = Kernel::new(order, order + 1, intervals, dt).ok()?;
@@ -150,12 +203,11 @@ pub(crate) fn rows(
     let parts = || terms.iter().filter_map(|&t| structure.terms[t].part(equation));
     let input = structure.equations[equation].input.as_ref().and_then(|name| model.input(name));
     let late: Vec<Vec<f64>> = match trial {
-        Some(t) => data.pieces.iter().map(|p| earlier(&p.smooth[t.state].value, p.dt, t.delay)).collect(),
+        Some(t) => stretches.iter().map(|p| earlier(p.smooth[t.state], p.dt, t.delay)).collect(),
         None => Vec::new(),
     };
-    let zeros: Vec<Vec<f64>> = data.pieces.iter().map(|p| vec![0.0; p.len]).collect();
-    let pieces: Vec<Vec<Column<'_>>> = data
-        .pieces
+    let zeros: Vec<Vec<f64>> = stretches.iter().map(|p| vec![0.0; p.len()]).collect();
+    let pieces: Vec<Vec<Column<'_>>> = stretches
         .iter()
         .enumerate()
         .filter(|(_, p)| (p.dt / dt - 1.0).abs() < 1e-6)
@@ -167,11 +219,11 @@ pub(crate) fn rows(
                 match (state, model.input(&integral.signal)) {
                     // A derivative of a measured state: from the measurement itself.
                     (Some(j), _) => {
-                        Column { signal: &piece.measured[j], order: integral.order, hold: Join::Smooth }
+                        Column { signal: piece.measured[j], order: integral.order, hold: Join::Smooth }
                     }
                     (None, Some(u)) => input_column(u),
                     (None, None) => Column {
-                        signal: &values.values[i][values.index[&integral.signal]],
+                        signal: &signals.values[i][signals.index[&integral.signal]],
                         order: integral.order,
                         hold: Join::Smooth,
                     },
@@ -393,8 +445,9 @@ mod tests {
 
     /// A structure with these terms and nothing else.
     fn of(terms: Vec<Term>) -> Structure {
-        let (inputs, states, equations, extras) = (Vec::new(), Vec::new(), Vec::new(), Vec::new());
-        Structure { title: String::new(), inputs, states, equations, terms, extras }
+        let (inputs, states, equations) = (Vec::new(), Vec::new(), Vec::new());
+        let (extras, dead_times) = (Vec::new(), Vec::new());
+        Structure { title: String::new(), inputs, states, equations, terms, extras, dead_times }
     }
 
     #[test]

@@ -2,6 +2,7 @@
 #![allow(missing_docs, clippy::unwrap_used)]
 
 mod blocks;
+mod dead_time;
 mod invariance;
 mod machines;
 mod recovery;

@@ -41,6 +41,9 @@ pub struct IdentifyReport {
     /// Delayed feedback, by the state that is fed back; absent where none was asked for.
     #[serde(default, skip_serializing_if = "Ordered::is_empty")]
     pub delay: Ordered<Delay>,
+    /// Dead times of inputs, by the input; absent where none was asked for.
+    #[serde(default, skip_serializing_if = "Ordered::is_empty")]
+    pub dead_time: Ordered<DeadTime>,
     /// How well the identified model (`improved`) reproduces the measurements.
     pub fit: Fit,
     /// How the recordings were read, where in blocks.
@@ -233,6 +236,34 @@ pub struct Delay {
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub correlation: Option<f64>,
     /// What to beware of, in plain language: delay and gain that these recordings cannot separate.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub warning: Option<String>,
+}
+
+/// The dead time τ of an input u: every equation that u enters has u(t − τ), in the model language
+/// `delay(u, parameter)`.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize, JsonSchema)]
+pub struct DeadTime {
+    /// Name of τ in `model.toml`.
+    pub parameter: String,
+    /// τ.
+    #[serde(with = "number")]
+    #[schemars(schema_with = "number_schema")]
+    pub value: f64,
+    /// 95 % confidence interval of τ, which does not go below zero; `null` where τ ended on the longest looked for.
+    pub ci95: Option<Interval>,
+    /// Unit of τ, interval, bound and longest: `s`.
+    pub unit: String,
+    /// Cramér–Rao bound of the standard deviation of τ at the noise found: no unbiased method can do better on these
+    /// recordings.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub bound: Option<f64>,
+    /// Longest τ looked for.
+    #[serde(with = "number")]
+    #[schemars(schema_with = "number_schema")]
+    pub longest: f64,
+    /// What to beware of, in plain language: a dead time that these recordings do not tell from none, or that ended on
+    /// the longest looked for.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub warning: Option<String>,
 }

@@ -160,6 +160,41 @@ fn a_delay_is_doubted_only_where_its_numbers_are_doubtful() {
     assert!(sentence::identified::delay_warning(&delay).unwrap().starts_with("The interval of the delay"));
 }
 
+/// The report of an equation whose input has this dead time and interval, looked for up to half a second.
+fn late(value: f64, ci95: Value) -> IdentifyReport {
+    let mut promised = promised();
+    promised["dead_time"] = json!({"v": {"parameter": "tau_v", "value": value, "ci95": ci95, "unit": "s", "bound": 0.0004, "longest": 0.5}});
+    let mut report = IdentifyReport::from_json(&promised.to_string()).unwrap();
+    for (input, dead_time) in &mut report.dead_time {
+        dead_time.warning = sentence::identified::dead_time_warning(input, dead_time);
+    }
+    report.summary = sentence::identified::summary(&report);
+    report
+}
+
+#[test]
+fn a_dead_time_stands_in_the_equation_the_sentences_and_the_page() {
+    let report = late(0.073, json!([0.072, 0.074]));
+    let written = assert_valid(&report);
+    assert_eq!(written["dead_time"]["v"]["ci95"], json!([0.072, 0.074]));
+    assert!(report.summary[0].ends_with(" = v(t − 0.07300 s)."), "{}", report.summary[0]);
+    assert_eq!(report.summary.last().unwrap(), "The dead time of v is (0.0730 ± 0.0010) s.");
+    let html = IdentifyPage { report, ..page() }.to_html().unwrap();
+    assert!(html.contains("<h3>Input <var>v</var></h3>") && html.contains("Longest looked for"), "{html}");
+}
+
+#[test]
+fn a_dead_time_that_may_be_none_or_ended_at_the_longest_is_said() {
+    let none = late(0.0004, json!([0.0, 0.0016]));
+    let last = none.summary.last().unwrap();
+    assert!(last.contains("do not tell it from none") && last.contains("at most 0.0016 s"), "{last}");
+    let longest = late(0.5, Value::Null);
+    let last = longest.summary.last().unwrap();
+    assert!(last.contains("ended on the longest looked for, 0.500 s"), "{last}");
+    assert!(last.contains("--dead-time v=SECONDS"), "{last}");
+    assert!(late(0.1, json!([0.09, 0.11])).dead_time["v"].warning.is_none());
+}
+
 #[test]
 fn the_page_says_what_a_reader_must_know() {
     let html = page().to_html().unwrap();

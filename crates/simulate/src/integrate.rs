@@ -606,9 +606,13 @@ impl<'a> Core<'a> {
         if self.zero_hold {
             self.fresh = false;
         }
-        for (at, delay) in self.breakpoints(s0) {
+        for (at, jump) in self.breakpoints(s0) {
             self.advance(at, false);
-            self.jump_of_delay(delay, at, s1);
+            match jump {
+                Some(delay) => self.jump_of_delay(delay, at, s1),
+                // The slope, and with it the sensitivity to the delay, is another after a bend.
+                None => self.fresh = false,
+            }
         }
         let substeps = self.substeps;
         if self.tolerance.is_none() && substeps > 1 {
@@ -623,18 +627,17 @@ impl<'a> Core<'a> {
         self.advance(s1, self.zero_hold);
     }
 
-    /// Instants inside (s0, s0 + dt) at which a delayed zero-order-hold input jumps.
-    fn breakpoints(&self, s0: f64) -> Vec<(f64, usize)> {
+    /// Instants inside (s0, s0 + dt) at which a delayed input jumps (zero-order hold: with the delay that does) or bends
+    /// (linear between its samples): no step crosses one.
+    fn breakpoints(&self, s0: f64) -> Vec<(f64, Option<usize>)> {
         let mut found = Vec::new();
-        if !self.zero_hold {
-            return found;
-        }
         for (i, delay) in self.system.rhs.delays.iter().enumerate() {
             let Some(u) = self.delayed_input(delay.arg_leaf) else { continue };
-            if self.env.inputs[u].hold() == Hold::Zero {
+            let hold = self.env.inputs[u].hold();
+            if hold != Hold::BandLimited {
                 let tau = self.stages[0].regs[delay.tau as usize];
                 let offset = tau.rem_euclid(self.env.dt);
-                found.push((s0 + offset, i));
+                found.push((s0 + offset, (hold == Hold::Zero).then_some(i)));
             }
         }
         found.sort_by(|a, b| a.0.total_cmp(&b.0));

@@ -3,6 +3,7 @@
 //! Every case makes recordings from a seed, identifies, and compares with the equation that made them. The
 //! rigs integrate on their own and know nothing of the model language.
 
+mod dead_time;
 mod machines;
 mod nominal;
 
@@ -337,7 +338,7 @@ fn doubt_figure(trials: &[Trial]) -> Figure {
 type CaseFn = fn(&[u64]) -> Result<Vec<Figure>>;
 
 /// Name, seeds of the full proof, what to do.
-const CASES: [(&str, usize, CaseFn); 23] = [
+const CASES: [(&str, usize, CaseFn); 27] = [
     ("duffing, thesis set-up, 60 s", 100, thesis_case),
     ("peers' protocol, 1 ms, 0.01", 100, |s| peers_case(s, 0.001, 0.01, 99)),
     ("peers' protocol, 1 ms, 0.05", 100, |s| peers_case(s, 0.001, 0.05, 97)),
@@ -363,6 +364,18 @@ const CASES: [(&str, usize, CaseFn); 23] = [
     ("machine: drive with current, voltage and load", 100, machines::drive_case),
     ("machine: pendulum on a cart, force on the cart", 100, machines::cart_case),
     ("machine: arm of two links, a torque at each joint", 100, machines::arm_case),
+    ("dead time: mass on a stiffening spring, 7.3 samples", 100, |s| {
+        dead_time::spring_case(s, 73, false, 0.006)
+    }),
+    ("dead time: the same, the force held between samples", 100, |s| {
+        dead_time::spring_case(s, 73, true, 0.006)
+    }),
+    ("dead time: the same, no dead time although one is asked for", 100, |s| {
+        dead_time::spring_case(s, 0, false, 0.004)
+    }),
+    ("dead time: chain of two masses, a force on each, 3.4 and 11.8 samples", 100, |s| {
+        dead_time::chain_case(s, [34, 118], [0.016, 0.016])
+    }),
 ];
 
 fn thesis_case(seeds: &[u64]) -> Result<Vec<Figure>> {
@@ -624,14 +637,28 @@ const PAGE: &str = "identify.md";
 pub(crate) const BEGIN: &str =
     "<!-- Made by `cargo xtask prove --identify --only machine: --write-docs`; do not edit. -->";
 
-/// Puts the figures of the machines with several coordinates into the book.
+pub(crate) const BEGIN_DEAD_TIME: &str =
+    "<!-- Made by `cargo xtask prove --identify --only 'dead time:' --write-docs`; do not edit. -->";
+
+/// A table of the book: what the names of its cases begin with, where it begins, and its text.
+type BookTable = (&'static str, &'static str, fn(&[Outcome]) -> String);
+
+/// The tables of the book.
+const TABLES: [BookTable; 2] =
+    [(machines::PREFIX, BEGIN, machines::table), (dead_time::PREFIX, BEGIN_DEAD_TIME, dead_time::table)];
+
+/// Puts the figures of the machines into the book: of each table of which a case was run, all must have been.
 pub(crate) fn write(root: &Path, outcomes: &[Outcome]) -> Result<()> {
-    let all = CASES.iter().filter(|c| c.0.starts_with(machines::PREFIX));
-    for case in all {
-        let ran = outcomes.iter().any(|o| o.case == case.0);
-        anyhow::ensure!(ran, "`{}` was not run: the table in the book has all machines", case.0);
+    let ran = |case: &str| outcomes.iter().any(|o| o.case == case);
+    let begun = |prefix: &str| outcomes.iter().any(|o| o.case.starts_with(prefix));
+    let none = !TABLES.iter().any(|(prefix, ..)| begun(prefix));
+    for (prefix, begin, table) in TABLES.iter().filter(|(prefix, ..)| none || begun(prefix)) {
+        for case in CASES.iter().filter(|c| c.0.starts_with(prefix)) {
+            anyhow::ensure!(ran(case.0), "`{}` was not run: the table in the book has all machines", case.0);
+        }
+        book::put_table(root, PAGE, begin, &table(outcomes))?;
     }
-    book::put_table(root, PAGE, BEGIN, &machines::table(outcomes))
+    Ok(())
 }
 
 /// Writes the recordings of the machines for other tools.
@@ -664,7 +691,9 @@ mod tests {
 
     #[test]
     fn the_book_has_a_place_for_the_machines_and_no_row_of_others() {
-        assert!(book::has_table(&greybox_dev::root(), PAGE, BEGIN));
+        for (_, begin, _) in TABLES {
+            assert!(book::has_table(&greybox_dev::root(), PAGE, begin), "{begin}");
+        }
         let outcome = |case: &str| Outcome {
             case: case.to_string(),
             figures: vec![
@@ -672,6 +701,8 @@ mod tests {
                 Figure::plain("intervals", "95 % of 9"),
             ],
         };
+        let late = dead_time::table(&[outcome("machine: a chain"), outcome("dead time: a spring")]);
+        assert!(late.ends_with("| a spring | 3 of 4 | 95 % of 9 |\n") && !late.contains("chain"), "{late}");
         let table = machines::table(&[outcome("machine: a chain"), outcome("duffing")]);
         assert!(table.ends_with("| a chain | 3 of 4 | 95 % of 9 |\n"), "{table}");
         assert!(!table.contains("duffing"));

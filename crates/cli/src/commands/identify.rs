@@ -4,7 +4,7 @@ use std::path::PathBuf;
 
 use clap::{Args, ValueEnum};
 use greybox_commands::identify::{FILES, Results};
-use greybox_identify::{DelayedState, Library, Monomials, Options, Streamed};
+use greybox_identify::{DeadTime, DelayedState, Library, Monomials, Options, Streamed};
 use greybox_model::Hold;
 use greybox_report::convert::identification::{MODEL_FILE, Sources};
 
@@ -23,6 +23,7 @@ use crate::study::{BILLION, Recordings, Study, whole};
   greybox identify run1.csv run2.csv --states theta,alpha --inputs v --library separate,friction --out found
   greybox identify run1.mat --states x --inputs f --map x=encoder --out found
   greybox identify run1.csv --states x --inputs f --delay x --longest 0.5 --out found
+  greybox identify run1.csv --states x --inputs f --dead-time f=0.2 --hold zero --out found
   greybox identify a_week.csv --states x --inputs f --block 20000 --out found
   greybox identify run1.csv --model link.toml --holdout run2.csv --out found
 
@@ -38,8 +39,8 @@ pub(crate) struct Arguments {
 
     /// Nominal model (TOML): identify the terms that its equations lack
     #[arg(long, value_name = "MODEL.toml", conflicts_with_all = [
-        "states", "inputs", "order", "library", "terms", "derivatives", "hold", "delay", "gain", "longest", "block",
-        "replicates",
+        "states", "inputs", "order", "library", "terms", "derivatives", "hold", "dead_times", "delay", "gain", "longest",
+        "block", "replicates",
     ])]
     model: Option<PathBuf>,
 
@@ -75,6 +76,11 @@ pub(crate) struct Arguments {
     /// What the inputs do between samples [default: found from the recordings]
     #[arg(long, value_name = "HOLD")]
     hold: Option<Between>,
+
+    /// Input with a dead time to be found, and the longest in seconds; may be repeated [default: a typical oscillation of
+    /// the states, at most a tenth of the longest recording]
+    #[arg(long = "dead-time", value_name = "INPUT[=SECONDS]", value_parser = dead_time)]
+    dead_times: Vec<DeadTime>,
 
     /// State that is also fed back with an unknown delay
     #[arg(long, value_name = "STATE")]
@@ -250,11 +256,24 @@ fn options(arguments: &Arguments) -> Result<Options, Failure> {
         order: arguments.order.unwrap_or(usual.order),
         hold: arguments.hold.map(Hold::from),
         delay,
+        dead_times: arguments.dead_times.clone(),
         replicates: usize::from(arguments.replicates),
         seed: arguments.seed,
         work: arguments.work.map_or(usual.work, |work| work.saturating_mul(BILLION)),
         ..usual
     })
+}
+
+/// `INPUT` or `INPUT=SECONDS`.
+fn dead_time(text: &str) -> Result<DeadTime, String> {
+    let (input, longest) = match text.split_once('=') {
+        None => (text, None),
+        Some((input, seconds)) => {
+            let number = seconds.trim().parse::<f64>();
+            (input, Some(number.map_err(|_| format!("`{seconds}` is not a number of seconds"))?))
+        }
+    };
+    Ok(DeadTime { input: input.trim().to_owned(), longest })
 }
 
 /// One value for every state, where one stands for all.

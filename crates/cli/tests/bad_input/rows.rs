@@ -935,6 +935,22 @@ fn options() -> Vec<Row> {
             "a longest delay longer than the recording",
             "greybox identify run.csv --states x --inputs f --delay x --longest 100 --out out",
         ),
+        all(
+            "a dead time of what is no input",
+            "greybox identify run.csv --states x --inputs f --dead-time g --out out",
+        ),
+        all(
+            "a dead time below zero",
+            "greybox identify run.csv --states x --inputs f --dead-time f=-1 --out out",
+        ),
+        all(
+            "a dead time longer than the recording",
+            "greybox identify run.csv --states x --inputs f --dead-time f=100 --out out",
+        ),
+        all(
+            "a dead time beside a delayed feedback",
+            "greybox identify run.csv --states x --inputs f --dead-time f --delay x --out out",
+        ),
         all("a state that is an input too", "greybox identify run.csv --states x --inputs x --out out"),
         all("a state named twice", "greybox identify run.csv --states x,x --inputs f --out out"),
         all(

@@ -4,7 +4,7 @@
 use std::sync::Arc;
 
 use greybox_calibrate::HoldoutSource;
-use greybox_identify::{FoundDelay, FoundEquation, Identification, Role as RoleRun};
+use greybox_identify::{FoundDeadTime, FoundDelay, FoundEquation, Identification, Role as RoleRun};
 use greybox_model::{Hold, Model, Unit, WriteOptions};
 use greybox_recording::Recording;
 
@@ -17,7 +17,8 @@ use crate::contract::{
 };
 use crate::format;
 use crate::identified::{
-    Blocks, Delay, Doubtful, Equation, IdentifyReport, Order, OrderValue, Term, Variable, VariableRole,
+    Blocks, DeadTime, Delay, Doubtful, Equation, IdentifyReport, Order, OrderValue, Term, Variable,
+    VariableRole,
 };
 use crate::page::{self, IdentifyPage, Residual};
 use crate::sentence;
@@ -63,6 +64,7 @@ pub fn report(found: &Identification, sources: &Sources<'_>) -> IdentifyReport {
                 .collect(),
         },
         delay: found.delays.iter().map(|d| (d.state.clone(), delay(d, &found.model, units))).collect(),
+        dead_time: found.dead_times.iter().map(|d| (d.input.clone(), dead_time(d))).collect(),
         fit: fit(found),
         blocks: found.blocks.map(|b| Blocks {
             blocks: b.blocks,
@@ -89,6 +91,7 @@ pub fn report(found: &Identification, sources: &Sources<'_>) -> IdentifyReport {
     };
     report.findings.extend(report.blocks.iter().flat_map(blocks));
     report.findings.extend(found.limited.then(limit));
+    report.findings.extend(found.without_effect.iter().map(|input| without_effect(input)));
     report.summary = sentence::identified::summary(&report);
     report
 }
@@ -103,6 +106,18 @@ fn limit() -> Finding {
         message: "the search ended at its limit of work: the terms were not all tried, and the fit may be unfinished"
             .to_owned(),
         help: Some("give it more with `--work`, a smaller library, or the input that drives the machine".to_owned()),
+    }
+}
+
+/// An input whose dead time was asked for enters no equation.
+fn without_effect(input: &str) -> Finding {
+    Finding {
+        severity: Severity::Warning,
+        code: "dead_time".to_owned(),
+        recording: None,
+        channel: Some(input.to_owned()),
+        message: format!("no equation has the input {input}, so that there is no dead time of it"),
+        help: Some(format!("if it does act, allow a longer dead time with `--dead-time {input}=SECONDS`")),
     }
 }
 
@@ -221,6 +236,20 @@ fn delay(found: &FoundDelay, model: &Model, units: bool) -> Delay {
     delay
 }
 
+fn dead_time(found: &FoundDeadTime) -> DeadTime {
+    let mut dead_time = DeadTime {
+        parameter: found.parameter.clone(),
+        value: found.value,
+        ci95: interval(found.ci95, |v| v),
+        unit: "s".to_owned(),
+        bound: found.bound,
+        longest: found.longest,
+        warning: None,
+    };
+    dead_time.warning = sentence::identified::dead_time_warning(&found.input, &dead_time);
+    dead_time
+}
+
 /// Names of the feedback's gain and delay in the identified model.
 const DELAY_GAIN: &str = "kp";
 const DELAY: &str = "tau";
@@ -263,6 +292,7 @@ pub fn model_toml(found: &Identification) -> String {
     let feedback = found.delays.iter().flat_map(|d| [(DELAY_GAIN, d.gain_ci95), (DELAY, d.ci95)]);
     let comments: Vec<(String, String)> = coefficients
         .chain(feedback)
+        .chain(found.dead_times.iter().map(|d| (d.parameter.as_str(), d.ci95)))
         .filter_map(|(name, ci95)| {
             let factor = unit_of(&found.model, name).map_or(1.0, |u| u.factor);
             let ci = interval(ci95, |v| v / factor)?;

@@ -3,10 +3,10 @@
 use askama::Template;
 
 use super::{Assets, Common, Island, LawView, Scene, Shown, findings, inputs, meta};
-use crate::contract::Ordered;
 use crate::expression::{self, escape};
-use crate::identified::{Delay, Equation, IdentifyReport, Order, Term, VariableRole};
+use crate::identified::{DeadTime, Delay, Equation, IdentifyReport, Order, Term, VariableRole};
 use crate::page::{IdentifyPage, MechanismPlot};
+use crate::sentence::identified::Delays;
 use crate::{ReportError, format, sentence, svg};
 
 /// The one model of an identification.
@@ -74,7 +74,7 @@ struct OrderRow {
 }
 
 struct DelayView {
-    state_html: String,
+    title_html: String,
     rows: Vec<(&'static str, String)>,
     warning: Option<String>,
 }
@@ -112,7 +112,7 @@ impl View {
             equations: report
                 .equations
                 .iter()
-                .map(|(state, e)| equation_view(state, e, &report.delay))
+                .map(|(state, e)| equation_view(state, e, &Delays::of(report)))
                 .collect(),
             variables: variables(report),
             orders: report
@@ -127,13 +127,18 @@ impl View {
                 .collect(),
             criterion: report.order.criterion.to_uppercase(),
             curve: order_curve(&report.order),
-            delays: report.delay.iter().map(|(state, d)| delay_view(state, d)).collect(),
+            delays: report
+                .delay
+                .iter()
+                .map(|(state, d)| delay_view(state, d))
+                .chain(report.dead_time.iter().map(|(input, d)| dead_time_view(input, d)))
+                .collect(),
             model_text: page.model_text.clone(),
         }
     }
 }
 
-fn equation_view(state: &str, equation: &Equation, delays: &Ordered<Delay>) -> EquationView {
+fn equation_view(state: &str, equation: &Equation, delays: &Delays<'_>) -> EquationView {
     EquationView {
         state_html: expression::html(state),
         symbols_html: expression::html(&equation.expression),
@@ -143,7 +148,11 @@ fn equation_view(state: &str, equation: &Equation, delays: &Ordered<Delay>) -> E
 }
 
 /// `2.00 x″ + 1.2 x³ = f`
-fn values_html(equation: &Equation, delays: &Ordered<Delay>) -> String {
+fn values_html(equation: &Equation, delays: &Delays<'_>) -> String {
+    let late = |signal: &str, delay: f64| {
+        let seconds = escape(&format::significant(delay, 4));
+        format!("{}(<var>t</var> − {seconds}\u{202f}s)", expression::html(signal))
+    };
     let mut out = String::new();
     let mut push = |value: f64, factor: &str| {
         out.push_str(format::joint(out.is_empty(), value));
@@ -155,17 +164,20 @@ fn values_html(equation: &Equation, delays: &Ordered<Delay>) -> String {
         out.push_str(factor);
     };
     for term in &equation.terms {
-        let factor = match (sentence::identified::delayed(term, delays), term.expression.as_str()) {
-            (Some((state, d)), _) => {
-                let seconds = escape(&format::significant(d.value, 4));
-                format!("{}(<var>t</var> − {seconds}\u{202f}s)", expression::html(state))
-            }
+        let factor = match (delays.of_term(term), term.expression.as_str()) {
+            (Some((signal, delay)), _) => late(signal, delay),
             (None, "1") => String::new(),
             (None, expression) => expression::html(expression),
         };
         push(term.value, &factor);
     }
-    let right = equation.input.as_deref().map_or_else(|| "0".to_owned(), expression::html);
+    let right = equation.input.as_deref().map_or_else(
+        || "0".to_owned(),
+        |input| match delays.of_input(input) {
+            Some(delay) => late(input, delay),
+            None => expression::html(input),
+        },
+    );
     format!("{out} = {right}")
 }
 
@@ -233,5 +245,20 @@ fn delay_view(state: &str, d: &Delay) -> DelayView {
         None => ("95 % interval of the gain", "held at the value given".to_owned()),
     });
     rows.extend(d.correlation.map(|rho| ("Correlation of delay and gain", format::significant(rho, 2))));
-    DelayView { state_html: expression::html(state), rows, warning: d.warning.clone() }
+    DelayView {
+        title_html: format!("Feedback of {}", expression::html(state)),
+        rows,
+        warning: d.warning.clone(),
+    }
+}
+
+fn dead_time_view(input: &str, d: &DeadTime) -> DelayView {
+    let seconds = |value: f64| format::with_unit(&format::number(value), &d.unit);
+    let mut rows = vec![
+        ("Dead time", format::with_unit(&format::with_interval(d.value, d.ci95), &d.unit)),
+        ("95 % interval", format::with_unit(&format::interval(d.ci95), &d.unit)),
+    ];
+    rows.extend(d.bound.map(|bound| ("Cramér–Rao bound (standard deviation)", seconds(bound))));
+    rows.push(("Longest looked for", seconds(d.longest)));
+    DelayView { title_html: format!("Input {}", expression::html(input)), rows, warning: d.warning.clone() }
 }

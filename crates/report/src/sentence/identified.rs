@@ -1,7 +1,7 @@
 //! The result of an identification in plain language, worded from the numbers of an [`IdentifyReport`].
 
 use crate::contract::{FitSet, Ordered};
-use crate::identified::{Delay, Equation, IdentifyReport, Term};
+use crate::identified::{DeadTime, Delay, Equation, IdentifyReport, Term};
 use crate::{expression, format};
 
 /// Correlation of delay and gain beyond which a warning is due.
@@ -16,7 +16,7 @@ pub fn summary(report: &IdentifyReport) -> Vec<String> {
     let mut out: Vec<String> = report
         .equations
         .iter()
-        .map(|(state, e)| format!("Equation of {state}: {}.", with_values(e, &report.delay)))
+        .map(|(state, e)| format!("Equation of {state}: {}.", with_values(e, &Delays::of(report))))
         .collect();
     out.extend(prediction(report));
     out.extend(report.misfit.iter().filter(|(_, misfit)| **misfit > INCOMPLETE).map(|(channel, misfit)| {
@@ -29,31 +29,62 @@ pub fn summary(report: &IdentifyReport) -> Vec<String> {
     out.extend(report.equations.iter().flat_map(|(state, e)| doubts(state, e, report.equations.len() > 1)));
     out.extend(report.delay.iter().map(|(state, d)| delay(state, d)));
     out.extend(report.delay.values().filter_map(|d| d.warning.clone()));
+    out.extend(report.dead_time.iter().map(|(input, d)| dead_time(input, d)));
+    out.extend(report.dead_time.values().filter_map(|d| d.warning.clone()));
     out
 }
 
 /// `2 x″ + 0.9 x′ + 1.2 x³ = f`, values to four digits.
-pub fn with_values(equation: &Equation, delays: &Ordered<Delay>) -> String {
+pub fn with_values(equation: &Equation, delays: &Delays<'_>) -> String {
     let mut text = String::new();
     for term in &equation.terms {
-        let factor = match (delayed(term, delays), term.expression.as_str()) {
-            (Some((state, d)), _) => {
-                format!("{}(t − {} s)", expression::text(state), format::significant(d.value, 4))
-            }
+        let factor = match (delays.of_term(term), term.expression.as_str()) {
+            (Some((signal, delay)), _) => late(signal, delay),
             (None, "1") => String::new(),
             (None, expression) => expression::text(expression),
         };
         push_signed(&mut text, term.value, &factor);
     }
-    let right = equation.input.as_deref().map_or_else(|| "0".to_owned(), expression::text);
+    let right = equation.input.as_deref().map_or_else(
+        || "0".to_owned(),
+        |input| match delays.of_input(input) {
+            Some(delay) => late(input, delay),
+            None => expression::text(input),
+        },
+    );
     format!("{text} = {right}")
 }
 
-/// The state and the delay of a term `delay(q, tau)`.
-pub(crate) fn delayed<'a>(term: &Term, delays: &'a Ordered<Delay>) -> Option<(&'a str, &'a Delay)> {
-    let inside = term.expression.strip_prefix("delay(")?;
-    let state = inside.split(',').next()?.trim();
-    delays.get_key_value(state).map(|(state, d)| (state.as_str(), d))
+/// `f(t − 0.073 s)`
+fn late(signal: &str, delay: f64) -> String {
+    format!("{}(t − {} s)", expression::text(signal), format::significant(delay, 4))
+}
+
+/// The delays of a report.
+#[derive(Debug, Clone, Copy)]
+pub struct Delays<'a> {
+    feedback: &'a Ordered<Delay>,
+    inputs: &'a Ordered<DeadTime>,
+}
+
+impl<'a> Delays<'a> {
+    /// Those of this report.
+    pub fn of(report: &'a IdentifyReport) -> Delays<'a> {
+        Delays { feedback: &report.delay, inputs: &report.dead_time }
+    }
+
+    /// The dead time of an input, s.
+    pub(crate) fn of_input(&self, input: &str) -> Option<f64> {
+        self.inputs.get(input).map(|d| d.value)
+    }
+
+    /// The state or input of a term `delay(q, tau)`, and the delay, s.
+    pub(crate) fn of_term<'t>(&self, term: &'t Term) -> Option<(&'t str, f64)> {
+        let inside = term.expression.strip_prefix("delay(")?;
+        let signal = inside.split(',').next()?.trim();
+        let delay = self.feedback.get(signal).map(|d| d.value).or_else(|| self.of_input(signal))?;
+        Some((signal, delay))
+    }
 }
 
 fn push_signed(text: &mut String, value: f64, factor: &str) {
@@ -180,4 +211,30 @@ pub fn delay_warning(d: &Delay) -> Option<String> {
     let mut letters = text.chars();
     let first = letters.next().map(|c| c.to_uppercase().collect::<String>()).unwrap_or_default();
     Some(format!("{first}{}.", letters.as_str()))
+}
+
+fn dead_time(input: &str, d: &DeadTime) -> String {
+    format!(
+        "The dead time of {} is {}.",
+        expression::text(input),
+        format::with_unit(&format::with_interval(d.value, d.ci95), "s")
+    )
+}
+
+/// The warning where a dead time ended on the longest looked for, or cannot be told from none.
+pub fn dead_time_warning(input: &str, d: &DeadTime) -> Option<String> {
+    let name = expression::text(input);
+    match d.ci95 {
+        None => Some(format!(
+            "The dead time of {name} ended on the longest looked for, {} s, or its interval is unknown: it may be longer; \
+             allow more with --dead-time {input}=SECONDS.",
+            format::number(d.longest)
+        )),
+        Some(ci) if ci.low.is_nan() || ci.low <= 0.0 => Some(format!(
+            "The interval of the dead time of {name} holds zero: these recordings do not tell it from none; it is at most {} \
+             s.",
+            format::significant(ci.high, 2)
+        )),
+        Some(_) => None,
+    }
 }

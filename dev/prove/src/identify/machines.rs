@@ -21,15 +21,17 @@ pub(super) const PREFIX: &str = "machine: ";
 /// Noise of every sensor, a share of what its channel moves (standard deviations).
 const NOISE: f64 = 0.01;
 /// Sampling, s.
-const STEP: f64 = 0.01;
+pub(super) const STEP: f64 = 0.01;
 /// Length of a recording, s.
 const SECONDS: f64 = 40.0;
+/// Samples that a machine with late inputs moves before its recording.
+const LEAD: usize = 500;
 
 /// ẋ of x and u.
 type Rates = Box<dyn Fn(&[f64], &[f64]) -> Vec<f64> + Sync>;
 
 /// A first-order system ẋ = f(x, u) whose first states are measured.
-struct Machine {
+pub(super) struct Machine {
     states: Vec<&'static str>,
     /// States that are measured, with their units.
     measured: Vec<(usize, &'static str)>,
@@ -37,11 +39,20 @@ struct Machine {
     inputs: Vec<(&'static str, &'static str, f64)>,
     /// Frequencies that excite it, Hz.
     band: (f64, f64),
+    /// How many samples each input acts late, in tenths; none: not at all. The machine then moves before the recording begins.
+    pub(super) late: Vec<usize>,
+    /// What the inputs do between samples: straight lines, or nothing.
+    held: bool,
     rates: Rates,
 }
 
-/// Sums of sines of random phase over `band`, with the standard deviation `size`.
-fn excitation(random: &mut Pcg64Mcg, (low, high): (f64, f64), size: f64, samples: usize) -> Vec<f64> {
+/// Sums of sines of random phase over `band`, with the standard deviation `size`, from `lead` samples before the start.
+fn excitation(
+    random: &mut Pcg64Mcg,
+    (low, high): (f64, f64),
+    size: f64,
+    (lead, samples): (usize, usize),
+) -> Vec<f64> {
     const SINES: usize = 12;
     let sines: Vec<(f64, f64)> = (0..SINES)
         .map(|i| {
@@ -52,27 +63,42 @@ fn excitation(random: &mut Pcg64Mcg, (low, high): (f64, f64), size: f64, samples
         .collect();
     let amplitude = size * (2.0 / SINES as f64).sqrt();
     let at = |t: f64| amplitude * sines.iter().map(|(w, phase)| (w * t + phase).sin()).sum::<f64>();
-    (0..samples).map(|k| at(k as f64 * STEP)).collect()
+    (0..lead + samples).map(|k| at((k as f64 - lead as f64) * STEP)).collect()
 }
 
 impl Machine {
-    /// A recording from rest; inputs are linear between samples.
-    fn record(&self, seed: u64) -> Result<Recording> {
+    /// The same, with inputs that act late by `late` tenths of a sample each.
+    pub(super) fn delayed(self, late: &[usize], held: bool) -> Machine {
+        Machine { late: late.to_vec(), held, ..self }
+    }
+
+    /// A recording from rest.
+    pub(super) fn record(&self, seed: u64) -> Result<Recording> {
+        // Tenths of a sample: no step crosses a bend or jump of a late input.
         const SUBSTEPS: usize = 10;
         let mut random = Pcg64Mcg::seed_from_u64(seed);
         let n = (SECONDS / STEP).round() as usize + 1;
-        let inputs: Vec<Vec<f64>> =
-            self.inputs.iter().map(|(.., size)| excitation(&mut random, self.band, *size, n)).collect();
+        let lead = if self.late.is_empty() { 0 } else { LEAD };
+        let inputs: Vec<Vec<f64>> = self
+            .inputs
+            .iter()
+            .map(|(.., size)| excitation(&mut random, self.band, *size, (lead, n)))
+            .collect();
         let h = STEP / SUBSTEPS as f64;
         let mut x = vec![0.0; self.states.len()];
         let mut clean = vec![Vec::with_capacity(n); self.measured.len()];
-        for k in 0..n {
-            clean.iter_mut().zip(&self.measured).for_each(|(c, (i, _))| c.push(x[*i]));
+        for k in 0..lead + n {
+            if k >= lead {
+                clean.iter_mut().zip(&self.measured).for_each(|(c, (i, _))| c.push(x[*i]));
+            }
             for s in 0..SUBSTEPS {
-                let drive = |w: f64| -> Vec<f64> {
-                    let share = (s as f64 + w) / SUBSTEPS as f64;
-                    inputs.iter().map(|u| u[k] + share * (u[(k + 1).min(n - 1)] - u[k])).collect()
+                let one = |(i, u): (usize, &Vec<f64>), w: f64| {
+                    let tenths = (k * SUBSTEPS + s).saturating_sub(self.late.get(i).copied().unwrap_or(0));
+                    let (k, s) = (tenths / SUBSTEPS, tenths % SUBSTEPS);
+                    let share = if self.held { 0.0 } else { (s as f64 + w) / SUBSTEPS as f64 };
+                    u[k] + share * (u[(k + 1).min(u.len() - 1)] - u[k])
                 };
+                let drive = |w: f64| -> Vec<f64> { inputs.iter().enumerate().map(|u| one(u, w)).collect() };
                 let at =
                     |r: &[f64], w: f64| -> Vec<f64> { x.iter().zip(r).map(|(x, r)| x + w * h * r).collect() };
                 let (begin, middle, end) = (drive(0.0), drive(0.5), drive(1.0));
@@ -93,7 +119,7 @@ impl Machine {
             .inputs
             .iter()
             .zip(inputs)
-            .map(|((name, unit, _), values)| with_unit(name, unit, values))
+            .map(|((name, unit, _), values)| with_unit(name, unit, values[lead..].to_vec()))
             .collect();
         for ((i, unit), values) in self.measured.iter().zip(clean) {
             let mean = values.iter().sum::<f64>() / n as f64;
@@ -148,7 +174,7 @@ pub(super) fn table(outcomes: &[Outcome]) -> String {
 }
 
 /// Shares of equations whose terms are exactly the true ones, and of intervals that hold the truth.
-fn figures(trials: &[Trial]) -> Vec<Figure> {
+pub(super) fn figures(trials: &[Trial]) -> Vec<Figure> {
     let of = |equations: &[bool]| equations.iter().all(|e| *e);
     let exact = trials.iter().filter(|t| of(&t.exact)).count();
     let n = trials.len();
@@ -170,13 +196,15 @@ const POSITIONS: [&str; 3] = ["x1", "x2", "x3"];
 const FORCES: [&str; 3] = ["f1", "f2", "f3"];
 
 /// A chain of `count` masses with forces on those in `driven`.
-fn chain(count: usize, driven: &[usize]) -> Machine {
+pub(super) fn chain(count: usize, driven: &[usize]) -> Machine {
     let force: Vec<Option<usize>> = (0..count).map(|i| driven.iter().position(|d| *d == i)).collect();
     Machine {
         states: [&POSITIONS[..count], &["v1", "v2", "v3"][..count]].concat(),
         measured: (0..count).map(|i| (i, "m")).collect(),
         inputs: driven.iter().map(|d| (FORCES[*d], "N", 5.0)).collect(),
         band: (0.2, 3.0),
+        late: Vec::new(),
+        held: false,
         rates: Box::new(move |x, u| {
             let (q, v) = x.split_at(count);
             // What the spring and damper before mass i pull it back with.
@@ -193,12 +221,11 @@ fn chain(count: usize, driven: &[usize]) -> Machine {
     }
 }
 
-pub(super) fn chain_case(seeds: &[u64], count: usize, driven: &[usize]) -> Result<Vec<Figure>> {
-    let machine = chain(count, driven);
-    let force = |i: usize| driven.iter().position(|d| *d == i);
-    let truths: Vec<Vec<(String, f64)>> = (0..count)
+/// The terms of the equations of a [`chain`].
+pub(super) fn chain_terms(count: usize, driven: &[usize]) -> Vec<Vec<(String, f64)>> {
+    (0..count)
         .map(|i| {
-            let scale = if force(i).is_some() { 1.0 } else { 1.0 / MASSES[i] };
+            let scale = if driven.contains(&i) { 1.0 } else { 1.0 / MASSES[i] };
             let after = |values: &[f64; 3]| if i + 1 < count { values[i + 1] } else { 0.0 };
             let mut terms = vec![(format!("{}''", POSITIONS[i]), scale * MASSES[i])];
             let mut add = |j: usize, spring: f64, damper: f64| {
@@ -214,7 +241,25 @@ pub(super) fn chain_case(seeds: &[u64], count: usize, driven: &[usize]) -> Resul
             }
             terms
         })
-        .collect();
+        .collect()
+}
+
+/// What a chain's identification is asked for.
+pub(super) fn chain_options(count: usize, driven: &[usize]) -> Options {
+    let inputs: Vec<&str> = driven.iter().map(|d| FORCES[*d]).collect();
+    Options {
+        library: Library { constant: true, ..Options::new(&POSITIONS[..count], &inputs).library },
+        order: 3,
+        hold: Some(Hold::Linear),
+        replicates: 0,
+        ..Options::new(&POSITIONS[..count], &inputs)
+    }
+}
+
+pub(super) fn chain_case(seeds: &[u64], count: usize, driven: &[usize]) -> Result<Vec<Figure>> {
+    let machine = chain(count, driven);
+    let force = |i: usize| driven.iter().position(|d| *d == i);
+    let truths = chain_terms(count, driven);
     let truths: Vec<Vec<(&str, f64)>> =
         truths.iter().map(|t| t.iter().map(|(name, v)| (name.as_str(), *v)).collect()).collect();
     let truths: Vec<Truth<'_>> = truths
@@ -222,17 +267,27 @@ pub(super) fn chain_case(seeds: &[u64], count: usize, driven: &[usize]) -> Resul
         .enumerate()
         .map(|(i, terms)| Truth { input: force(i).map(|_| FORCES[i]), terms })
         .collect();
-    let inputs: Vec<&str> = driven.iter().map(|d| FORCES[*d]).collect();
-    let options = Options {
-        library: Library { constant: true, ..Options::new(&POSITIONS[..count], &inputs).library },
-        order: 3,
-        hold: Some(Hold::Linear),
-        replicates: 0,
-        ..Options::new(&POSITIONS[..count], &inputs)
-    };
+    let options = chain_options(count, driven);
     let trials = run_seeds(seeds, |seed| Ok(vec![machine.record(seed)?]), &options, &truths, None)?;
     Ok(figures(&trials))
 }
+
+/// A mass on a spring that stiffens: m x″ + c x′ + k x + k₃ x³ = f.
+pub(super) fn spring() -> Machine {
+    let [(_, m), (_, k), (_, c), (_, k3)] = SPRING;
+    Machine {
+        states: vec!["x", "v"],
+        measured: vec![(0, "m")],
+        inputs: vec![("f", "N", 5.0)],
+        band: (0.2, 3.0),
+        late: Vec::new(),
+        held: false,
+        rates: Box::new(move |x, u| vec![x[1], (u[0] - c * x[1] - k * x[0] - k3 * x[0].powi(3)) / m]),
+    }
+}
+
+/// The terms of the [`spring`].
+pub(super) const SPRING: [(&str, f64); 4] = [("x''", 1.2), ("x", 40.0), ("x'", 1.5), ("x^3", 300.0)];
 
 const INERTIA: f64 = 0.02;
 const FRICTION: f64 = 0.015;
@@ -248,6 +303,8 @@ fn drive() -> Machine {
         measured: vec![(0, "rad"), (1, "A")],
         inputs: vec![("v", "V", 4.0), ("load", "N*m", 0.1)],
         band: (0.2, 6.0),
+        late: Vec::new(),
+        held: false,
         rates: Box::new(|x, u| {
             let rate = (u[0] - RESISTANCE * x[1] - TORQUE * x[2]) / INDUCTANCE;
             vec![x[2], rate, (u[1] + TORQUE * x[1] - FRICTION * x[2]) / INERTIA]
@@ -302,6 +359,8 @@ pub(super) fn cart_case(seeds: &[u64]) -> Result<Vec<Figure>> {
         measured: vec![(0, "m"), (1, "rad")],
         inputs: vec![("f", "N", 6.0)],
         band: (0.2, 3.0),
+        late: Vec::new(),
+        held: false,
         rates: Box::new(|x, u| {
             let (s, c) = x[1].sin_cos();
             let on_cart = u[0] + MOMENT * s * x[3] * x[3] - DAMPING * x[2] - SPRING * x[0];
@@ -351,6 +410,8 @@ pub(super) fn arm_case(seeds: &[u64]) -> Result<Vec<Figure>> {
         measured: vec![(0, "rad"), (1, "rad")],
         inputs: vec![("t1", "N*m", 3.0), ("t2", "N*m", 0.6)],
         band: (0.2, 2.0),
+        late: Vec::new(),
+        held: false,
         rates: Box::new(|x, u| {
             let (s, c) = x[1].sin_cos();
             let (w1, w2) = (x[2], x[3]);
