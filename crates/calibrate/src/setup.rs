@@ -5,7 +5,7 @@ use std::sync::Arc;
 
 use greybox_model::system::CompileError;
 use greybox_model::{Expr, Func, Hold, Model, System};
-use greybox_simulate::{Environment, MOST_TRIALS, Method, Seeds, Trajectory, integrate};
+use greybox_simulate::{Environment, MOST_TRIALS, Method, Seeds, Trajectory, can_stride, integrate};
 use rayon::prelude::*;
 
 use crate::data::{Data, SmoothedStates};
@@ -20,6 +20,9 @@ const LEAST: usize = 40;
 /// Samples of a recording, and stretches of it, by which a method is judged.
 const JUDGED: usize = 1500;
 const STRETCHES: usize = 8;
+/// Samples that a step may go across, and how far, in standard deviations, its error may move a parameter.
+const STRIDES: [usize; 4] = [16, 8, 4, 2];
+const SHIFT: f64 = 0.1;
 /// Error over the least of any method up to which one is as good.
 const AS_GOOD: f64 = 2.0;
 
@@ -158,7 +161,8 @@ impl Setup {
 
     /// The same data with another model of the same measurements (a mechanism added). No state is
     /// carried any more, since the entries of the state vector are others: ask again with
-    /// [`with_carried`](Self::with_carried).
+    /// [`with_carried`](Self::with_carried). Steps across several samples were chosen for this model; the other one, which may
+    /// be faster, goes from sample to sample.
     ///
     /// # Errors
     /// When the model does not compile.
@@ -169,10 +173,12 @@ impl Setup {
         } else {
             Arc::new(SmoothedStates::new(&model, &self.data))
         };
-        Ok(Setup { model, system, smoothed_states, free, carried: Vec::new(), ..self.clone() })
+        let method = self.method.at_every_sample();
+        Ok(Setup { model, system, smoothed_states, method, free, carried: Vec::new(), ..self.clone() })
     }
 
-    /// The same model, integrated in the same way, with other recordings of its channels.
+    /// The same model, integrated in the same way, with other recordings of its channels; where steps went across several
+    /// samples of these, they go from sample to sample of those.
     pub fn with_data(&self, data: Arc<Data>) -> Setup {
         let smoothed_states = SmoothedStates::new(&self.model, &data);
         self.with_smoothed(data, smoothed_states)
@@ -180,7 +186,8 @@ impl Setup {
 
     fn with_smoothed(&self, data: Arc<Data>, smoothed_states: SmoothedStates) -> Setup {
         let environments = Arc::new(data.environments(&self.holds));
-        Setup { data, smoothed_states: Arc::new(smoothed_states), environments, noise: None, ..self.clone() }
+        let (smoothed_states, method) = (Arc::new(smoothed_states), self.method.at_every_sample());
+        Setup { data, smoothed_states, environments, method, noise: None, ..self.clone() }
     }
 
     /// The same model for simulations of other recordings with these parameters: in the same steps, or in finer ones
@@ -272,6 +279,9 @@ impl Setup {
         let limit: Vec<f64> = (0..self.system.ny)
             .map(|c| tolerance[c].max(0.05 * self.data.sigma[c]).max(1e-6 * self.data.spread[c]))
             .collect();
+        if let Some(long) = self.longest_stride(references) {
+            return long;
+        }
         let ladder = [
             Method::Rk4 { substeps: 1 },
             Method::Dp5 { substeps: 1 },
@@ -322,6 +332,34 @@ impl Setup {
         };
         let as_good = tried.iter().find(|t| is_as_good(&t.1));
         as_good.map_or(fine[fine.len() - 1], |t| t.0)
+    }
+
+    /// The longest steps across several samples whose error e moves no fitted parameter by more than a tenth of its standard
+    /// deviation. A parameter's shift is at most ‖e/σ‖ of its standard deviations, with the norm over all samples of the
+    /// data; the samples that are judged stand for all. `None`: steps have to end at every sample.
+    fn longest_stride(&self, references: &[Reference]) -> Option<Method> {
+        let judged: usize = references.iter().map(|r| r.range.len()).sum();
+        let channels = self.system.ny;
+        if !can_stride(&self.system) || judged == 0 || references.iter().any(|r| r.run.diverged.is_some()) {
+            return None;
+        }
+        let share = self.data.samples() as f64 / judged as f64;
+        let is_good = |method: Method| {
+            let squares: f64 = references
+                .iter()
+                .map(|r| {
+                    let n = r.range.len();
+                    let trial = self.stretch(r.piece, r.range.clone(), &r.x0, method);
+                    let of = |c: usize| {
+                        let pairs = trial.y[c * n..(c + 1) * n].iter().zip(&r.run.y[c * n..(c + 1) * n]);
+                        pairs.map(|(a, b)| ((a - b) / self.data.sigma[c]).powi(2)).sum::<f64>()
+                    };
+                    (0..channels).map(of).sum::<f64>()
+                })
+                .sum();
+            share * squares <= SHIFT * SHIFT
+        };
+        STRIDES.map(|samples| Method::Rk4Stride { samples }).into_iter().find(|method| is_good(*method))
     }
 
     /// Parameter values of the model.

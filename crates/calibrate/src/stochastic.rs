@@ -872,6 +872,7 @@ fn finer(method: Method, coarse: usize) -> Method {
         Method::Rk4 { substeps } => Method::Rk4 { substeps: steps(substeps) },
         Method::Dp5 { substeps } => Method::Dp5 { substeps: steps(substeps) },
         Method::Dop853 { substeps } => Method::Dop853 { substeps: steps(substeps) },
+        Method::Rk4Stride { samples } => Method::Rk4 { substeps: coarse.div_ceil(samples.max(1)) },
         adaptive @ Method::Adaptive { .. } => adaptive,
     }
 }

@@ -34,6 +34,7 @@ mod history;
 mod record;
 mod stage;
 mod stepper;
+mod stride;
 mod tableau;
 mod tangent;
 
@@ -47,6 +48,7 @@ pub use self::history::{Carry, delayed_states, has_history};
 use self::history::{History, LaneMap};
 use self::stage::{Held, Rates, Stage, dot};
 pub use self::stepper::Stepper;
+use self::stride::Long;
 use self::tableau::{DOP853, DP5, RK4, Tableau};
 use self::tangent::width;
 use crate::aligned::Aligned;
@@ -71,6 +73,15 @@ pub enum Method {
         /// Steps per sample interval (≥ 1).
         substeps: usize,
     },
+    /// Classical fourth-order Runge–Kutta, one step across so many sample intervals: for records taken far faster than the
+    /// machine moves. The samples within come from the method's interpolant of the third order. Over a step, inputs are
+    /// parabolas with the mean and the first and second moments of their samples. Steps end at the samples whose number is
+    /// a multiple of `samples`. A model with delays, one whose outputs need the highest derivatives, and a
+    /// [`Stepper`] go from sample to sample.
+    Rk4Stride {
+        /// Sample intervals per step (≥ 1).
+        samples: usize,
+    },
     /// Dormand–Prince 5(4) with error control; steps never straddle a sample.
     Adaptive {
         /// Relative tolerance.
@@ -82,12 +93,30 @@ pub enum Method {
 
 impl Method {
     /// Evaluations of the right-hand side between two samples; none are known beforehand with error control.
-    pub fn evaluations(&self) -> usize {
+    pub fn evaluations(&self) -> f64 {
+        let of = |stages: usize, steps: f64| stages as f64 * steps;
+        match *self {
+            Method::Rk4 { substeps } => of(RK4.b.len(), substeps as f64),
+            Method::Dp5 { substeps } => of(DP5.b.len(), substeps as f64),
+            Method::Dop853 { substeps } => of(DOP853.b.len(), substeps as f64),
+            Method::Rk4Stride { samples } => of(RK4.b.len(), 1.0 / samples.max(1) as f64),
+            Method::Adaptive { .. } => 0.0,
+        }
+    }
+
+    /// The same where no step goes across several samples: from each to the next.
+    pub fn at_every_sample(self) -> Method {
         match self {
-            Method::Rk4 { substeps } => RK4.b.len() * substeps,
-            Method::Dp5 { substeps } => DP5.b.len() * substeps,
-            Method::Dop853 { substeps } => DOP853.b.len() * substeps,
-            Method::Adaptive { .. } => 0,
+            Method::Rk4Stride { .. } => Method::Rk4 { substeps: 1 },
+            other => other,
+        }
+    }
+
+    /// Sample intervals that one step goes across.
+    pub fn stride(&self) -> usize {
+        match *self {
+            Method::Rk4Stride { samples } => samples.max(1),
+            _ => 1,
         }
     }
 }
@@ -333,6 +362,8 @@ struct Core<'a> {
     /// What the inputs do around the time `mid`.
     pieces: Vec<Piece>,
     mid: f64,
+    /// The step across several samples.
+    long: Long,
     /// The register that each entry of ẋ is.
     source: Vec<usize>,
     modes: Vec<i8>,
@@ -384,6 +415,7 @@ impl<'a> Core<'a> {
             Method::Rk4 { substeps } => (&RK4, substeps.max(1), None),
             Method::Dp5 { substeps } => (&DP5, substeps.max(1), None),
             Method::Dop853 { substeps } => (&DOP853, substeps.max(1), None),
+            Method::Rk4Stride { .. } => (&RK4, 1, None),
             Method::Adaptive { rtol, atol } => (&DP5, 1, Some((rtol, atol))),
         };
         let tape = &system.rhs;
@@ -485,6 +517,7 @@ impl<'a> Core<'a> {
             rates: Rates::new(nx, stages.len()),
             pieces: env.inputs.iter().map(|u| u.piece(s)).collect(),
             mid: s,
+            long: Long::new(if can_stride(system) { method.stride() } else { 1 }),
             source,
             sticking: Vec::new(),
             live,
@@ -577,6 +610,10 @@ impl<'a> Core<'a> {
             ..Trajectory::default()
         };
         self.start_modes();
+        if self.long.samples > 1 {
+            self.run_long(range, go_on);
+            return std::mem::take(&mut self.result);
+        }
         for (row, k) in range.clone().enumerate() {
             self.s = k as f64 * self.env.dt;
             self.record(row);
@@ -595,6 +632,36 @@ impl<'a> Core<'a> {
             }
         }
         std::mem::take(&mut self.result)
+    }
+
+    /// The same in steps across several samples.
+    fn run_long(&mut self, range: std::ops::Range<usize>, go_on: bool) {
+        let (n, recorded) = (range.len(), range.end);
+        let end =
+            if go_on { range.end.min(self.env.len.saturating_sub(1)) } else { range.end.saturating_sub(1) };
+        let stride = self.long.samples;
+        self.long.from = range.start;
+        let mut k = range.start;
+        while k < recorded {
+            self.s = k as f64 * self.env.dt;
+            self.record(k - range.start);
+            // (Within a step, no sample is recorded once the solution has left every bound.)
+            if self.result.diverged.is_some() {
+                self.freeze(self.long.next.clamp(range.start, k) - range.start, n);
+                return;
+            }
+            if k >= end {
+                return;
+            }
+            let mut to = ((k / stride + 1) * stride).min(end);
+            // What is beyond the last sample is no part of the result.
+            if k + 1 < recorded {
+                to = to.min(recorded - 1);
+            }
+            self.cross_samples(k, to);
+            k = to;
+        }
+        self.lost = self.result.diverged.take().is_some();
     }
 
     /// From sample `k` to the next.
@@ -797,6 +864,7 @@ impl<'a> Core<'a> {
 
     /// Takes the trial step over: sensitivities, state, time, history.
     fn accept(&mut self, h: f64, has_end: bool) {
+        self.keep_start();
         if self.lanes > 0 {
             self.tangent_step(h);
         }
@@ -812,6 +880,7 @@ impl<'a> Core<'a> {
             self.result.diverged = Some(usize::MAX);
             return;
         }
+        self.record_within(h);
         if has_end {
             let end = self.tableau.b.len();
             self.stages.swap(0, end);
@@ -844,6 +913,12 @@ impl<'a> Core<'a> {
             self.rhs_history[i].push(st.s, st.regs[arg], self.gd[arg], lanes);
         }
     }
+}
+
+/// Whether a model can be simulated in steps across several samples ([`Method::Rk4Stride`]): nothing in it is delayed, and no
+/// output needs the highest derivatives.
+pub fn can_stride(system: &System) -> bool {
+    system.rhs.delays.is_empty() && system.output.delays.is_empty() && !system.output_needs_z
 }
 
 /// Entry of the state vector that a leaf is.

@@ -13,6 +13,6 @@ pub mod small;
 
 pub use integrate::{
     Carry, Environment, Force, MOST_TRIALS, Method, Seeds, SignalLanes, Simulation, Stepper, Trajectory,
-    delayed_states, has_history, integrate,
+    can_stride, delayed_states, has_history, integrate,
 };
 pub use signal::{FINE, Signal};

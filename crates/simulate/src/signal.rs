@@ -71,6 +71,21 @@ impl Signal {
         };
         Piece { c, k: k as f64, rate: self.rate }
     }
+
+    /// The parabola that stands for the signal over `intervals` samples from `sample` on: `fit` gives its coefficients, in
+    /// powers of the grid's intervals that have passed, for the values of the grid there.
+    pub(crate) fn parabola(
+        &self,
+        sample: usize,
+        intervals: usize,
+        fit: impl FnOnce(&[f64]) -> [f64; 3],
+    ) -> Piece {
+        let denser = if self.hold == Hold::BandLimited { FINE } else { 1 };
+        let last = self.grid.len() - 1;
+        let (from, to) = ((sample * denser).min(last), ((sample + intervals) * denser).min(last));
+        let [c0, c1, c2] = fit(&self.grid[from..=to]);
+        Piece { c: [c0, c1, c2, 0.0], k: from as f64, rate: self.rate }
+    }
 }
 
 /// A signal within one smooth stretch: a cubic in time over the grid's interval.

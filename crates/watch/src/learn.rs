@@ -66,8 +66,10 @@ impl Steps {
         let least = |substeps: usize| substeps.div_ceil(thinning);
         match method {
             Method::Rk4 { .. } | Method::Dp5 { .. } | Method::Dop853 { .. } if thinning >= CLOSE => {
-                Steps::Rk4(method.evaluations().max(4).div_ceil(4 * thinning))
+                Steps::Rk4((method.evaluations() / (4 * thinning) as f64).ceil().max(1.0) as usize)
             }
+            // (A filter goes from sample to sample.)
+            Method::Rk4Stride { .. } => Steps::Rk4(1),
             Method::Rk4 { substeps } => Steps::Rk4(least(substeps)),
             Method::Dp5 { substeps } => Steps::Dp5(least(substeps)),
             Method::Dop853 { substeps } => Steps::Dop853(least(substeps)),

@@ -106,7 +106,7 @@ impl Core<'_> {
     #[inline]
     pub(super) fn eval_stage(&mut self, b: usize, s: f64, mid: f64) {
         let system = self.system;
-        if mid != self.mid {
+        if mid != self.mid && !self.long.active {
             self.mid = mid;
             for (piece, input) in self.pieces.iter_mut().zip(&self.env.inputs) {
                 *piece = input.piece(mid);
@@ -186,9 +186,10 @@ impl Core<'_> {
         let z = &mut st.regs[highest..highest + nz];
         if !self.env.forces.is_empty() {
             let (k, w) = locate(st.s, st.mid, self.env.dt, self.env.len);
-            for force in &self.env.forces {
+            for (i, force) in self.env.forces.iter().enumerate() {
                 let (a, b) = (force.samples[k], force.samples[(k + 1).min(self.env.len - 1)]);
-                let v = a + w * (b - a);
+                let long = self.long.active.then(|| self.long.force(i, st.s, self.env.dt));
+                let v = long.unwrap_or(a + w * (b - a));
                 for (z, weight) in z.iter_mut().zip(&force.weights) {
                     *z -= weight * v;
                 }

@@ -8,7 +8,7 @@ use crate::small;
 
 /// out = x + Σ h · weight · k, k one block as long as x after the other; a weight of zero takes no part.
 #[inline(always)]
-fn tangents_along(out: &mut [f64], x: &[f64], k: &[f64], weights: &[f64], h: f64) {
+pub(super) fn tangents_along(out: &mut [f64], x: &[f64], k: &[f64], weights: &[f64], h: f64) {
     let n = x.len();
     let mut terms =
         weights.iter().enumerate().filter(|w| *w.1 != 0.0).map(|(j, w)| (h * w, &k[j * n..][..n]));
@@ -94,9 +94,13 @@ impl Core<'_> {
             let first = self.seeds.parameters.len() + self.seeds.initial.len();
             let count = self.seeds.signals.lanes;
             let (k, w) = locate(st.s, st.mid, self.env.dt, self.env.len);
-            for (i, change) in &self.seeds.signals.inputs {
+            for (j, (i, change)) in self.seeds.signals.inputs.iter().enumerate() {
                 let row = &mut self.d[(system.inputs() + i) * width + first..][..count];
-                lerp(change, k, w, self.env.len, count, row);
+                if self.long.active {
+                    self.long.lane_input(j, st.s, self.env.dt, row);
+                } else {
+                    lerp(change, k, w, self.env.len, count, row);
+                }
             }
         }
         if !system.rhs.delays.is_empty() {
@@ -180,6 +184,14 @@ impl Core<'_> {
         let signals = &self.seeds.signals;
         let first = self.seeds.parameters.len() + self.seeds.initial.len();
         let count = signals.lanes;
+        if self.long.active {
+            for i in 0..self.system.nz {
+                let weights = &signals.weights[i * count..][..count];
+                let row = &mut self.b[i * self.width + first..][..count];
+                self.long.take_lane_forces(weights, st.s, self.env.dt, row);
+            }
+            return;
+        }
         let (k, w) = locate(st.s, st.mid, self.env.dt, self.env.len);
         let a = &signals.force[k * count..][..count];
         let c = &signals.force[(k + 1).min(self.env.len - 1) * count..][..count];
