@@ -227,12 +227,16 @@ pub(crate) fn search(
     options: &Options,
     listener: &dyn ProgressListener,
 ) -> Result<Search, IdentifyError> {
-    let mut plain = structure(fit_on, options)?;
+    let plain = structure(fit_on, options)?;
+    let mut structures = if options.has_one_scale() { plain.scaled_together() } else { vec![plain] };
+    let plain = &structures[0];
     let all = vec![true; plain.terms.len()];
     let ones: Vec<f64> = plain.terms.iter().map(|t| if t.optional { 0.0 } else { 1.0 }).collect();
     let whole = plain.model(&all, &ones, &plain.outside_values())?;
     let data = Arc::new(Data::new(&whole, fit_on)?);
-    plain.dead_times.iter_mut().filter(|d| d.longest.is_infinite()).for_each(|d| d.longest = reach(&data));
+    let open = structures.iter_mut().flat_map(|s| &mut s.dead_times).filter(|d| d.longest.is_infinite());
+    open.for_each(|d| d.longest = reach(&data));
+    let plain = &structures[0];
     let past = plain.unknown_past();
     let samples = data.pieces.iter().map(|p| p.len - ((past / p.dt).ceil() as usize).min(p.len)).sum();
     if plain.terms.len() * 4 > samples {
@@ -245,7 +249,6 @@ pub(crate) fn search(
     listener.stage("weak form");
     let smoothed_states = SmoothedStates::new(&whole, &data);
     let ground = Ground { model: &whole, data: &data, smoothed_states: &smoothed_states, options };
-    let structures = if options.has_one_scale() { plain.scaled_together() } else { vec![plain] };
     let work = Arc::new(Work::within(options.work));
     listener.begins(&work);
     let mut proposed: Vec<(Structure, First)> = Vec::new();
