@@ -279,8 +279,7 @@ impl Setup {
         let limit: Vec<f64> = (0..self.system.ny)
             .map(|c| tolerance[c].max(0.05 * self.data.sigma[c]).max(1e-6 * self.data.spread[c]))
             .collect();
-        if let Some(long) = self.longest_stride(references)
-        {
+        if let Some(long) = self.longest_stride(references) {
             return long;
         }
         let ladder = [

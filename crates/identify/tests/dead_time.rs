@@ -29,7 +29,9 @@ fn record(
         .iter()
         .map(|_| {
             let sines: Vec<(f64, f64)> = (0..8)
-                .map(|i| (2.0 * 8.0_f64.powf(f64::from(i) / 7.0), random.random_range(0.0..6.28)))
+                .map(|i| {
+                    (2.0 * 8.0_f64.powf(f64::from(i) / 7.0), random.random_range(0.0..std::f64::consts::TAU))
+                })
                 .collect();
             let at = |t: f64| sines.iter().map(|(w, phase)| (w * t + phase).sin()).sum::<f64>();
             (0..LEAD + samples).map(|k| at(k as f64 * STEP)).collect()
