@@ -53,8 +53,10 @@ pub(crate) fn lowest(axes: &[Axis], criterion: &mut dyn FnMut(&[f64]) -> Option<
     let mut best = criterion(&at).unwrap_or(f64::INFINITY);
     let mut offer = |at: &mut Vec<f64>, i: usize, value: f64| {
         let before = std::mem::replace(&mut at[i], value);
+        if value == before {
+            return false;
+        }
         match criterion(at) {
-            _ if value == before => false,
             Some(found) if found < best => {
                 best = found;
                 true
