@@ -52,6 +52,8 @@ pub struct Setup {
     pub environments: Arc<Vec<Environment>>,
     /// Integration method.
     pub method: Method,
+    /// Whether steps across several samples may be chosen (see [`with_strides`](Self::with_strides)).
+    pub strides: bool,
     /// Parameters to fit with priors and bounds.
     pub free: Vec<FreeParameter>,
     /// Entries of the state vector carried from segment to segment (see [`Problem::carried`]).
@@ -142,12 +144,13 @@ impl Setup {
             holds,
             environments,
             method: Method::Rk4 { substeps: 1 },
+            strides: false,
             free,
             carried: Vec::new(),
             noise: None,
             work: Arc::default(),
         };
-        let tolerance: Vec<f64> = setup.data.spread.iter().map(|s| 1e-3 * s).collect();
+        let tolerance = setup.first_tolerance();
         let references = setup.references(JUDGED);
         for r in &references {
             let dt = setup.data.pieces[r.piece].dt;
@@ -188,6 +191,19 @@ impl Setup {
         let environments = Arc::new(data.environments(&self.holds));
         let (smoothed_states, method) = (Arc::new(smoothed_states), self.method.at_every_sample());
         Setup { data, smoothed_states, environments, method, noise: None, ..self.clone() }
+    }
+
+    /// The same, where a step of the integration may go across several samples, wherever its error moves no parameter that is
+    /// fitted by more than a tenth of its standard deviation: for records taken far faster than the machine moves.
+    pub fn with_strides(mut self) -> Setup {
+        self.strides = true;
+        self.choose_method(&self.first_tolerance(), JUDGED);
+        self
+    }
+
+    /// What a simulation may be off before anything is fitted, SI per channel.
+    fn first_tolerance(&self) -> Vec<f64> {
+        self.data.spread.iter().map(|s| 1e-3 * s).collect()
     }
 
     /// The same model for simulations of other recordings with these parameters: in the same steps, or in finer ones
@@ -279,7 +295,7 @@ impl Setup {
         let limit: Vec<f64> = (0..self.system.ny)
             .map(|c| tolerance[c].max(0.05 * self.data.sigma[c]).max(1e-6 * self.data.spread[c]))
             .collect();
-        if let Some(long) = self.longest_stride(references) {
+        if let Some(long) = self.strides.then(|| self.longest_stride(references)).flatten() {
             return long;
         }
         let ladder = [

@@ -11,6 +11,7 @@ mod noise;
 mod range;
 mod starts;
 mod stiff;
+mod strides;
 mod undefined;
 mod units;
 mod work;

@@ -58,7 +58,7 @@ pub fn calibrate(
     listener: &dyn ProgressListener,
 ) -> Result<Calibration, DiagnoseError> {
     let Layout { train, holdout, source } = layout(model, train, holdout)?;
-    let nominal = Setup::new(model, train.clone(), free_parameters(model))?;
+    let nominal = Setup::new(model, train.clone(), free_parameters(model))?.with_strides();
     let found = alone(&nominal, true, MOST_WORK, listener);
     let judge = Judge::of(&found.calibrated, &residual_scale(&found.calibrated, &found.scale));
     let window = judge.window;

@@ -451,7 +451,7 @@ impl<'a, 'b> Explorer<'a, 'b> {
         laws.push((candidate.clone(), s.values.clone(), s.scales.clone()));
         let mut draft = self.assembled(h, &laws, &at.parameters[..n0], &fresh)?;
         let start = &mut draft.start;
-        if !mechanism.states.is_empty() || at.setup.method.stride() > 1 {
+        if !mechanism.states.is_empty() {
             // What it brings along may be faster than the machine.
             let tolerance: Vec<f64> = start.setup.data.spread.iter().map(|s| 1e-3 * s).collect();
             start.setup.choose_method(&tolerance, usize::MAX);

@@ -249,7 +249,7 @@ impl Search<'_> {
         };
         let level = same_level(&setup, &base.level);
         let kept = transfer(&base.setup, &base.level, &old.starts, &setup, &fresh);
-        if !mechanism.states.is_empty() || base.setup.method.stride() > 1 {
+        if !mechanism.states.is_empty() {
             // What it brings along may be faster than the machine.
             let tolerance: Vec<f64> = scale.iter().map(|s| 0.05 * s).collect();
             setup.choose_method(&tolerance, longest(&level));
