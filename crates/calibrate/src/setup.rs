@@ -20,8 +20,9 @@ const LEAST: usize = 40;
 /// Samples of a recording, and stretches of it, by which a method is judged.
 const JUDGED: usize = 1500;
 const STRETCHES: usize = 8;
-/// Samples that a step may go across, and how far, in standard deviations, its error may move a parameter.
+/// Samples that a step may go across.
 const STRIDES: [usize; 4] = [16, 8, 4, 2];
+/// How far the error of such steps may move a parameter, in its standard deviations.
 const SHIFT: f64 = 0.1;
 /// Error over the least of any method up to which one is as good.
 const AS_GOOD: f64 = 2.0;
@@ -193,8 +194,16 @@ impl Setup {
         Setup { data, smoothed_states, environments, method, noise: None, ..self.clone() }
     }
 
-    /// The same, where a step of the integration may go across several samples, wherever its error moves no parameter that is
-    /// fitted by more than a tenth of its standard deviation: for records taken far faster than the machine moves.
+    /// The same, where a step of the integration may go across up to 16 samples ([`Method::Rk4Stride`]): for records taken far
+    /// faster than the machine moves. The longest step is taken whose error e, against tight tolerances, keeps
+    ///
+    /// ```text
+    /// N · mean (e/σ)² ≤ 0.1²
+    /// ```
+    ///
+    /// over N samples of noise σ (each channel's own). In a least-squares fit a parameter moves by at most ‖e/σ‖ of its standard
+    /// deviations, so that none moves by more than a tenth of one. Where no such step is good enough, or the model has delays
+    /// or measures its highest derivatives, the method stays one that ends a step at every sample.
     pub fn with_strides(mut self) -> Setup {
         self.strides = true;
         self.choose_method(&self.first_tolerance(), JUDGED);
