@@ -3,10 +3,13 @@
 //! Every goal is a figure that was reached before with a hand-written model of the same recording, or a
 //! published one; the README beside each recording tells which.
 
+use std::path::Path;
+
 use greybox_report::Report;
 use greybox_report::contract::{FitSet, Score, Verdict};
 
 use super::Figure;
+use super::runs::Question;
 
 /// Figures of a report.
 pub(crate) type Judge = Box<dyn Fn(&Report) -> Vec<Figure>>;
@@ -30,6 +33,11 @@ pub(crate) struct Case {
 }
 
 impl Case {
+    /// What is asked.
+    pub(crate) fn question(&self, folder: &Path) -> Question {
+        Question::of(&folder.join(&self.folder), &self.model, &self.train, &self.holdout)
+    }
+
     /// The files that must be there.
     pub(crate) fn files(&self) -> impl Iterator<Item = &String> {
         std::iter::once(&self.model).chain(&self.train).chain(&self.holdout)

@@ -14,8 +14,6 @@ mod tests;
 
 use std::path::{Path, PathBuf};
 use std::process::Command;
-use std::sync::atomic::{AtomicUsize, Ordering};
-use std::sync::{Mutex, PoisonError};
 use std::time::Duration;
 
 use anyhow::{Context, Result, bail};
@@ -78,7 +76,7 @@ pub(crate) fn run(binary: &Path, options: &Options<'_>) -> Result<Ending> {
         std::fs::create_dir_all(&path).with_context(|| format!("{} cannot be made", path.display()))?;
     }
     let slots = plan::plan(seed, count);
-    let finished = in_order(&slots, options.jobs, |slot| one(binary, slot, options))?;
+    let finished = runs::in_order(&slots, options.jobs, |slot| one(binary, slot, options))?;
     if finished.is_empty() {
         bail!("no case is about `{}`", options.only.unwrap_or_default());
     }
@@ -103,35 +101,6 @@ pub(crate) fn run(binary: &Path, options: &Options<'_>) -> Result<Ending> {
     let asked = if floors.is_some() { "floors" } else { "goals" };
     println!("{} {asked} met.", if missed.is_empty() { "all" } else { "not all" });
     Ok(if missed.is_empty() { Ending::Done } else { Ending::Missed })
-}
-
-/// Works through the slots in their order, several at a time; the results in the same order, without the
-/// slots that were left out. After an error nothing new is begun.
-fn in_order<T: Send>(
-    slots: &[Slot],
-    jobs: usize,
-    work: impl Fn(&Slot) -> Result<Option<T>> + Sync,
-) -> Result<Vec<T>> {
-    let next = AtomicUsize::new(0);
-    let results: Mutex<Vec<(usize, Result<Option<T>>)>> = Mutex::default();
-    std::thread::scope(|scope| {
-        for _ in 0..jobs.max(1) {
-            scope.spawn(|| {
-                loop {
-                    let i = next.fetch_add(1, Ordering::Relaxed);
-                    let Some(slot) = slots.get(i) else { break };
-                    let result = work(slot);
-                    if result.is_err() {
-                        next.store(slots.len(), Ordering::Relaxed);
-                    }
-                    results.lock().unwrap_or_else(PoisonError::into_inner).push((i, result));
-                }
-            });
-        }
-    });
-    let mut results = results.into_inner().unwrap_or_else(PoisonError::into_inner);
-    results.sort_by_key(|r| r.0);
-    results.into_iter().filter_map(|(_, r)| r.transpose()).collect()
 }
 
 /// Makes, runs and judges the case of a slot; `None` where `--only` leaves it out.

@@ -23,7 +23,7 @@ use serde_json::json;
 
 use cases::Case;
 use greybox_dev::{Ending, process};
-use runs::{Question, Runs};
+use runs::Runs;
 
 /// What `prove` takes.
 #[derive(Debug, clap::Args)]
@@ -53,7 +53,7 @@ pub struct Arguments {
     /// --identify's and --watch's machines
     #[arg(long, value_name = "DIR")]
     keep: Option<PathBuf>,
-    /// Cases of the concealed suite that run at the same time
+    /// Cases of the concealed suite, or with --times-advisory real recordings, that run at the same time
     #[arg(long, value_name = "N", default_value_t = 2)]
     jobs: usize,
     /// Beside greybox, judge what sparse regression of the missing acceleration says of the concealed suite
@@ -180,15 +180,20 @@ pub fn run(root: &Path, arguments: &Arguments) -> Result<Ending> {
     }
     let binary = process::build(root)?;
     let mut runs = Runs::new(&binary, Duration::from_secs(arguments.timeout));
+    let (out, sets_out) =
+        (process::target(root).join("prove"), process::target(root).join("prove").join("sets"));
+    // (Where times count, or stand in the book, each has the machine for itself.)
+    if arguments.times_advisory && !arguments.write_docs {
+        let of_cases = cases.iter().map(|case| (case.question(&folder), out.join(&case.name)));
+        let of_sets = sets.iter().flat_map(|sets| sets.questions(&folder, &sets_out, only));
+        runs.ask_ahead(of_cases.chain(of_sets).collect(), arguments.jobs)?;
+    }
     let mut outcomes = Vec::new();
     for case in &cases {
-        eprintln!("{} …", case.name);
-        let out = process::target(root).join("prove").join(&case.name);
-        outcomes.push(measure(&mut runs, &folder, case, &out)?);
+        outcomes.push(measure(&mut runs, &folder, case, &out.join(&case.name))?);
     }
     if let Some(sets) = sets {
-        let out = process::target(root).join("prove").join("sets");
-        let answers = sets::run(&sets, &folder, &mut runs, &out, only)?;
+        let answers = sets::run(&sets, &folder, &mut runs, &sets_out, only)?;
         println!("{}", sets::text(&answers));
         let totals = sets::totals(&answers);
         let figures = match &arguments.floors {
@@ -257,8 +262,7 @@ fn select(cases: Vec<Case>, only: Option<&str>) -> Result<Vec<Case>> {
 
 /// Runs one case; a run that fails is a figure like any other.
 fn measure(runs: &mut Runs<'_>, folder: &Path, case: &Case, out: &Path) -> Result<Outcome> {
-    let question = Question::of(&folder.join(&case.folder), &case.model, &case.train, &case.holdout);
-    let answered = runs.ask(&question, out)?;
+    let answered = runs.ask(&case.question(folder), out)?;
     let mut figures = match &answered.report {
         Ok(report) => (case.judge)(report),
         Err(why) => vec![Figure::judged("run", why, "a report", false)],

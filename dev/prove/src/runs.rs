@@ -1,7 +1,10 @@
 //! Runs of `greybox diagnose` on real recordings: the same question is put once, whoever asks.
 
+use std::cmp::Reverse;
 use std::path::{Path, PathBuf};
 use std::process::Command;
+use std::sync::atomic::{AtomicUsize, Ordering};
+use std::sync::{Mutex, PoisonError};
 use std::time::Duration;
 
 use anyhow::{Context, Result};
@@ -23,6 +26,11 @@ impl Question {
         let at = |files: &[String]| files.iter().map(|file| folder.join(file)).collect();
         Question { model: folder.join(model), train: at(train), holdout: at(holdout) }
     }
+
+    /// Bytes of its recordings: what has many of them takes long.
+    fn size(&self) -> u64 {
+        self.train.iter().map(|file| std::fs::metadata(file).map_or(0, |m| m.len())).sum()
+    }
 }
 
 /// How the run went, and its report, or why there is none.
@@ -37,13 +45,43 @@ pub(crate) struct Answered {
 pub(crate) struct Runs<'a> {
     binary: &'a Path,
     limit: Duration,
+    /// Threads of each; as many as it likes where nothing is stated.
+    threads: Option<usize>,
     done: Vec<(Question, Answered)>,
 }
 
 impl<'a> Runs<'a> {
     /// None yet: of this binary, each no longer than `limit`.
     pub(crate) fn new(binary: &'a Path, limit: Duration) -> Runs<'a> {
-        Runs { binary, limit, done: Vec::new() }
+        Runs { binary, limit, threads: None, done: Vec::new() }
+    }
+
+    /// Answers questions beforehand, `jobs` at a time, which share the machine: each has its part of the cores, and that much
+    /// more time. Those with the largest recordings come first, so that no long one is left at the end.
+    ///
+    /// # Errors
+    /// As [`ask`](Self::ask).
+    pub(crate) fn ask_ahead(&mut self, questions: Vec<(Question, PathBuf)>, jobs: usize) -> Result<()> {
+        let jobs = jobs.max(1);
+        let mut open: Vec<(Question, PathBuf)> = Vec::new();
+        for (question, out) in questions {
+            if !open.iter().any(|(asked, _)| *asked == question) {
+                open.push((question, out));
+            }
+        }
+        open.sort_by_key(|(question, _)| Reverse(question.size()));
+        let cores = std::thread::available_parallelism().map_or(1, usize::from);
+        let each = Runs {
+            limit: self.limit.saturating_mul(jobs.try_into().unwrap_or(u32::MAX)),
+            threads: Some((cores / jobs).max(1)),
+            ..Runs::new(self.binary, self.limit)
+        };
+        let answered = in_order(&open, jobs, |(question, out)| {
+            eprintln!("{} …", question.model.display());
+            each.diagnose(question, out).map(Some)
+        })?;
+        self.done.extend(open.into_iter().map(|(question, _)| question).zip(answered));
+        Ok(())
     }
 
     /// The answer to a question, its files in `out` when it was not answered before.
@@ -75,10 +113,45 @@ impl<'a> Runs<'a> {
             command.arg("--holdout").arg(file);
         }
         command.arg("--out").arg(out);
+        if let Some(threads) = self.threads {
+            command.env("RAYON_NUM_THREADS", threads.to_string());
+        }
         let run = process::run(&mut command, out, self.limit)?;
         let report = report_of(&run, out);
         Ok(Answered { run, report })
     }
+}
+
+/// Works through items in their order, several at a time; the results in the same order, without the items that were left
+/// out. After an error nothing new is begun.
+///
+/// # Errors
+/// The first error of an item.
+pub(crate) fn in_order<I: Sync, T: Send>(
+    items: &[I],
+    jobs: usize,
+    work: impl Fn(&I) -> Result<Option<T>> + Sync,
+) -> Result<Vec<T>> {
+    let next = AtomicUsize::new(0);
+    let results: Mutex<Vec<(usize, Result<Option<T>>)>> = Mutex::default();
+    std::thread::scope(|scope| {
+        for _ in 0..jobs.max(1) {
+            scope.spawn(|| {
+                loop {
+                    let i = next.fetch_add(1, Ordering::Relaxed);
+                    let Some(item) = items.get(i) else { break };
+                    let result = work(item);
+                    if result.is_err() {
+                        next.store(items.len(), Ordering::Relaxed);
+                    }
+                    results.lock().unwrap_or_else(PoisonError::into_inner).push((i, result));
+                }
+            });
+        }
+    });
+    let mut results = results.into_inner().unwrap_or_else(PoisonError::into_inner);
+    results.sort_by_key(|r| r.0);
+    results.into_iter().filter_map(|(_, r)| r.transpose()).collect()
 }
 
 /// The report that a run left in `out`, or why there is none.
@@ -116,5 +189,41 @@ mod tests {
         }
         assert_eq!(std::fs::read_to_string(&count).unwrap(), "run\nrun\n");
         assert!(place.path().join("1").is_dir() && !place.path().join("2").exists());
+    }
+
+    /// A stand-in that tells how many threads it may have, and for whose sake.
+    #[test]
+    fn questions_are_answered_ahead_the_largest_first() {
+        use std::os::unix::fs::PermissionsExt;
+        let place = tempfile::tempdir().unwrap();
+        let (binary, log) = (place.path().join("stand-in"), place.path().join("log"));
+        let script = format!("#!/bin/sh\necho $2 $RAYON_NUM_THREADS >> {}\nexit 2\n", log.display());
+        std::fs::write(&binary, script).unwrap();
+        std::fs::set_permissions(&binary, std::fs::Permissions::from_mode(0o755)).unwrap();
+        for (file, bytes) in [("short.csv", 10), ("long.csv", 1000)] {
+            std::fs::write(place.path().join(file), vec![b'0'; bytes]).unwrap();
+        }
+        let question = |model: &str, file: &str| {
+            let question = Question::of(place.path(), model, &[file.to_owned()], &[]);
+            (Question { model: model.into(), ..question }, place.path().join(model))
+        };
+        let (short, long) = (question("short", "short.csv"), question("long", "long.csv"));
+        let mut runs = Runs::new(&binary, Duration::from_secs(20));
+        runs.ask_ahead(vec![short.clone(), long.clone(), short.clone()], 1).unwrap();
+        let cores = std::thread::available_parallelism().unwrap();
+        let once = format!("long {cores}\nshort {cores}\n");
+        assert_eq!(std::fs::read_to_string(&log).unwrap(), once);
+        for (question, out) in [&short, &long] {
+            runs.ask(question, out).unwrap();
+        }
+        assert_eq!(
+            std::fs::read_to_string(&log).unwrap(),
+            once,
+            "what was answered ahead is not asked again"
+        );
+        // (As many at a time as there are cores: a thread each.)
+        let mut runs = Runs::new(&binary, Duration::from_secs(20));
+        runs.ask_ahead(vec![long.clone()], cores.get()).unwrap();
+        assert!(std::fs::read_to_string(&log).unwrap().ends_with("long 1\n"));
     }
 }

@@ -3,7 +3,7 @@
 //!
 //! `reachable.json` beside the recordings tells what is reachable and which names are right. Only this scorer reads it.
 
-use std::path::Path;
+use std::path::{Path, PathBuf};
 
 use anyhow::{Context, Result, bail};
 use greybox_report::Report;
@@ -49,6 +49,20 @@ pub(crate) struct Set {
 }
 
 impl Sets {
+    fn wanted(&self, only: Option<&str>) -> impl Iterator<Item = &Set> {
+        self.sets.iter().filter(move |s| only.is_none_or(|w| s.name().contains(w)))
+    }
+
+    /// What is asked of the sets whose names contain `only`, and where the answers go.
+    pub(crate) fn questions(
+        &self,
+        folder: &Path,
+        out: &Path,
+        only: Option<&str>,
+    ) -> Vec<(Question, PathBuf)> {
+        self.wanted(only).map(|set| set.question(folder, out)).collect()
+    }
+
     /// Whether the name of a set contains this.
     pub(crate) fn has(&self, word: &str) -> bool {
         self.sets.iter().any(|s| s.name().contains(word))
@@ -58,6 +72,11 @@ impl Sets {
 impl Set {
     fn name(&self) -> String {
         format!("{}/{}", self.set, self.model.trim_end_matches(".toml"))
+    }
+
+    fn question(&self, folder: &Path, out: &Path) -> (Question, PathBuf) {
+        let question = Question::of(&folder.join(&self.set), &self.model, &self.train, &self.holdout);
+        (question, out.join(self.name().replace('/', "-")))
     }
 }
 
@@ -159,15 +178,12 @@ pub(crate) fn run(
     out: &Path,
     only: Option<&str>,
 ) -> Result<Vec<Answer>> {
-    let wanted = sets.sets.iter().filter(|s| only.is_none_or(|w| s.name().contains(w)));
-    wanted.map(|set| one(set, folder, runs, &out.join(set.name().replace('/', "-")))).collect()
-}
-
-fn one(set: &Set, folder: &Path, runs: &mut Runs<'_>, out: &Path) -> Result<Answer> {
-    eprintln!("{} …", set.name());
-    let question = Question::of(&folder.join(&set.set), &set.model, &set.train, &set.holdout);
-    let answered = runs.ask(&question, out)?;
-    Ok(judge(set, answered.report.as_ref(), answered.run.seconds))
+    let one = |set: &Set| {
+        let (question, out) = set.question(folder, out);
+        let answered = runs.ask(&question, &out)?;
+        Ok(judge(set, answered.report.as_ref(), answered.run.seconds))
+    };
+    sets.wanted(only).map(one).collect()
 }
 
 /// The error of the worst channel by the report's criterion: infinite where a simulation diverges.
