@@ -188,6 +188,8 @@ fn a_dead_time_that_may_be_none_or_ended_at_the_longest_is_said() {
     let none = late(0.0004, json!([0.0, 0.0016]));
     let last = none.summary.last().unwrap();
     assert!(last.contains("do not tell it from none") && last.contains("at most 0.0016 s"), "{last}");
+    let none = late(0.0, json!([0.0, 0.0016]));
+    assert!(none.summary[0].ends_with(" = v."), "{}", none.summary[0]);
     let longest = late(0.5, Value::Null);
     let last = longest.summary.last().unwrap();
     assert!(last.contains("ended on the longest looked for, 0.500 s"), "{last}");

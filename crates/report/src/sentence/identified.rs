@@ -55,9 +55,13 @@ pub fn with_values(equation: &Equation, delays: &Delays<'_>) -> String {
     format!("{text} = {right}")
 }
 
-/// `f(t − 0.073 s)`
+/// `f(t − 0.073 s)`, or `f` where the delay is none.
 fn late(signal: &str, delay: f64) -> String {
-    format!("{}(t − {} s)", expression::text(signal), format::significant(delay, 4))
+    let signal = expression::text(signal);
+    match delay == 0.0 {
+        true => signal,
+        false => format!("{signal}(t − {} s)", format::significant(delay, 4)),
+    }
 }
 
 /// The delays of a report.
