@@ -6,7 +6,7 @@ use std::fmt::Write as _;
 use std::process::Stdio;
 
 use common::Bench;
-use running::{Broker, Watching};
+use running::{Broker, Watching, watch};
 
 #[allow(dead_code, reason = "not every test file uses all of it")]
 mod common;
@@ -126,6 +126,88 @@ fn a_broker_with_users_sends_lines_of_the_influx_protocol() {
         assert!(
             refused.stderr.contains("--from mqtt://user:password@host") && !refused.stderr.contains("wrong")
         );
+    }
+}
+
+/// An authority, and a broker's certificate of 127.0.0.1 that it has signed; `false`, and a word of it, without `openssl`.
+#[allow(clippy::print_stderr, reason = "what is skipped is said")]
+fn certificates(bench: &Bench) -> bool {
+    bench.write("names", "subjectAltName = IP:127.0.0.1\n");
+    let new = "req -newkey ec -pkeyopt ec_paramgen_curve:prime256v1 -nodes";
+    let made = [
+        format!("{new} -x509 -days 2 -subj /CN=authority -keyout authority.key -out authority.pem"),
+        format!("{new} -subj /CN=broker -keyout broker.key -out broker.csr"),
+        "x509 -req -days 2 -in broker.csr -CA authority.pem -CAkey authority.key -CAcreateserial -extfile names \
+         -out broker.pem"
+            .to_owned(),
+    ]
+    .iter()
+    .all(|arguments| {
+        let mut openssl = std::process::Command::new("openssl");
+        openssl.args(arguments.split_whitespace()).current_dir(bench.path(".")).stderr(Stdio::null());
+        openssl.status().is_ok_and(|status| status.success())
+    });
+    if !made {
+        eprintln!("skipped: openssl is not installed (Debian: openssl)");
+    }
+    made
+}
+
+/// What comes by TLS is what was sent; a broker that the machine does not trust, or that is another, is refused.
+#[test]
+fn a_broker_by_tls_is_followed_where_its_certificate_is_trusted() {
+    let bench = bench();
+    if !certificates(&bench) {
+        return;
+    }
+    let at = |file: &str| bench.path(file).display().to_string();
+    let config = format!("allow_anonymous true\ncertfile {}\nkeyfile {}", at("broker.pem"), at("broker.key"));
+    let Some(mut broker) = Broker::start(&bench, &config) else { return };
+    let lines: Vec<String> = throttle::samples(20.0)
+        .iter()
+        .map(|[t, torque, angle]| format!(r#"{{"t": {t}, "torque": {torque:.5}, "angle": {angle:.6}}}"#))
+        .collect();
+    let (whole, state) = fed(&bench, &lines.join("\n"));
+    let of = |trusted: &str, from: &str| {
+        let mut command = watch(&bench);
+        command.args(["--learn", "15", "--from", from]).env("SSL_CERT_FILE", at(trusted));
+        command.env_remove("SSL_CERT_DIR");
+        command
+    };
+    let from = |scheme: &str, host: &str, port: &str| format!("{scheme}://{host}:{port}/plant/throttle");
+
+    let mut command = of("authority.pem", &from("mqtts", "127.0.0.1", &broker.port));
+    let watching = Watching::start_as(command.args(["--state", "state.json"]));
+    let subscribed = watching.until("subscribed");
+    assert!(subscribed.len() == 1 && subscribed[0].contains("mqtts://127.0.0.1"), "{subscribed:?}");
+    broker.publish(&lines, &["--cafile", &at("authority.pem")]);
+    watching.until_saved(&bench, "state.json", &state);
+    assert_eq!(watching.rest(), whole);
+    broker.kill();
+    assert_eq!(watching.next().1["event"], "disconnected");
+    assert!(broker.run());
+    while watching.next().1["event"] != "subscribed" {}
+
+    bench.write("nobody.pem", "");
+    let plain = std::net::TcpListener::bind("127.0.0.1:0").unwrap();
+    let nowhere = plain.local_addr().unwrap().port().to_string();
+    // (It hangs up on whoever comes.)
+    std::thread::spawn(move || plain.incoming().for_each(drop));
+    for (trusted, from, words) in [
+        ("nobody.pem", from("mqtts", "127.0.0.1", &broker.port), "signed by nobody whom this machine trusts"),
+        ("nobody.pem", from("mqtts", "127.0.0.1", &broker.port), "SSL_CERT_FILE"),
+        (
+            "authority.pem",
+            from("mqtts", "localhost", &broker.port),
+            "its certificate is that of another host",
+        ),
+        ("authority.pem", from("mqtts", "127.0.0.1", &nowhere), "no TLS"),
+        ("authority.pem", from("mqtt", "127.0.0.1", &broker.port), "see that the broker runs there"),
+    ] {
+        let said = of(trusted, &from).stdin(Stdio::null()).output().unwrap();
+        let stderr = String::from_utf8(said.stderr).unwrap();
+        assert_eq!(said.status.code(), Some(2), "{from}: {stderr}");
+        assert!(stderr.contains(words), "{from}: {stderr}");
     }
 }
 

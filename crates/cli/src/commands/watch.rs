@@ -21,6 +21,8 @@ use crate::loading;
 
 mod address;
 #[cfg(feature = "mqtt")]
+mod connection;
+#[cfg(feature = "mqtt")]
 mod mqtt;
 mod source;
 
@@ -62,7 +64,7 @@ pub(crate) struct Arguments {
     #[arg(long, value_name = "RATE", default_value_t = Options::default().alarms_per_day)]
     alarms_per_day: f64,
 
-    /// Broker and topic to take samples from, instead of standard input: mqtt://host:1883/topic, mqtt://user:password@host/topic
+    /// Broker and topic to take samples from, instead of standard input: mqtt://host:1883/topic, by TLS mqtts://user:password@host:8883/topic
     #[arg(long, value_name = "URL")]
     from: Option<Address>,
 

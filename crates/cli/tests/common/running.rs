@@ -101,6 +101,13 @@ impl Broker {
     }
 }
 
+/// `greybox watch --json` on the throttle of a bench.
+pub(crate) fn watch(bench: &Bench) -> Command {
+    let mut command = Command::new(env!("CARGO_BIN_EXE_greybox"));
+    command.args(["watch", "throttle.toml", "--json"]).current_dir(bench.path("."));
+    command
+}
+
 /// A `greybox watch --json` that runs.
 pub(crate) struct Watching {
     pub(crate) process: Running,
@@ -110,14 +117,12 @@ pub(crate) struct Watching {
 
 impl Watching {
     pub(crate) fn start(bench: &Bench, arguments: &[&str]) -> Watching {
-        let mut child = Command::new(env!("CARGO_BIN_EXE_greybox"))
-            .args(["watch", "throttle.toml", "--json"])
-            .args(arguments)
-            .current_dir(bench.path("."))
-            .stdin(Stdio::piped())
-            .stdout(Stdio::piped())
-            .spawn()
-            .unwrap();
+        Watching::start_as(watch(bench).args(arguments))
+    }
+
+    /// Of a [`watch`] with its arguments.
+    pub(crate) fn start_as(command: &mut Command) -> Watching {
+        let mut child = command.stdin(Stdio::piped()).stdout(Stdio::piped()).spawn().unwrap();
         let out = BufReader::new(child.stdout.take().unwrap());
         let (to, lines) = mpsc::channel();
         thread::spawn(move || {

@@ -4,9 +4,10 @@ use std::str::FromStr;
 
 use percent_encoding::percent_decode_str;
 
-/// `mqtt://[user[:password]@]host[:port]/topic`.
+/// `mqtt://[user[:password]@]host[:port]/topic`, or `mqtts://…` by TLS.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub(crate) struct Address {
+    pub(super) secure: bool,
     pub(super) host: String,
     pub(super) port: u16,
     pub(super) user: Option<String>,
@@ -14,8 +15,9 @@ pub(crate) struct Address {
     pub(super) topic: String,
 }
 
-/// The port of MQTT.
+/// The port of MQTT, and that of MQTT by TLS.
 const PORT: u16 = 1883;
+const SECURE_PORT: u16 = 8883;
 /// Most bytes of a text of the protocol.
 const LONGEST: usize = 65_535;
 
@@ -23,7 +25,8 @@ impl Address {
     /// The broker in messages, without what is secret.
     pub(super) fn broker(&self) -> String {
         let between = if self.host.contains(':') { ["[", "]"] } else { ["", ""] };
-        format!("mqtt://{}{}{}:{}", between[0], self.host, between[1], self.port)
+        let scheme = if self.secure { "mqtts" } else { "mqtt" };
+        format!("{scheme}://{}{}{}:{}", between[0], self.host, between[1], self.port)
     }
 }
 
@@ -31,17 +34,12 @@ impl FromStr for Address {
     type Err = String;
 
     fn from_str(text: &str) -> Result<Address, String> {
-        const FORM: &str =
-            "write it like mqtt://broker:1883/plant/throttle, or mqtt://user:password@broker/topic";
-        if text.starts_with("mqtts://") {
-            return Err(
-                "greybox speaks no TLS: pipe `mosquitto_sub --cafile …` into it, or let a broker of \
-                        this machine be the bridge"
-                    .to_owned(),
-            );
-        }
-        let rest =
-            text.strip_prefix("mqtt://").ok_or_else(|| format!("this is no address of a broker; {FORM}"))?;
+        const FORM: &str = "write it like mqtt://broker:1883/plant/throttle, mqtts://… by TLS, or mqtt://user:password@broker/topic";
+        let (secure, rest) = match (text.strip_prefix("mqtt://"), text.strip_prefix("mqtts://")) {
+            (Some(rest), _) => (false, rest),
+            (_, Some(rest)) => (true, rest),
+            _ => return Err(format!("this is no address of a broker; {FORM}")),
+        };
         // (A topic is taken as it stands: `#` and `?` mean nothing else here.)
         let (authority, topic) = rest.split_once('/').ok_or_else(|| format!("there is no topic; {FORM}"))?;
         let (login, place) = match authority.rsplit_once('@') {
@@ -49,17 +47,18 @@ impl FromStr for Address {
             None => (None, authority),
         };
         let (host, port) = host_and_port(place).ok_or_else(|| format!("there is no host or port; {FORM}"))?;
+        let port = port.unwrap_or(if secure { SECURE_PORT } else { PORT });
         let (user, password) = match login.map(|login| login.split_once(':').unwrap_or((login, ""))) {
             None => (None, None),
             Some((user, password)) => (Some(decoded(user)?), Some(decoded(password)?)),
         };
         check_topic(topic)?;
         let password = password.filter(|p| !p.is_empty());
-        Ok(Address { host, port, user, password, topic: topic.to_owned() })
+        Ok(Address { secure, host, port, user, password, topic: topic.to_owned() })
     }
 }
 
-fn host_and_port(place: &str) -> Option<(String, u16)> {
+fn host_and_port(place: &str) -> Option<(String, Option<u16>)> {
     let (host, port) = match place.strip_prefix('[') {
         // An address of IPv6 has colons of its own.
         Some(rest) => {
@@ -68,7 +67,7 @@ fn host_and_port(place: &str) -> Option<(String, u16)> {
         }
         None => place.split_once(':').map_or((place, None), |(host, port)| (host, Some(port))),
     };
-    let port = port.map_or(Some(PORT), |port| port.parse().ok())?;
+    let port = port.map(str::parse).transpose().ok()?;
     (!host.is_empty()).then(|| (host.to_owned(), port))
 }
 
@@ -115,9 +114,11 @@ mod tests {
         let short = read("mqtt://[::1]//a?b").unwrap();
         assert_eq!((short.broker().as_str(), short.topic.as_str()), ("mqtt://[::1]:1883", "/a?b"));
         assert_eq!((short.user, short.password), (None, None));
+        let secure = read("mqtts://broker/topic").unwrap();
+        assert_eq!((secure.secure, secure.broker().as_str()), (true, "mqtts://broker:8883"));
         for (text, part) in [
             ("broker/topic", "no address of a broker"),
-            ("mqtts://broker/topic", "no TLS"),
+            ("http://broker/topic", "no address of a broker"),
             ("mqtt://broker", "no topic"),
             ("mqtt://broker/", "`` is no topic"),
             ("mqtt://broker/a#", "`a#` is no topic"),

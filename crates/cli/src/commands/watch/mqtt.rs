@@ -1,9 +1,8 @@
-//! A subscription at an MQTT broker (version 3.1.1): the protocol is a library's, the connection is here.
+//! A subscription at an MQTT broker (version 3.1.1): the protocol is a library's.
 
 use std::collections::VecDeque;
 use std::hash::{BuildHasher, RandomState};
 use std::io::{ErrorKind, Read, Write};
-use std::net::{TcpStream, ToSocketAddrs};
 use std::sync::mpsc::SyncSender;
 use std::thread;
 use std::time::{Duration, Instant};
@@ -17,6 +16,7 @@ use mqtt_protocol_core::mqtt::result_code::{ConnectReturnCode, MqttError};
 use mqtt_protocol_core::mqtt::{Connection as Protocol, Version, role};
 
 use super::address::Address;
+use super::connection::{ANSWER, Ended, Stream, lost};
 use super::now;
 use super::source::{Connection, Message};
 use crate::failure::Failure;
@@ -25,21 +25,8 @@ use crate::failure::Failure;
 const PAUSES: (u64, u64) = (1, 60);
 /// A broker that hears nothing for so long is asked whether it is there.
 const KEEP_ALIVE: u16 = 30;
-/// What is waited for an answer.
-const ANSWER: Duration = Duration::from_secs(10);
 /// Most bytes of a packet.
 const LARGEST: u32 = 16 << 20;
-
-/// Why a connection ended.
-#[derive(Debug)]
-enum Ended {
-    /// The broker cannot be reached any more.
-    Lost(String),
-    /// The broker does not want it: what it says, and the help.
-    Refused(String, &'static str),
-    /// Nobody takes messages any more.
-    Over,
-}
 
 use Ended::{Lost, Over, Refused};
 
@@ -82,7 +69,7 @@ pub(super) fn follow(address: &Address, to: &SyncSender<Message>) {
 struct Subscription<'a> {
     address: &'a Address,
     to: &'a SyncSender<Message>,
-    stream: TcpStream,
+    stream: Stream,
     protocol: Protocol<role::Client>,
     timers: Vec<(TimerKind, Instant)>,
     /// When it is given up where the broker has not confirmed it.
@@ -101,7 +88,7 @@ impl<'a> Subscription<'a> {
         Ok(Subscription {
             address,
             to,
-            stream: stream(address)?,
+            stream: Stream::open(address)?,
             protocol,
             timers: Vec::new(),
             confirmed_by: now() + ANSWER,
@@ -118,7 +105,7 @@ impl<'a> Subscription<'a> {
         loop {
             let left = self.next_timer().saturating_duration_since(now());
             let wait = left.max(Duration::from_millis(1));
-            self.stream.set_read_timeout(Some(wait)).map_err(|e| lost(&e))?;
+            self.stream.wait_at_most(wait).map_err(|e| lost(&e))?;
             match self.stream.read(&mut buffer) {
                 Ok(0) => return Err(Lost("the broker has closed the connection".to_owned())),
                 Ok(read) => {
@@ -167,7 +154,8 @@ impl<'a> Subscription<'a> {
         while let Some(event) = events.pop_front() {
             match event {
                 Event::RequestSendPacket { packet, .. } => {
-                    self.stream.write_all(&packet.to_continuous_buffer()).map_err(|e| lost(&e))?;
+                    let bytes = packet.to_continuous_buffer();
+                    self.stream.write_all(&bytes).and_then(|()| self.stream.flush()).map_err(|e| lost(&e))?;
                 }
                 Event::NotifyPacketReceived(packet) => events.extend(self.take(&packet)?),
                 Event::RequestTimerReset { kind, duration_ms } => {
@@ -236,26 +224,6 @@ impl<'a> Subscription<'a> {
     }
 }
 
-/// A connection to the first address of the host that takes it.
-fn stream(address: &Address) -> Result<TcpStream, Ended> {
-    let found = (address.host.as_str(), address.port).to_socket_addrs();
-    let found = found.map_err(|e| Lost(format!("the host is not known: {e}")))?;
-    let mut refused = Lost("the host has no address".to_owned());
-    for place in found {
-        match TcpStream::connect_timeout(&place, ANSWER) {
-            Ok(stream) => {
-                stream
-                    .set_write_timeout(Some(ANSWER))
-                    .and_then(|()| stream.set_nodelay(true))
-                    .map_err(|e| lost(&e))?;
-                return Ok(stream);
-            }
-            Err(e) => refused = Lost(format!("no connection: {e}")),
-        }
-    }
-    Err(refused)
-}
-
 /// The first packet. The session is a clean one: the broker keeps nothing for this client while it is not there.
 fn connect(address: &Address) -> Result<Connect, MqttError> {
     // Two clients with one name would take each other's place; `RandomState` differs from process to process.
@@ -285,10 +253,6 @@ fn accepted(answer: &Connack) -> Result<(), Ended> {
         ConnectReturnCode::ServerUnavailable => ("it is not available", "try again later"),
     };
     Err(Refused(format!("the broker refuses the connection: {what}"), help))
-}
-
-fn lost(error: &std::io::Error) -> Ended {
-    Lost(format!("the connection is lost: {error}"))
 }
 
 /// What the protocol has no room for.
