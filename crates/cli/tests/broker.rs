@@ -129,13 +129,14 @@ fn a_broker_with_users_sends_lines_of_the_influx_protocol() {
     }
 }
 
-/// An authority, and a broker's certificate of 127.0.0.1 that it has signed; `false`, and a word of it, without `openssl`.
+/// Two authorities, and a broker's certificate of 127.0.0.1 that the first has signed; `false`, and a word of it, without `openssl`.
 #[allow(clippy::print_stderr, reason = "what is skipped is said")]
 fn certificates(bench: &Bench) -> bool {
     bench.write("names", "subjectAltName = IP:127.0.0.1\n");
     let new = "req -newkey ec -pkeyopt ec_paramgen_curve:prime256v1 -nodes";
     let made = [
         format!("{new} -x509 -days 2 -subj /CN=authority -keyout authority.key -out authority.pem"),
+        format!("{new} -x509 -days 2 -subj /CN=other -keyout other.key -out other.pem"),
         format!("{new} -subj /CN=broker -keyout broker.key -out broker.csr"),
         "x509 -req -days 2 -in broker.csr -CA authority.pem -CAkey authority.key -CAcreateserial -extfile names \
          -out broker.pem"
@@ -189,19 +190,21 @@ fn a_broker_by_tls_is_followed_where_its_certificate_is_trusted() {
     while watching.next().1["event"] != "subscribed" {}
 
     bench.write("nobody.pem", "");
-    let plain = std::net::TcpListener::bind("127.0.0.1:0").unwrap();
-    let nowhere = plain.local_addr().unwrap().port().to_string();
-    // (It hangs up on whoever comes.)
-    std::thread::spawn(move || plain.incoming().for_each(drop));
+    // Two that are no brokers: one hangs up on whoever comes, one is silent.
+    let [rude, silent] = [0, 1].map(|_| std::net::TcpListener::bind("127.0.0.1:0").unwrap());
+    let [rude_port, silent_port] = [&rude, &silent].map(|l| l.local_addr().unwrap().port().to_string());
+    std::thread::spawn(move || rude.incoming().for_each(drop));
     for (trusted, from, words) in [
-        ("nobody.pem", from("mqtts", "127.0.0.1", &broker.port), "signed by nobody whom this machine trusts"),
-        ("nobody.pem", from("mqtts", "127.0.0.1", &broker.port), "SSL_CERT_FILE"),
+        ("other.pem", from("mqtts", "127.0.0.1", &broker.port), "signed by nobody whom this machine trusts"),
+        ("other.pem", from("mqtts", "127.0.0.1", &broker.port), "SSL_CERT_FILE"),
+        ("nobody.pem", from("mqtts", "127.0.0.1", &broker.port), "no certificates of authorities to trust"),
         (
             "authority.pem",
             from("mqtts", "localhost", &broker.port),
             "its certificate is that of another host",
         ),
-        ("authority.pem", from("mqtts", "127.0.0.1", &nowhere), "no TLS"),
+        ("authority.pem", from("mqtts", "127.0.0.1", &rude_port), "no TLS"),
+        ("authority.pem", from("mqtts", "127.0.0.1", &silent_port), "no answer in 10 s"),
         ("authority.pem", from("mqtt", "127.0.0.1", &broker.port), "see that the broker runs there"),
     ] {
         let said = of(trusted, &from).stdin(Stdio::null()).output().unwrap();
@@ -209,6 +212,7 @@ fn a_broker_by_tls_is_followed_where_its_certificate_is_trusted() {
         assert_eq!(said.status.code(), Some(2), "{from}: {stderr}");
         assert!(stderr.contains(words), "{from}: {stderr}");
     }
+    drop(silent);
 }
 
 #[test]

@@ -31,6 +31,11 @@ pub(super) fn lost(error: &io::Error) -> Ended {
     Lost(format!("the connection is lost: {error}"))
 }
 
+/// Nothing has come for too long.
+pub(super) fn no_answer() -> Ended {
+    Lost(format!("no answer in {} s", ANSWER.as_secs()))
+}
+
 /// Bytes from and to a broker.
 pub(super) enum Stream {
     Plain(TcpStream),
@@ -104,8 +109,16 @@ fn connected(address: &Address) -> Result<TcpStream, Ended> {
 /// TLS 1.2 or 1.3 over a connection, where the broker's certificate is that of its host, signed by an authority that this
 /// machine trusts: those of the system, or of the file that `SSL_CERT_FILE` names.
 fn secured(address: &Address, socket: TcpStream) -> Result<Stream, Ended> {
+    let found = rustls_native_certs::load_native_certs();
     let mut trusted = RootCertStore::empty();
-    trusted.add_parsable_certificates(rustls_native_certs::load_native_certs().certs);
+    trusted.add_parsable_certificates(found.certs);
+    if trusted.is_empty() {
+        let why = found.errors.first().map_or_else(String::new, |e| format!(" ({e})"));
+        return Err(Refused(
+            format!("this machine has no certificates of authorities to trust{why}"),
+            "name a file of them (PEM) in the environment variable SSL_CERT_FILE, or install them (Debian: ca-certificates)",
+        ));
+    }
     let failed = |e: Error| Lost(format!("no TLS: {e}"));
     let provider = Arc::new(rustls::crypto::ring::default_provider());
     let config = ClientConfig::builder_with_provider(provider)
@@ -126,6 +139,9 @@ fn secured(address: &Address, socket: TcpStream) -> Result<Stream, Ended> {
 /// Why TLS could not begin.
 fn untrusted(error: &io::Error) -> Ended {
     use CertificateError::{Expired, ExpiredContext, NotValidForName, NotValidForNameContext, UnknownIssuer};
+    if matches!(error.kind(), io::ErrorKind::WouldBlock | io::ErrorKind::TimedOut) {
+        return no_answer();
+    }
     let Some(Error::InvalidCertificate(why)) = error.get_ref().and_then(|e| e.downcast_ref::<Error>()) else {
         return Lost(format!("no TLS: {error}"));
     };

@@ -16,7 +16,7 @@ use mqtt_protocol_core::mqtt::result_code::{ConnectReturnCode, MqttError};
 use mqtt_protocol_core::mqtt::{Connection as Protocol, Version, role};
 
 use super::address::Address;
-use super::connection::{ANSWER, Ended, Stream, lost};
+use super::connection::{ANSWER, Ended, Stream, lost, no_answer};
 use super::now;
 use super::source::{Connection, Message};
 use crate::failure::Failure;
@@ -134,13 +134,13 @@ impl<'a> Subscription<'a> {
     fn fire(&mut self) -> Result<(), Ended> {
         let now = now();
         if !self.subscribed && now >= self.confirmed_by {
-            return Err(Lost(format!("no answer in {} s", ANSWER.as_secs())));
+            return Err(no_answer());
         }
         let due: Vec<TimerKind> = self.timers.iter().filter(|(_, at)| now >= *at).map(|(k, _)| *k).collect();
         self.timers.retain(|(_, at)| now < *at);
         for kind in due {
             if kind == TimerKind::PingrespRecv {
-                return Err(Lost(format!("no answer in {} s", ANSWER.as_secs())));
+                return Err(no_answer());
             }
             let events = self.protocol.notify_timer_fired(kind);
             self.handle(events)?;
