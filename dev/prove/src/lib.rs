@@ -180,8 +180,8 @@ pub fn run(root: &Path, arguments: &Arguments) -> Result<Ending> {
     }
     let binary = process::build(root)?;
     let mut runs = Runs::new(&binary, Duration::from_secs(arguments.timeout));
-    let (out, sets_out) =
-        (process::target(root).join("prove"), process::target(root).join("prove").join("sets"));
+    let out = process::target(root).join("prove");
+    let sets_out = out.join("sets");
     // (Where times count, or stand in the book, each has the machine for itself.)
     if arguments.times_advisory && !arguments.write_docs {
         let of_cases = cases.iter().map(|case| (case.question(&folder), out.join(&case.name)));
