@@ -24,6 +24,14 @@ fn bench() -> Bench {
     bench
 }
 
+/// So many seconds of samples, an object each.
+fn messages(seconds: f64) -> Vec<String> {
+    let samples = throttle::samples(seconds);
+    let message =
+        |[t, torque, angle]: &_| format!(r#"{{"t": {t}, "torque": {torque:.5}, "angle": {angle:.6}}}"#);
+    samples.iter().map(message).collect()
+}
+
 /// What the same samples on standard input leave: the lines, and the state.
 fn fed(bench: &Bench, text: &str) -> (Vec<String>, String) {
     let arguments = ["watch", "throttle.toml", "--json", "--learn", "15", "--state", "fed.json"];
@@ -39,11 +47,7 @@ fn fed(bench: &Bench, text: &str) -> (Vec<String>, String) {
 fn a_broker_that_is_killed_is_waited_for() {
     let bench = bench();
     let Some(mut broker) = Broker::start(&bench, "allow_anonymous true") else { return };
-    let samples = throttle::samples(30.0);
-    let lines: Vec<String> = samples
-        .iter()
-        .map(|[t, torque, angle]| format!(r#"{{"t": {t}, "torque": {torque:.5}, "angle": {angle:.6}}}"#))
-        .collect();
+    let lines = messages(30.0);
     let (first, second) = lines.split_at(2000);
     let (early, early_state) = fed(&bench, &first.join("\n"));
     let (whole, whole_state) = fed(&bench, &lines.join("\n"));
@@ -164,10 +168,7 @@ fn a_broker_by_tls_is_followed_where_its_certificate_is_trusted() {
     let at = |file: &str| bench.path(file).display().to_string();
     let config = format!("allow_anonymous true\ncertfile {}\nkeyfile {}", at("broker.pem"), at("broker.key"));
     let Some(mut broker) = Broker::start(&bench, &config) else { return };
-    let lines: Vec<String> = throttle::samples(20.0)
-        .iter()
-        .map(|[t, torque, angle]| format!(r#"{{"t": {t}, "torque": {torque:.5}, "angle": {angle:.6}}}"#))
-        .collect();
+    let lines = messages(20.0);
     let (whole, state) = fed(&bench, &lines.join("\n"));
     let of = |trusted: &str, from: &str| {
         let mut command = watch(&bench);

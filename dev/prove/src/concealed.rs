@@ -77,6 +77,7 @@ pub(crate) fn run(binary: &Path, options: &Options<'_>) -> Result<Ending> {
     }
     let slots = plan::plan(seed, count);
     let finished = runs::in_order(&slots, options.jobs, |slot| one(binary, slot, options))?;
+    let finished: Vec<Finished> = finished.into_iter().flatten().collect();
     if finished.is_empty() {
         bail!("no case is about `{}`", options.only.unwrap_or_default());
     }

@@ -78,7 +78,7 @@ impl<'a> Runs<'a> {
         };
         let answered = in_order(&open, jobs, |(question, out)| {
             eprintln!("{} …", question.model.display());
-            each.diagnose(question, out).map(Some)
+            each.diagnose(question, out)
         })?;
         self.done.extend(open.into_iter().map(|(question, _)| question).zip(answered));
         Ok(())
@@ -122,18 +122,17 @@ impl<'a> Runs<'a> {
     }
 }
 
-/// Works through items in their order, several at a time; the results in the same order, without the items that were left
-/// out. After an error nothing new is begun.
+/// Works through items in their order, several at a time; the results in the same order. After an error nothing new is begun.
 ///
 /// # Errors
 /// The first error of an item.
 pub(crate) fn in_order<I: Sync, T: Send>(
     items: &[I],
     jobs: usize,
-    work: impl Fn(&I) -> Result<Option<T>> + Sync,
+    work: impl Fn(&I) -> Result<T> + Sync,
 ) -> Result<Vec<T>> {
     let next = AtomicUsize::new(0);
-    let results: Mutex<Vec<(usize, Result<Option<T>>)>> = Mutex::default();
+    let results: Mutex<Vec<(usize, Result<T>)>> = Mutex::default();
     std::thread::scope(|scope| {
         for _ in 0..jobs.max(1) {
             scope.spawn(|| {
@@ -151,7 +150,7 @@ pub(crate) fn in_order<I: Sync, T: Send>(
     });
     let mut results = results.into_inner().unwrap_or_else(PoisonError::into_inner);
     results.sort_by_key(|r| r.0);
-    results.into_iter().filter_map(|(_, r)| r.transpose()).collect()
+    results.into_iter().map(|(_, result)| result).collect()
 }
 
 /// The report that a run left in `out`, or why there is none.
@@ -173,14 +172,19 @@ pub(crate) fn report_of(run: &Measured, out: &Path) -> Result<Report, String> {
 mod tests {
     use super::*;
 
-    /// A stand-in for greybox that counts its runs.
+    /// A program in the place of greybox.
+    fn stand_in(binary: &Path, line: &str) {
+        use std::os::unix::fs::PermissionsExt;
+        std::fs::write(binary, format!("#!/bin/sh\n{line}\nexit 2\n")).unwrap();
+        std::fs::set_permissions(binary, std::fs::Permissions::from_mode(0o755)).unwrap();
+    }
+
+    /// A stand-in that counts its runs.
     #[test]
     fn the_same_question_is_put_once() {
-        use std::os::unix::fs::PermissionsExt;
         let place = tempfile::tempdir().unwrap();
         let (binary, count) = (place.path().join("stand-in"), place.path().join("count"));
-        std::fs::write(&binary, format!("#!/bin/sh\necho run >> {}\nexit 2\n", count.display())).unwrap();
-        std::fs::set_permissions(&binary, std::fs::Permissions::from_mode(0o755)).unwrap();
+        stand_in(&binary, &format!("echo run >> {}", count.display()));
         let mut runs = Runs::new(&binary, Duration::from_secs(20));
         let question = |model: &str| Question::of(Path::new("here"), model, &["a.csv".to_owned()], &[]);
         for (model, out) in [("one.toml", "1"), ("one.toml", "2"), ("two.toml", "3")] {
@@ -191,15 +195,12 @@ mod tests {
         assert!(place.path().join("1").is_dir() && !place.path().join("2").exists());
     }
 
-    /// A stand-in that tells how many threads it may have, and for whose sake.
+    /// A stand-in that writes down the model and how many threads it may have.
     #[test]
     fn questions_are_answered_ahead_the_largest_first() {
-        use std::os::unix::fs::PermissionsExt;
         let place = tempfile::tempdir().unwrap();
         let (binary, log) = (place.path().join("stand-in"), place.path().join("log"));
-        let script = format!("#!/bin/sh\necho $2 $RAYON_NUM_THREADS >> {}\nexit 2\n", log.display());
-        std::fs::write(&binary, script).unwrap();
-        std::fs::set_permissions(&binary, std::fs::Permissions::from_mode(0o755)).unwrap();
+        stand_in(&binary, &format!("echo $2 $RAYON_NUM_THREADS >> {}", log.display()));
         for (file, bytes) in [("short.csv", 10), ("long.csv", 1000)] {
             std::fs::write(place.path().join(file), vec![b'0'; bytes]).unwrap();
         }

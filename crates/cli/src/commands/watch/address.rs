@@ -7,6 +7,7 @@ use percent_encoding::percent_decode_str;
 /// `mqtt://[user[:password]@]host[:port]/topic`, or `mqtts://…` by TLS.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub(crate) struct Address {
+    /// By TLS.
     pub(super) secure: bool,
     pub(super) host: String,
     pub(super) port: u16,
