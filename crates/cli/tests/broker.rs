@@ -27,8 +27,9 @@ fn bench() -> Bench {
 /// So many seconds of samples, an object each.
 fn messages(seconds: f64) -> Vec<String> {
     let samples = throttle::samples(seconds);
-    let message =
-        |[t, torque, angle]: &_| format!(r#"{{"t": {t}, "torque": {torque:.5}, "angle": {angle:.6}}}"#);
+    let message = |[t, torque, angle]: &[f64; 3]| {
+        format!(r#"{{"t": {t}, "torque": {torque:.5}, "angle": {angle:.6}}}"#)
+    };
     samples.iter().map(message).collect()
 }
 

@@ -173,6 +173,7 @@ mod tests {
     use super::*;
 
     /// A program in the place of greybox.
+    #[allow(clippy::unwrap_used, reason = "a test")]
     fn stand_in(binary: &Path, line: &str) {
         use std::os::unix::fs::PermissionsExt;
         std::fs::write(binary, format!("#!/bin/sh\n{line}\nexit 2\n")).unwrap();
