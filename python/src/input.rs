@@ -181,6 +181,16 @@ impl Sources {
     /// As [`loading::recordings`], and two recordings of one name.
     pub(crate) fn read(self) -> Result<Recordings, Failure> {
         let count = self.train.len();
+        let mut train = self.each()?.into_iter().collect::<Result<Vec<_>, _>>()?;
+        let holdout = train.split_off(count);
+        Ok(Recordings { train, holdout })
+    }
+
+    /// Reads the files, each of which may fail on its own; recordings to learn from, then those held out.
+    ///
+    /// # Errors
+    /// Bad input: a file named twice, or two recordings of one name.
+    pub(crate) fn each(self) -> Result<Vec<Result<greybox_recording::Recording, Failure>>, Failure> {
         let all: Vec<Place> = self.train.into_iter().chain(self.holdout).collect();
         let paths: Vec<PathBuf> = all
             .iter()
@@ -189,25 +199,25 @@ impl Sources {
                 Place::Memory(_) => None,
             })
             .collect();
-        let mut read = loading::recordings(&paths, &self.wanted)?.into_iter();
-        let mut train = Vec::with_capacity(all.len());
+        let mut files = loading::each_recording(&paths, &self.wanted)?.into_iter();
+        let mut names = HashSet::new();
+        let mut read = Vec::with_capacity(all.len());
         for place in all {
-            train.push(match place {
-                Place::Memory(mut recording) => {
-                    self.wanted.apply(&mut recording)?;
-                    recording
-                }
-                Place::File(_) => only(read.by_ref().take(1).collect())?,
-            });
-        }
-        for (k, recording) in train.iter().enumerate() {
-            if train[..k].iter().any(|other| other.name == recording.name) {
+            let one = match place {
+                Place::Memory(mut recording) => self.wanted.apply(&mut recording).map(|()| recording),
+                Place::File(_) => files.next().unwrap_or_else(|| {
+                    Err(Failure::internal("a recording was named, but not read"))
+                }),
+            };
+            if let Ok(recording) = &one
+                && !names.insert(recording.name.clone())
+            {
                 return Err(Failure::input(format!("two recordings are called {}", recording.name))
                     .help("give each a name of its own: `greybox.Recording(data, name=…)`"));
             }
+            read.push(one);
         }
-        let holdout = train.split_off(count);
-        Ok(Recordings { train, holdout })
+        Ok(read)
     }
 }
 

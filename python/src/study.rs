@@ -257,8 +257,7 @@ pub(crate) fn check(
             Some(model) => sources.of_model(model),
             None => sources,
         };
-        let Recordings { train, .. } = sources.without_folders()?.read()?;
-        let checked = checks::check(&train, model, &inputs)?;
+        let checked = checks::check(sources.without_folders()?.each()?, model, &inputs)?;
         Ok((checks::to_json(model, &checked).to_string(), checks::story(&checked)))
     })
 }

@@ -24,11 +24,13 @@ pub(crate) struct Answer {
     json: Option<serde_json::Value>,
     /// Conditions that were to make it fail, and hold.
     met: Vec<String>,
+    /// What it could not do of what was asked.
+    failures: Vec<Failure>,
 }
 
 impl Answer {
     pub(crate) fn new(text: String, json: serde_json::Value) -> Answer {
-        Answer { text, json: Some(json), met: Vec::new() }
+        Answer { text, json: Some(json), met: Vec::new(), failures: Vec::new() }
     }
 
     /// The same, of a command that fails for these reasons; none is success.
@@ -36,9 +38,14 @@ impl Answer {
         Answer { met, ..self }
     }
 
+    /// The same without what failed on its own, while the rest was done.
+    pub(crate) fn without(self, failures: Vec<Failure>) -> Answer {
+        Answer { failures, ..self }
+    }
+
     /// Help or version: the same words in either format.
     pub(crate) fn words(text: String) -> Answer {
-        Answer { text, json: None, met: Vec::new() }
+        Answer { text, json: None, met: Vec::new(), failures: Vec::new() }
     }
 
     /// Adds words, which JSON does not have.
@@ -59,10 +66,13 @@ impl Answer {
             Failure::input(format!("standard output cannot be written: {e}"))
                 .help("see that the disk has room; what `--out` names is written")
         })?;
-        let said: String = self.met.iter().map(|what| format!("failed: {what}\n")).collect();
+        let met = self.met.iter().map(|what| format!("failed: {what}\n"));
+        let said: String = self.failures.iter().map(Failure::to_string).chain(met).collect();
         // With standard error closed there is nobody left to tell.
         let _ = std::io::stderr().lock().write_all(said.as_bytes());
-        Ok(if self.met.is_empty() { ExitCode::SUCCESS } else { ExitCode::from(FAILED) })
+        let failed = self.failures.iter().map(Failure::code).min();
+        let met = (!self.met.is_empty()).then_some(FAILED);
+        Ok(failed.or(met).map_or(ExitCode::SUCCESS, ExitCode::from))
     }
 }
 

@@ -9,7 +9,7 @@ use std::time::Instant;
 
 use cpu_time::ProcessTime;
 
-/// Whether stages are told, set once before a command runs.
+/// Whether stages are reported, set once before a command runs.
 static WANTED: AtomicBool = AtomicBool::new(false);
 
 /// Asks for the log.

@@ -280,6 +280,45 @@ fn check_takes_folders_and_finds_clocks_that_disagree() {
         .refuses(&["check", "runs", "runs/one_clock.csv"], &["one_clock.csv: this recording is named twice"]);
 }
 
+#[test]
+fn check_lists_what_is_in_a_folder_of_logs_and_passes_over_a_damaged_one() {
+    let bench = bench();
+    fs::create_dir_all(bench.path("logs/bag")).unwrap();
+    let run = recording(600, 0.0);
+    let in_steps = rewritten("t,f [N],x [mm]", |k, t, _, x| format!("{t},{},{x}", k / 40 % 3));
+    let holed: Vec<&str> =
+        in_steps.lines().enumerate().filter(|(k, _)| !(200..230).contains(k)).map(|l| l.1).collect();
+    bench.write("logs/b.csv", &holed.join("\n"));
+    bench.write("logs/bag/a.csv", &in_steps);
+    bench.write("logs/cut.csv", "t,f [N],x [mm]\n0,1,nothing\n");
+    let outcome = bench.greybox(&["check", "logs"]);
+    assert_eq!(outcome.code, 2, "{}", outcome.stdout);
+    for part in [
+        "b.csv: ",
+        "a.csv: ",
+        "1 recording could not be checked\n",
+        "Channels of each:",
+        "f  [N]         95.0 to 100 Hz, 570 to 600 samples, 0 to 1 gaps; in steps: an input?\n",
+        "x  [mm]        95.0 to 100 Hz, 570 to 600 samples, 0 to 1 gaps; smooth: a state?\n",
+    ] {
+        assert!(outcome.stdout.contains(part), "`{part}` is not in: {}", outcome.stdout);
+    }
+    assert!(outcome.stderr.contains("cut.csv") && outcome.stderr.contains("nothing"), "{}", outcome.stderr);
+    let json: Value = serde_json::from_str(&bench.greybox(&["check", "logs", "--json"]).stdout).unwrap();
+    assert_eq!(json["recordings"].as_array().unwrap().len(), 2);
+    assert_eq!(json["failures"][0]["kind"], "bad_input");
+    assert!(json["failures"][0]["file"].as_str().unwrap().ends_with("cut.csv"), "{json:#}");
+    let holed = &json["recordings"][0]["channels"][1];
+    assert_eq!((holed["gaps"].as_u64(), holed["samples"].as_u64()), (Some(1), Some(570)), "{holed}");
+
+    // With the model, what feeds it is told, and a recording that does not is a failure of its own.
+    bench.write("logs/cut.csv", &run.replacen("x [mm]", "y [mm]", 1));
+    let outcome = bench.greybox(&["check", "logs", "--model", "model.toml"]);
+    assert_eq!(outcome.code, 2, "{}", outcome.stdout);
+    assert!(outcome.stdout.contains("measurement of x (mm → m)"), "{}", outcome.stdout);
+    assert!(outcome.stderr.contains("cut.csv") && outcome.stderr.contains("`x`"), "{}", outcome.stderr);
+}
+
 /// The cells of a recording of the spring written anew: row, time, f and x of a line.
 fn rewritten(header: &str, row: impl Fn(usize, &str, &str, &str) -> String) -> String {
     let mut text = format!("{header}\n");

@@ -260,6 +260,34 @@ fn a_kill_in_the_silence_loses_nothing() {
     assert!(bench.names().iter().all(|name| !name.ends_with(".tmp")), "{:?}", bench.names());
 }
 
+/// Killed while samples come, it has saved within the last second (and one more, for a busy machine), and goes on from there.
+#[test]
+fn a_kill_amid_samples_loses_a_second() {
+    let bench = bench();
+    let samples = throttle::samples(40.0);
+    let mut watching = Watching::start(&bench, &["--learn", "15", "--state", "state.json"]);
+    let mut input = watching.input.take().unwrap();
+    input.write_all(throttle::csv(&samples[..2000]).as_bytes()).unwrap();
+    // At the machine's own pace.
+    let mut sent = 2000;
+    for piece in samples[2000..2400].chunks(10) {
+        let text = throttle::csv(piece);
+        input.write_all(text.split_once('\n').unwrap().1.as_bytes()).unwrap();
+        input.flush().unwrap();
+        sent += piece.len();
+        sleep(Duration::from_millis(100));
+    }
+    watching.process.0.kill().unwrap();
+    watching.process.0.wait().unwrap();
+    let age = std::fs::metadata(bench.path("state.json")).unwrap().modified().unwrap().elapsed().unwrap();
+    assert!(age < Duration::from_secs(2), "{age:?}");
+    let rest = ["watch", "throttle.toml", "--json", "--state", "state.json"];
+    let said = bench.greybox_fed(&rest, &throttle::csv(&samples[sent..]));
+    assert_eq!(said.code, 0, "{}", said.stderr);
+    let events = events(&said.stdout);
+    assert!(of(&events, "learned").is_empty() && !of(&events, "estimates").is_empty(), "{events:?}");
+}
+
 /// Told to end, it saves first, and ends by the signal.
 #[cfg(unix)]
 #[test]

@@ -33,7 +33,7 @@ pub struct Results {
 }
 
 impl Results {
-    /// What is told of a finished calibration on these recordings.
+    /// What is reported of a finished calibration on these recordings.
     ///
     /// # Errors
     /// An internal failure where the report cannot be written.

@@ -7,7 +7,7 @@ use serde_json::{Value, json};
 
 /// Most significant digits of a number that may be a value of a recording.
 const DIGITS: usize = 3;
-/// Significant digits by which values are told from each other.
+/// Significant digits by which values are distinguished.
 const DISTINCT_DIGITS: usize = 12;
 
 /// What is known of a recording without its values: sizes, sampling, ranges to two digits, health.
@@ -60,7 +60,7 @@ fn range(values: &[f64]) -> Option<[f64; 2]> {
 pub struct Values(HashSet<u64>);
 
 impl Values {
-    /// Those of these recordings. Times are none: the step of the sampling may be told.
+    /// Those of these recordings. Times are none: the step of the sampling may be stated.
     pub fn of<'a>(recordings: impl IntoIterator<Item = &'a Recording>) -> Values {
         let values = recordings.into_iter().flat_map(|r| r.channels.iter().flat_map(|c| &c.values));
         Values(values.filter(|v| v.is_finite() && **v != 0.0).map(|v| digits(*v)).collect())

@@ -15,6 +15,15 @@ use serde_json::json;
 use crate::failure::Failure;
 use crate::plausible;
 
+/// What is said of recordings.
+#[derive(Debug)]
+pub struct Checked {
+    /// Those that could be checked.
+    pub recordings: Vec<Health>,
+    /// Why the others could not.
+    pub failures: Vec<Failure>,
+}
+
 /// What is said of one recording.
 #[derive(Debug, Serialize)]
 pub struct Health {
@@ -44,66 +53,71 @@ struct ChannelUse {
     character: Option<Character>,
 }
 
-/// Checks recordings, with the roles that a model gives their channels, or with `inputs` as what drives them.
+/// Checks recordings, with the roles that a model gives their channels, or with `inputs` as what drives them. One that cannot
+/// be read or does not fit the model stops no other.
 ///
 /// # Errors
-/// Bad input: a recording that lacks what the model needs, or an input that is no channel.
+/// Bad input: none of the recordings could be checked; the first of their errors.
 pub fn check(
-    recordings: &[Recording],
+    recordings: Vec<Result<Recording, Failure>>,
     model: Option<&Model>,
     inputs: &[String],
-) -> Result<Vec<Health>, Failure> {
-    if let Some(model) = model {
-        Data::new(model, recordings)?;
-    }
+) -> Result<Checked, Failure> {
+    let mut checked = Checked { recordings: Vec::new(), failures: Vec::new() };
     for recording in recordings {
-        known(recording, inputs)?;
+        match recording.and_then(|recording| health_of(&recording, model, inputs)) {
+            Ok(health) => checked.recordings.push(health),
+            Err(failure) => checked.failures.push(failure),
+        }
     }
-    let checked = recordings
-        .iter()
-        .map(|recording| match model {
-            Some(model) => {
-                let has = |name: &str| recording.channel(name).is_some();
-                let feeds = |name: &str, unit: Option<&str>| feeds(model, name, unit, &has);
-                let (inputs, outputs) = roles(model, recording);
-                let mut findings = findings(recording, &inputs, &outputs);
-                findings.extend(plausible::findings(model, recording));
-                describe(recording, findings, feeds)
-            }
-            None => {
-                let findings = check_with_inputs(recording, inputs);
-                describe(recording, findings, |name, _| {
-                    inputs.iter().any(|i| i == name).then(|| "input".to_owned())
-                })
-            }
-        })
-        .collect();
-    Ok(checked)
+    match checked.failures.len() {
+        0 => Ok(checked),
+        _ if checked.recordings.is_empty() => Err(checked.failures.swap_remove(0)),
+        _ => Ok(checked),
+    }
+}
+
+fn health_of(recording: &Recording, model: Option<&Model>, inputs: &[String]) -> Result<Health, Failure> {
+    known(recording, inputs)?;
+    let Some(model) = model else {
+        let findings = check_with_inputs(recording, inputs);
+        let feeds = |name: &str, _: Option<&str>| inputs.iter().any(|i| i == name).then(|| "input".to_owned());
+        return Ok(describe(recording, findings, feeds));
+    };
+    Data::new(model, std::slice::from_ref(recording))?;
+    let has = |name: &str| recording.channel(name).is_some();
+    let (inputs, outputs) = roles(model, recording);
+    let mut findings = findings(recording, &inputs, &outputs);
+    findings.extend(plausible::findings(model, recording));
+    Ok(describe(recording, findings, |name, unit| feeds(model, name, unit, &has)))
 }
 
 /// What was found, in plain language: a verdict for each recording, its channels, then the findings, those that matter most
 /// first. What the recordings have in common is said once.
-pub fn story(checked: &[Health]) -> String {
-    let tables: Vec<String> = checked.iter().map(table).collect();
-    let alike = checked.len() > 1 && tables.windows(2).all(|pair| pair[0] == pair[1]);
+pub fn story(checked: &Checked) -> String {
+    let Checked { recordings, failures } = checked;
     let mut text = String::new();
-    for (health, table) in checked.iter().zip(&tables) {
+    let alike = recordings.len() > 1 && recordings.iter().all(|health| health.is_laid_out_as(&recordings[0]));
+    for health in recordings {
         let _ = writeln!(text, "{}: {}", health.file, verdict(&health.findings));
         if !alike {
-            text.push_str(table);
+            text.push_str(&table(std::slice::from_ref(health)));
         }
     }
-    if let Some(table) = tables.first().filter(|_| alike) {
-        let _ = write!(text, "\nChannels of each:\n{table}");
+    if !failures.is_empty() {
+        let _ = writeln!(text, "{} could not be checked", plural(failures.len(), "recording"));
     }
-    let found: Vec<contract::Finding> = checked.iter().flat_map(Health::findings).collect();
+    if alike {
+        let _ = write!(text, "\nChannels of each:\n{}", table(recordings));
+    }
+    let found: Vec<contract::Finding> = recordings.iter().flat_map(Health::findings).collect();
     let mut notes = grouped(&found);
     notes.sort_by_key(|note| std::cmp::Reverse(note.severity));
-    if checked.len() > 1 {
+    if recordings.len() > 1 {
         text.push_str("\nFindings:\n");
     }
     for mut note in notes {
-        if let [alone] = checked {
+        if let [alone] = &recordings[..] {
             // It stands above.
             let place = note.place.strip_prefix(&alone.file).unwrap_or(&note.place);
             note.place = place.trim_start_matches(", ").to_owned();
@@ -114,8 +128,10 @@ pub fn story(checked: &[Health]) -> String {
 }
 
 /// What was found, for machines.
-pub fn to_json(model: Option<&Model>, checked: &[Health]) -> serde_json::Value {
-    json!({ "model": model.map(|m| &m.name), "recordings": checked })
+pub fn to_json(model: Option<&Model>, checked: &Checked) -> serde_json::Value {
+    let failures: Vec<serde_json::Value> =
+        checked.failures.iter().map(|failure| failure.to_json()["error"].take()).collect();
+    json!({ "model": model.map(|m| &m.name), "recordings": checked.recordings, "failures": failures })
 }
 
 /// Sees that the recording has every channel named after `--inputs`.
@@ -219,25 +235,52 @@ impl ChannelUse {
         }
     }
 
-    /// Rate, samples, gaps and what it may be, in words.
-    fn in_a_log(&self) -> String {
-        let rate = self.rate_hz.map_or(String::new(), |rate| format!("{} Hz, ", format::number(rate)));
-        let gaps = if self.gaps > 0 { format!(", {}", plural(self.gaps, "gap")) } else { String::new() };
-        let moves = match self.character {
-            Some(Character::Constant) => "; constant",
-            Some(Character::Steps) => "; in steps: an input?",
-            Some(Character::Broadband) => "; broadband: an input?",
-            Some(Character::Smooth) => "; smooth: a state?",
-            None => "",
-        };
-        format!("{rate}{}{gaps}{moves}", plural(self.samples, "sample"))
+    /// What it may be, in words.
+    fn moves(&self) -> Option<&'static str> {
+        Some(match self.character? {
+            Character::Constant => "constant",
+            Character::Steps => "in steps: an input?",
+            Character::Broadband => "broadband: an input?",
+            Character::Smooth => "smooth: a state?",
+        })
     }
 }
 
+/// Rates, samples, gaps of a channel in every recording, and what it may be, in words.
+fn in_a_log(channels: &[&ChannelUse]) -> String {
+    let rates: Vec<f64> = channels.iter().filter_map(|c| c.rate_hz).collect();
+    let rate = range(&rates, format::number).map_or(String::new(), |rate| format!("{rate} Hz, "));
+    let counted = |count: fn(&ChannelUse) -> usize, word: &str| {
+        let counts: Vec<f64> = channels.iter().map(|c| count(c) as f64).collect();
+        let plural = if counts.iter().all(|n| *n == 1.0) { "" } else { "s" };
+        range(&counts, |n| n.to_string()).map_or(String::new(), |range| format!("{range} {word}{plural}"))
+    };
+    let samples = counted(|c| c.samples, "sample");
+    let gaps = match channels.iter().any(|c| c.gaps > 0) {
+        true => format!(", {}", counted(|c| c.gaps, "gap")),
+        false => String::new(),
+    };
+    let mut moves: Vec<&str> = channels.iter().filter_map(|c| c.moves()).collect();
+    moves.sort_unstable();
+    moves.dedup();
+    let moves = if moves.is_empty() { String::new() } else { format!("; {}", moves.join(", or ")) };
+    format!("{rate}{samples}{gaps}{moves}")
+}
+
+/// The least and the largest of values, in words: one value where both read the same.
+fn range(values: &[f64], written: impl Fn(f64) -> String) -> Option<String> {
+    let least = values.iter().copied().reduce(f64::min)?;
+    let (least, largest) = (written(least), written(values.iter().copied().fold(least, f64::max)));
+    Some(if least == largest { least } else { format!("{least} to {largest}") })
+}
+
 impl Health {
-    /// Whether its channels come from clocks of their own.
-    fn is_a_log(&self) -> bool {
-        self.findings.iter().any(|finding| finding.code == "clocks")
+    /// Whether another recording has the same channels, which feed the same.
+    fn is_laid_out_as(&self, other: &Health) -> bool {
+        let layout = |health: &Health| -> Vec<(String, Option<String>, Option<String>)> {
+            health.channels.iter().map(|c| (c.name.clone(), c.unit.clone(), c.feeds.clone())).collect()
+        };
+        layout(self) == layout(other)
     }
 
     /// The findings as those of a study of several recordings.
@@ -257,16 +300,16 @@ fn verdict(findings: &[Finding]) -> String {
     }
 }
 
-/// The channels of a recording.
-fn table(health: &Health) -> String {
+/// The channels of recordings that have the same ones.
+fn table(recordings: &[Health]) -> String {
     let mut text = String::new();
-    let width = health.channels.iter().map(|c| c.name.chars().count()).max().unwrap_or(0);
-    for channel in &health.channels {
+    let Some(first) = recordings.first() else { return text };
+    let width = first.channels.iter().map(|c| c.name.chars().count()).max().unwrap_or(0);
+    for (k, channel) in first.channels.iter().enumerate() {
         let unit = channel.unit.as_deref().map_or(String::new(), |u| format!("[{}]", format::unit(u)));
         let feeds = match &channel.feeds {
             Some(feeds) => feeds.clone(),
-            None if health.is_a_log() => channel.in_a_log(),
-            None => String::new(),
+            None => in_a_log(&recordings.iter().map(|health| &health.channels[k]).collect::<Vec<_>>()),
         };
         let line = format!("  {:width$}  {unit:10}  {feeds}", channel.name);
         let _ = writeln!(text, "{}", line.trim_end());

@@ -31,7 +31,7 @@ pub struct Results {
 }
 
 impl Results {
-    /// What is told of a finished diagnosis of these recordings.
+    /// What is reported of a finished diagnosis of these recordings.
     ///
     /// # Errors
     /// An internal failure where the report cannot be written.

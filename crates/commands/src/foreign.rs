@@ -99,7 +99,7 @@ pub(crate) fn of(path: &Path) -> Option<&'static Kind> {
         return None;
     }
     let mut head = Vec::new();
-    // What cannot be read is told by who reads it.
+    // What cannot be read is reported by who reads it.
     File::open(path).and_then(|file| file.take(HEAD).read_to_end(&mut head)).ok()?;
     kind(path.extension().and_then(|e| e.to_str()).unwrap_or_default(), &head)
 }

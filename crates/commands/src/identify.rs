@@ -29,7 +29,7 @@ pub struct Results {
 }
 
 impl Results {
-    /// What is told of a finished identification.
+    /// What is reported of a finished identification.
     ///
     /// # Errors
     /// An internal failure where the report cannot be written.

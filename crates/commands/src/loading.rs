@@ -148,7 +148,10 @@ pub fn mechanisms_of(texts: &[(String, String)], folder: &Path) -> Result<Librar
 /// # Errors
 /// Bad input: as [`files_of`], or no recording in it.
 pub fn recordings_of(folder: &Path) -> Result<Vec<PathBuf>, Failure> {
-    let recordings = files_of(folder, &EXTENSIONS)?;
+    some_recordings(folder, files_of(folder, &EXTENSIONS)?)
+}
+
+fn some_recordings(folder: &Path, recordings: Vec<PathBuf>) -> Result<Vec<PathBuf>, Failure> {
     if recordings.is_empty() {
         let endings = EXTENSIONS.map(|e| format!("`*.{e}`")).join(", ");
         return Err(Failure::file(folder, format!("this folder holds no recording ({endings})"))
@@ -157,7 +160,7 @@ pub fn recordings_of(folder: &Path) -> Result<Vec<PathBuf>, Failure> {
     Ok(recordings)
 }
 
-/// These paths, with the recordings of a folder in its place.
+/// These paths, with the recordings of a folder and of the folders in it in its place: a ROS 2 bag is a folder.
 ///
 /// # Errors
 /// As [`recordings_of`].
@@ -165,11 +168,32 @@ pub fn without_folders(paths: &[PathBuf]) -> Result<Vec<PathBuf>, Failure> {
     let mut files = Vec::with_capacity(paths.len());
     for path in paths {
         match path.is_dir() {
-            true => files.extend(recordings_of(path)?),
+            true => {
+                let mut found = Vec::new();
+                for folder in folders_of(path) {
+                    found.extend(files_of(&folder, &EXTENSIONS)?);
+                }
+                files.extend(some_recordings(path, found)?);
+            }
             false => files.push(path.clone()),
         }
     }
     Ok(files)
+}
+
+/// A folder and all folders in it, in the order of their names; a link to a folder is not followed.
+fn folders_of(folder: &Path) -> Vec<PathBuf> {
+    let mut folders = vec![folder.to_path_buf()];
+    let mut inner: Vec<PathBuf> = fs::read_dir(folder)
+        .into_iter()
+        .flatten()
+        .flatten()
+        .filter(|entry| entry.file_type().is_ok_and(|kind| kind.is_dir()))
+        .map(|entry| entry.path())
+        .collect();
+    inner.sort();
+    folders.extend(inner.iter().flat_map(|folder| folders_of(folder)));
+    folders
 }
 
 /// The files of a folder with one of these extensions, in the order of their names.
@@ -258,16 +282,26 @@ impl Wanted {
 /// Bad input: a file that is missing, a model or a folder in its place, one named twice, any fault in it, or a channel
 /// that is wanted and that it does not have.
 pub fn recordings(paths: &[PathBuf], wanted: &Wanted) -> Result<Vec<Recording>, Failure> {
+    each_recording(paths, wanted)?.into_iter().collect()
+}
+
+/// Reads recordings, each of which may fail on its own.
+///
+/// # Errors
+/// Bad input: a file named twice.
+pub fn each_recording(
+    paths: &[PathBuf],
+    wanted: &Wanted,
+) -> Result<Vec<Result<Recording, Failure>>, Failure> {
     no_twins(paths)?;
-    let mut read = Vec::with_capacity(paths.len());
-    for path in paths {
+    let read = |path: &PathBuf| {
         let mut recording =
             read_selected(path, &wanted.selection).map_err(|error| unreadable(path, error))?;
         recording.name = called(path, paths);
         wanted.apply(&mut recording)?;
-        read.push(recording);
-    }
-    Ok(read)
+        Ok(recording)
+    };
+    Ok(paths.iter().map(read).collect())
 }
 
 /// The bytes of the recording at `path`.

@@ -18,7 +18,7 @@ use crate::loading::LoadedModel;
 pub struct Simulated {
     /// Per measured channel its header and its values at the recording's rows; NaN = not simulated.
     pub columns: Vec<(String, Vec<f64>)>,
-    /// What is to be told of it.
+    /// What is to be reported of it.
     pub story: String,
     /// The same for machines.
     pub json: serde_json::Value,

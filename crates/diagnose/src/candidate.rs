@@ -411,22 +411,25 @@ mod tests {
         assert!(is_offered("asymmetric_damping") && is_offered("asymmetric_stiffness"));
     }
 
-    /// The force of a spring is a load as that of an input is, and only the latter drives.
+    /// The force of a spring is a load as that of an input is, and only the latter drives, a torque that falls with the speed
+    /// as well.
     #[test]
     fn what_acts_on_a_drive_is_offered_where_an_input_is() {
         let offered = |right: &str| {
             let text = format!(
                 "[inputs]\nf = {{ unit = \"N\" }}\n[states]\nx = {{ unit = \"m\" }}\n[parameters]\n\
                  m = {{ value = 1.0, unit = \"kg\" }}\nk = {{ value = 9.0, unit = \"N/m\" }}\n\
+                 c = {{ value = 1.0, unit = \"N s/m\" }}\n\
                  [equations]\nmass = \"m*x'' + k*x = {right}\"\n"
             );
             let model = Model::from_toml(&text, "mass.toml").unwrap();
             let library = crate::built_in().unwrap();
             let all = candidates(&model, &library, &places(&model));
-            ["load_dependent_friction", "load_dependent_damping"]
+            ["load_dependent_friction", "load_dependent_damping", "position_dependent_drive"]
                 .map(|kind| all.iter().filter(|c| library[c.mechanism].kind == kind).count())
         };
-        assert_eq!(offered("f"), [2, 1]);
-        assert_eq!(offered("0"), [1, 0]);
+        assert_eq!(offered("f"), [2, 1, 1]);
+        assert_eq!(offered("2*(f - c*x')"), [2, 1, 1]);
+        assert_eq!(offered("-c*x'"), [1, 0, 0]);
     }
 }

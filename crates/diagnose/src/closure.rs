@@ -703,7 +703,7 @@ second = "n*y'' + c*y' + l*(y - x) = 0"
         }
     }
 
-    /// x², told as |x| and a constant, is told as it is; what is right stays.
+    /// x², found as |x| and a constant, is reported as x²; what is right stays.
     #[test]
     fn terms_that_do_the_same_work_for_less_take_the_place_of_more() {
         let library = crate::built_in().unwrap();

@@ -28,7 +28,7 @@ pub(crate) fn rss_alone(
     }
 }
 
-/// What is left of the residual with each part `alone` and `without` each, for parts that are told in the order of their
+/// What is left of the residual with each part `alone` and `without` each, for parts that are reported in the order of their
 /// shares; nothing where there are no two.
 pub(crate) fn subsets_of(shares: &[f64], [alone, without]: [Vec<f64>; 2], all: f64) -> Vec<Subset> {
     let n = shares.len();

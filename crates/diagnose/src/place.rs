@@ -312,7 +312,8 @@ pub fn places(model: &Model) -> Vec<Place> {
 }
 
 /// What the joint of coordinate `own` may transmit: the drive terms of its equation together, and its
-/// position terms together. Constant factors of one common sign stay; highest derivatives never appear.
+/// position terms together. Constant factors of one common sign stay; highest derivatives never appear. A drive that weakens
+/// with the speed is one, written as a product: the torque k·(v − k·ω)/R of a motor behind its winding.
 fn loads(model: &Model, equation: usize, own: usize) -> Vec<Expr> {
     let residual = model.equations[equation].residual();
     let (mut drive, mut position): (Option<Expr>, Option<Expr>) = (None, None);
@@ -330,7 +331,7 @@ fn loads(model: &Model, equation: usize, own: usize) -> Vec<Expr> {
             }
             input |= model.input(&name).is_some();
         }
-        if highest || rate {
+        if highest || (rate && !input) {
             continue;
         }
         let sum = if input {

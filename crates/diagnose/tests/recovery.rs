@@ -30,6 +30,8 @@ struct Left {
     hum: (f64, f64),
     /// Speed at which the drive has no force left, m/s.
     fading: Option<f64>,
+    /// Relative change of the drive, 1/m².
+    uneven: f64,
 }
 
 impl Left {
@@ -66,7 +68,7 @@ fn record(seed: u64, left: Left, noise: f64) -> Recording {
             let w = i as f64 / fine as f64;
             let f = samples[k] + w * (samples[(k + 1).min(n - 1)] - samples[k]);
             let t = k as f64 * dt + i as f64 * h;
-            let drive = f - left.fading.map_or(0.0, |free| f.abs() * v / free);
+            let drive = f * (1.0 + left.uneven * x * x) - left.fading.map_or(0.0, |free| f.abs() * v / free);
             let smooth = drive - 0.6 * v - (42.0 - left.soft) * x - left.force(x, t);
             // Dry friction removes at most the momentum there is (semi-implicit, sticks exactly).
             let free = v + h * smooth;
@@ -116,6 +118,7 @@ fn one_effect_left_out_is_named_and_sized() {
         ("cubic_stiffness", "k3", 300.0, Left { cubic: 300.0, ..Left::default() }),
         ("constant_offset", "f0", 0.5, Left { offset: 0.5, ..Left::default() }),
         ("load_dependent_damping", "cl", 0.2, Left { fading: Some(5.0), ..Left::default() }),
+        ("position_dependent_drive", "g2", -2.0, Left { uneven: -2.0, ..Left::default() }),
     ];
     for (kind, parameter, truth, left) in cases {
         let mut exact = 0;

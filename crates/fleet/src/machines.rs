@@ -170,16 +170,16 @@ pub fn analyse(estimates: &[Estimate]) -> Option<Machines> {
     let machine_freedom = freedom(remaining, at_machines)?;
     let within = columns.len() + 1 - at_machines;
     let recording_freedom = freedom(used.len().saturating_sub(problem.machines()), within);
-    let interval = |told: Predicted, freedom: StudentsT| Interval {
-        value: scale * told.value,
-        half_width: scale * told.error * freedom.inverse_cdf(0.975),
+    let interval = |estimate: Predicted, freedom: StudentsT| Interval {
+        value: scale * estimate.value,
+        half_width: scale * estimate.error * freedom.inverse_cdf(0.975),
     };
     let coefficient = |k: usize| Predicted { value: fit.beta[k], error: fit.covariance[(k, k)].sqrt() };
     let slopes = columns.iter().enumerate().filter_map(|(k, column)| {
-        let told = coefficient(k + 1);
+        let estimate = coefficient(k + 1);
         let freedom = if column.level == Level::Between { machine_freedom } else { recording_freedom? };
-        let p_value = 2.0 * freedom.sf((told.value / told.error).abs());
-        let per_unit = Predicted { value: told.value / column.scale, error: told.error / column.scale };
+        let p_value = 2.0 * freedom.sf((estimate.value / estimate.error).abs());
+        let per_unit = Predicted { value: estimate.value / column.scale, error: estimate.error / column.scale };
         Some(Slope {
             covariate: column.covariate,
             level: column.level,
@@ -191,11 +191,11 @@ pub fn analyse(estimates: &[Estimate]) -> Option<Machines> {
     let mut machines: Vec<Machine> = (0..problem.machines())
         .map(|m| {
             let differs = different.iter().find(|(number, _)| *number == m).map(|(_, p)| *p);
-            let told = if differs.is_some() { problem.alone(m, &fit) } else { problem.shrunken(m, &fit) };
+            let estimate = if differs.is_some() { problem.alone(m, &fit) } else { problem.shrunken(m, &fit) };
             Machine {
                 machine: numbers[m],
                 recordings: problem.recordings(m),
-                value: interval(told, machine_freedom),
+                value: interval(estimate, machine_freedom),
                 differs,
             }
         })

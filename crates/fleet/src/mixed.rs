@@ -220,7 +220,7 @@ impl Problem {
             let block = self.block(group, variances);
             let solved = block.solve(&self.residual(group, &point.beta));
             let sum: f64 = solved.iter().sum();
-            let told = [vec![sum; solved.len()], solved.clone()];
+            let scores = [vec![sum; solved.len()], solved.clone()];
             squares[0] += sum * sum;
             squares[1] += solved.iter().map(|g| g * g).sum::<f64>();
             traces[0] += block.total / (1.0 + variances[0] * block.total);
@@ -234,12 +234,12 @@ impl Problem {
                 all += solved_row;
             }
             spread[0].ger(1.0, &all, &all, 1.0);
-            for (k, h) in told.iter().enumerate() {
+            for (k, h) in scores.iter().enumerate() {
                 let solved_h = block.solve(h);
                 for (s, row) in solved_h.iter().zip(block.rows) {
                     crossed[k].axpy(*s, row, 1.0);
                 }
-                for (l, other) in told.iter().enumerate() {
+                for (l, other) in scores.iter().enumerate() {
                     inner[k][l] += solved_h.iter().zip(other).map(|(a, b)| a * b).sum::<f64>();
                 }
             }

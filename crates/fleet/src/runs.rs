@@ -327,8 +327,8 @@ run3.csv,B-11,,,400
             ("recording,date\na,today\n", "r:2: `today` is not a date"),
             ("recording,x\na\n", "r: CSV error"),
         ] {
-            let told = Runs::parse(text, "r").unwrap_err().to_string();
-            assert!(told.starts_with(wanted), "{told}");
+            let error = Runs::parse(text, "r").unwrap_err().to_string();
+            assert!(error.starts_with(wanted), "{error}");
         }
     }
 }

@@ -333,7 +333,7 @@ pub(crate) fn structure(recordings: &[Recording], options: &Options) -> Result<S
     let right = if fixed { options.inputs.first() } else { None };
     let mut taken: Vec<String> = options.states.iter().chain(&options.inputs).cloned().collect();
     taken.extend(["t", "pi", "tau", "kp"].map(String::from));
-    // A unit that cannot be read is told where the recordings are laid out.
+    // A unit that cannot be read is reported where the recordings are laid out.
     let may_be_angle = |state: &String| {
         unit(state).and_then(|text| Unit::parse(&text).ok()).is_none_or(|unit| unit.dimension.is_none())
     };

@@ -49,11 +49,11 @@ pub fn check(recording: &Recording, inputs: &[&str], outputs: &[&str]) -> Vec<Fi
 fn check_channel(recording: &Recording, c: usize, role: Role, driven: bool) -> Vec<Finding> {
     let channel = &recording.channels[c];
     let present: Vec<f64> = channel.values.iter().copied().filter(|v| !v.is_nan()).collect();
-    // What is missing between the samples of a clock of its own is told there.
+    // What is missing between the samples of a clock of its own is reported there.
     let own_clock =
         |warning: &Finding| warning.code == "clocks" && warning.channel.as_ref() == Some(&channel.name);
-    let told = !present.is_empty() && recording.warnings.iter().any(own_clock);
-    let mut findings: Vec<Finding> = match told {
+    let reported = !present.is_empty() && recording.warnings.iter().any(own_clock);
+    let mut findings: Vec<Finding> = match reported {
         true => Vec::new(),
         false => missing(channel, &recording.time).into_iter().collect(),
     };
@@ -564,7 +564,7 @@ fn averaged_lag(a: &[f64], b: &[f64], lag: impl Fn(&[f64], &[f64]) -> Option<Lag
     })
 }
 
-/// Smallest offset that is told, in samples (or times what the lag may be wrong by): what one sample more or less is may
+/// Smallest offset that is reported, in samples (or times what the lag may be wrong by): what one sample more or less is may
 /// be the sampling alone.
 const LEAST_OFFSET: isize = 2;
 
@@ -591,7 +591,7 @@ const MOST_PAIRS: usize = 2000;
 /// Channels that were recorded later than others by a constant number of samples, as by another logger.
 ///
 /// Asked is every pair of outputs, and every output that runs ahead of an input; with no roles stated, every pair. Of two
-/// channels that move with one cause, what is left after whitening must meet at the same sample. It is told where the
+/// channels that move with one cause, what is left after whitening must meet at the same sample. It is reported where the
 /// longest piece shows a lag of two samples or more and three of four of its parts, asked one by one, show the same within
 /// a sample (some samples, where only averages of a few samples stand out of the noise): an offset is constant, and an accident is not. A sensor's own delay looks the same, and with no roles
 /// stated so does an input with a late answer: then it is no more than information.

@@ -4,7 +4,7 @@
 //! `timestamp`, in s (or `t [ms]`, `t [us]`) or a timestamp, which counts from the first row. Read are real numbers and
 //! truth values (0 and 1); a missing value (null) or NaN is a missing sample. Lists that are of one length in all rows, as
 //! data sets of robot learning have them (`observation.state`), are the channels `observation.state[0]`,
-//! `observation.state[1]`, …. What else there is (texts, lists of different lengths, decimals) is left out, and told in
+//! `observation.state[1]`, …. What else there is (texts, lists of different lengths, decimals) is left out, and reported in
 //! the warnings of the recording. Compression: Snappy, Zstandard, LZ4, gzip.
 
 use crate::error::{Place, RecordingError};

@@ -497,11 +497,13 @@ fn losses(fit: &Fit) -> impl Iterator<Item = String> + '_ {
             }
             _ => String::new(),
         };
-        Some(format!(
-            "The held-out error{of} {}{windows}: what was found describes the training recordings and does not carry \
-             over.",
-            change(from.nrmse, to.nrmse)
-        ))
+        let carries = match (from.nrmse_windowed, to.nrmse_windowed) {
+            (Some(a), Some(b)) if a > LOSS * b => {
+                "what was found carries over for that time, and not for a whole recording"
+            }
+            _ => "what was found describes the training recordings and does not carry over",
+        };
+        Some(format!("The held-out error{of} {}{windows}: {carries}.", change(from.nrmse, to.nrmse)))
     })
 }
 

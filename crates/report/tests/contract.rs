@@ -172,8 +172,18 @@ fn a_held_out_error_that_rises_is_told() {
         said[0].contains("rises from 32 % to 37 % (restarted every 2.00 s it falls from 25 % to 24 %)"),
         "{said:?}"
     );
-    report.fit.holdout.improved[worse].nrmse = 0.321;
+    // For the time of a window it does.
+    report.fit.holdout.improved[worse].nrmse_windowed = Some(0.05);
     assert_eq!(reported(&report), Vec::<String>::new());
+    let said = sentence::summary(&report);
+    assert!(
+        said.iter().any(|s| s.ends_with(
+            "it falls from 25 % to 5.0 %): what was found carries over for that time, and not for a whole recording."
+        )),
+        "{said:?}"
+    );
+    report.fit.holdout.improved[worse].nrmse = 0.321;
+    assert!(!sentence::summary(&report).iter().any(|s| s.contains("carries over")));
 }
 
 /// The noise is as large in a recording that moves half as much, and twice as large a part of it.

@@ -225,7 +225,7 @@ fn judge(set: &Set, report: Result<&Report, &String>, seconds: f64) -> Answer {
     let criterion = report.fit.criterion;
     let (calibrated, improved) =
         (worst(&report.fit.holdout.calibrated, criterion), worst(&report.fit.holdout.improved, criterion));
-    // What is reachable is told of free runs.
+    // What is reachable is stated for free runs.
     let gap = set.reachable_nrmse.and_then(|reachable| {
         let free = Criterion::FreeRun;
         gap(worst(&report.fit.holdout.calibrated, free), worst(&report.fit.holdout.improved, free), reachable)

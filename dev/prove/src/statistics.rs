@@ -272,7 +272,7 @@ impl Answer {
         Answer { reported, equals, confidence: first.map(|f| f.confidence), covered }
     }
 
-    /// The confidence told, and whether it is right: the name, or, where equals count, one of them.
+    /// The confidence stated, and whether it is right: the name, or, where equals count, one of them.
     fn judged(&self, equals_count: bool) -> Option<(f64, bool)> {
         let right = self.reported == Reported::Named || (equals_count && self.reported == Reported::Equal);
         self.confidence.map(|confidence| (confidence, right))
@@ -431,14 +431,14 @@ fn bin_figures(bins: &[Bin]) -> Vec<Figure> {
         let (low, high) = b.interval();
         let name = format!("confidence {:.2} to {:.2}", b.low, b.high);
         let measured = format!(
-            "{:.1} % of {} right ({:.0} to {:.0} %), told {:.1} %",
+            "{:.1} % of {} right ({:.0} to {:.0} %), stated {:.1} %",
             100.0 * b.rate(),
             b.answers,
             100.0 * low,
             100.0 * high,
             100.0 * b.reported
         );
-        Figure::judged(name, measured, "no less than told", b.is_honest())
+        Figure::judged(name, measured, "no less than stated", b.is_honest())
     };
     bins.iter().filter(|b| b.answers > 0).map(reported).collect()
 }
@@ -469,12 +469,12 @@ fn table(found: &Found) -> String {
             text += &format!("| {case} | {} | {} | {} | {met} |\n", f.name, f.measured, f.goal);
         }
     }
-    text + "\n![Answers that are right against the confidence told](statistics-reliability.svg)\n"
+    text + "\n![Answers that are right against the confidence stated](statistics-reliability.svg)\n"
 }
 
-/// Answers that are right against the confidence told, with their intervals, and the line where both agree.
+/// Answers that are right against the confidence stated, with their intervals, and the line where both agree.
 fn diagram(bins: &[Vec<Bin>; 2]) -> Result<String> {
-    let mut series = vec![Series::new("as told", Style::Dashed, vec![[0.0, 0.0], [100.0, 100.0]])];
+    let mut series = vec![Series::new("as stated", Style::Dashed, vec![[0.0, 0.0], [100.0, 100.0]])];
     for (name, bins) in ["measured", "measured, little recorded"].into_iter().zip(bins) {
         let reported = || bins.iter().filter(|b| b.answers > 0);
         let percent = |(low, high): (f64, f64)| (100.0 * low, 100.0 * high);
@@ -483,8 +483,8 @@ fn diagram(bins: &[Vec<Bin>; 2]) -> Result<String> {
         series.push(Series::new(name, Style::Points, points).with_errors(errors));
     }
     let plot = Plot {
-        alt: "Answers that are right against the confidence told".into(),
-        x: Axis::linear("confidence told in %"),
+        alt: "Answers that are right against the confidence stated".into(),
+        x: Axis::linear("confidence stated in %"),
         y: Axis::linear("right in %"),
         series,
     };

@@ -313,7 +313,7 @@ fn judged(case: &Case, events: &[Event], options: &Options) -> Trial {
                 }
             }
             Event::Changed(_) => trial.further.0 += 1,
-            // (The first change is told together with the second one.)
+            // (The first change is reported together with the second one.)
             Event::Settled(change)
                 if trial.settled.is_none() && trial.delay.is_some_and(|delay| change.t > at + delay) =>
             {

@@ -19,7 +19,8 @@ use crate::loading;
   greybox check log.mcap --channels \"/joint_states.position[elbow]\" --channels /cmd.data
   greybox check run1.csv --model link.toml --json
 
-A folder stands for all its recordings (*.csv, *.mat, *.h5, *.hdf5, *.npz, *.npy, *.mcap, *.parquet).")]
+A folder stands for all recordings in it and in its folders (*.csv, *.mat, *.h5, *.hdf5, *.npz, *.npy, *.mcap,
+*.parquet). A recording that cannot be read stops no other; the exit status is 2 then.")]
 pub(crate) struct Arguments {
     /// Recordings, or folders of them (CSV: first column `t` in seconds, header cells `name` or `name [unit]`;
     /// MAT-file; HDF5; NumPy; MCAP; Parquet)
@@ -47,7 +48,8 @@ pub(crate) fn run(arguments: &Arguments) -> Result<Answer, Failure> {
         Some(model) => wanted.of_model(model),
         None => wanted,
     };
-    let recordings = loading::recordings(&paths, &wanted)?;
-    let checked = check::check(&recordings, model, &arguments.inputs)?;
-    Ok(Answer::new(check::story(&checked), check::to_json(model, &checked)))
+    let recordings = loading::each_recording(&paths, &wanted)?;
+    let checked = check::check(recordings, model, &arguments.inputs)?;
+    let answer = Answer::new(check::story(&checked), check::to_json(model, &checked));
+    Ok(answer.without(checked.failures))
 }

@@ -222,7 +222,7 @@ fn work(arguments: &Arguments) -> Result<Answer, Failure> {
             loading::no_twins(paths.iter().chain(&arguments.study.holdout))?;
             let holdout = loading::recordings(&arguments.study.holdout, &wanted)?;
             let open = || loading::blocks(paths, rows as usize, &wanted);
-            // A file that is missing or empty is told before anything is written.
+            // A file that is missing or empty is reported before anything is written.
             drop(open()?);
             let out = arguments.study.folder(&FILES, [])?;
             let progress = Progress::open();

@@ -198,8 +198,8 @@ mod tests {
             ("m a=1", "no timestamp"),
             ("m a=\"1\" 0", "`a` is a text"),
         ] {
-            let told = row(line, &["a"]).unwrap_err();
-            assert!(told.contains(wanted), "{line}: {told}");
+            let error = row(line, &["a"]).unwrap_err();
+            assert!(error.contains(wanted), "{line}: {error}");
         }
     }
 

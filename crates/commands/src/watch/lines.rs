@@ -32,7 +32,7 @@ impl fmt::Display for Place<'_> {
     }
 }
 
-/// How lines are read: told by the first of them.
+/// How lines are read: chosen by the first of them.
 #[derive(Debug)]
 pub(super) struct Lines {
     format: Format,

@@ -42,7 +42,7 @@ pub(super) fn run(arguments: &Arguments, folder: &Path, own: Option<&Mechanisms>
     loading::no_twins(holdout)?;
     let held = holdout.iter().map(|path| file(path)).collect::<Result<_, _>>()?;
     let texts = own.map_or(&[][..], |own| &own.texts);
-    // A fault in what judges all recordings is told once.
+    // A fault in what judges all recordings is reported once.
     let channels = Channels { map: read.names.map.clone(), only: read.only.clone() };
     let fleet = Fleet::new(loaded, held, channels, arguments.options(own), texts)?;
     let recordings = recordings(folder, holdout, arguments.runs.as_deref())?;
