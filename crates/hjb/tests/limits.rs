@@ -209,6 +209,41 @@ fn a_mass_pushed_cheaply_brakes_in_time() {
 }
 
 #[test]
+fn an_upright_pendulum_is_caught_from_no_farther() {
+    let (plant, q, r, limit) = (pendulum(), DMatrix::identity(2, 2), dmatrix![1.0], 0.5);
+    let domain = Domain::symmetric(&[0.4, 0.4]).unwrap();
+    let range = InputRange::new(-limit, limit).unwrap();
+    let regulator = design(&plant, &q, &r, &domain, 2, false).unwrap().feedback;
+    // Of 15 × 15 starts up to three quarters of a radian and of a radian per second; the clipped regulator is a law
+    // with a plant that clips.
+    let clips = |x: &[f64], f: &mut [f64]| {
+        let u = regulator.control(x, &[0.0, 1.0])[0].clamp(-limit, limit);
+        f.copy_from_slice(&[x[1], x[0].sin() - 0.1 * x[1] + u]);
+    };
+    let clipped =
+        Affine { states: 2, inputs: 1, drift: clips, input: |_: &[f64], g: &mut [f64]| g.fill(0.0) };
+    let starts = Domain::symmetric(&[0.75, 0.75]).unwrap().grid(&[15, 15]).unwrap();
+    let caught = |plant: &dyn Fn([f64; 2], &mut f64) -> [f64; 2]| {
+        let comes_back = |x: &&Vec<f64>| {
+            // A pendulum that fell and was swung up again is not caught.
+            let mut farthest = 0.0;
+            let end = plant([x[0], x[1]], &mut farthest);
+            farthest < 1.5 && end.iter().all(|x| x.abs() < 1e-2)
+        };
+        starts.iter().filter(comes_back).count()
+    };
+    let steps = (0.03, 1000);
+    let least = caught(&|x, far| run((&clipped, &q, &regulator), x, steps, |x| *far = far.max(x[0].abs())).0);
+    let found = [4, 8].map(|degree| {
+        let basis = Monomials::even(2, degree).unwrap();
+        let law = design_within(&plant, &q, &r, &[range], &domain, &basis).unwrap().feedback;
+        caught(&|x, far| run((&plant, &q, &law), x, steps, |x| *far = far.max(x[0].abs())).0)
+    });
+    println!("caught from {least} of 225 starts by the clipped regulator, from {found:?} by degrees 4 and 8");
+    assert!(found[0] < least && found[1] <= least && 10 * found[1] > 9 * least, "{found:?} {least}");
+}
+
+#[test]
 fn wide_limits_give_the_quadratic_law() {
     let (plant, q, r) = (pendulum(), DMatrix::identity(2, 2), dmatrix![0.7]);
     let domain = Domain::symmetric(&[1.0, 1.0]).unwrap();
