@@ -245,6 +245,7 @@ def control(
     dt: float = 1e-3,
     hold: float = 2.0,
     degree: int = 4,
+    bounded: bool = False,
     lambda_: float = 10.0,
     rate: float = 50.0,
     eta: float | None = None,
@@ -267,12 +268,13 @@ def control(
 
     Args:
         model: the model; of a diagnosis its completed one, and then ``report`` is that diagnosis unless stated.
-        method: ``lqr``, ``hjb`` (value function of ``degree``) or ``smc`` (sliding mode; ``lambda_``, ``rate``,
+        method: ``lqr``, ``hjb`` (value function of ``degree``; ``bounded``) or ``smc`` (sliding mode; ``lambda_``, ``rate``,
             ``eta``).
         input: input that commands; the model's only one where it has one.
         track, to: state to bring to the set points ± ``to``.
         size, input_size: typical sizes of states and command, from which the weights follow.
         limit: the actuator gives ± this at most.
+        bounded: hold the limits by the cost, so that the law slows down in time; without this they clip it (hjb).
         dt: sample time of the law, s.
         hold: time for each set point of the simulated square wave, s.
         ignore_time_terms: drop disturbances that depend on the time from the design.
@@ -323,6 +325,7 @@ def control(
         "dt": dt,
         "hold": hold,
         "degree": degree,
+        "bounded": bounded,
         "lambda_": lambda_,
         "rate": rate,
         "eta": eta,

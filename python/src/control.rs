@@ -26,6 +26,7 @@ pub(crate) struct Wanted {
     dt: f64,
     hold: f64,
     degree: u8,
+    bounded: bool,
     #[pyo3(item("lambda_"))]
     lambda: f64,
     rate: f64,
@@ -102,6 +103,7 @@ impl Wanted {
             dt: self.dt,
             hold: self.hold,
             degree: self.degree,
+            bounded: self.bounded,
             lambda: self.lambda,
             rate: self.rate,
             eta: self.eta,

@@ -35,7 +35,10 @@ fn greybox(folder: &Path, arguments: &[&str]) -> (Option<i32>, String, String) {
 fn every_method_gives_a_law_that_tracks_and_code_that_agrees() {
     let folder = tempfile::tempdir().unwrap();
     std::fs::write(folder.path().join("arm.toml"), MODEL).unwrap();
-    for method in ["lqr", "hjb", "smc"] {
+    let bounded: &[&str] = &["--bounded"];
+    for (method, name, more) in
+        [("lqr", "lqr", &[][..]), ("hjb", "hjb", &[]), ("hjb", "bounded", bounded), ("smc", "smc", &[])]
+    {
         let arguments = [
             "control",
             "arm.toml",
@@ -56,29 +59,31 @@ fn every_method_gives_a_law_that_tracks_and_code_that_agrees() {
             "--members",
             "10",
             "--out",
-            method,
+            name,
             "--json",
         ];
-        let (code, out, err) = greybox(folder.path(), &arguments);
-        assert_eq!(code, Some(0), "{method}: {err}");
+        let (code, out, err) = greybox(folder.path(), &[&arguments[..], more].concat());
+        assert_eq!(code, Some(0), "{name}: {err}");
         let report: serde_json::Value = serde_json::from_str(&out).unwrap();
+        assert_eq!(report["bounded"], !more.is_empty());
+        assert_eq!(report["law"][0].as_str().unwrap().contains("tanh("), !more.is_empty(), "{report}");
         assert_eq!(report["closed_loop"]["diverged"], false);
         for point in report["closed_loop"]["set_points"].as_array().unwrap() {
-            assert!(point["final_error"].as_f64().unwrap().abs() < 0.02, "{method}: {point}");
+            assert!(point["final_error"].as_f64().unwrap().abs() < 0.02, "{name}: {point}");
         }
-        assert_eq!(report["family"]["diverged"], 0, "{method}");
-        assert_eq!(report["verdict"], "settles", "{method}");
+        assert_eq!(report["family"]["diverged"], 0, "{name}");
+        assert_eq!(report["verdict"], "settles", "{name}");
         for check in report["checks"].as_array().unwrap() {
             let radius = |p: &serde_json::Value| p[0].as_f64().unwrap().hypot(p[1].as_f64().unwrap());
             let held: Vec<f64> = check["held_poles"].as_array().unwrap().iter().map(radius).collect();
             assert_eq!(held[0], check["spectral_radius"].as_f64().unwrap());
-            assert!(held.len() == 2 && held[1] <= held[0] && held[0] < 1.0, "{method}: {check}");
+            assert!(held.len() == 2 && held[1] <= held[0] && held[0] < 1.0, "{name}: {check}");
         }
-        let read = |name: &str| std::fs::read_to_string(folder.path().join(method).join(name)).unwrap();
+        let read = |file: &str| std::fs::read_to_string(folder.path().join(name).join(file)).unwrap();
         assert!(
             read("law.rs").contains("pub fn control_law(state: &[f64; 2], set_point: &[f64; 1]) -> [f64; 1]")
         );
-        agrees(&folder.path().join(method), &read("vectors.csv"));
+        agrees(&folder.path().join(name), &read("vectors.csv"));
         page_says(&read("report.html"), &report);
     }
 }

@@ -66,6 +66,8 @@ pub struct Request {
     pub hold: f64,
     /// Degree of the value function (hjb).
     pub degree: u8,
+    /// Hold the limits of the command by the cost (hjb); without this the limits clip the law.
+    pub bounded: bool,
     /// Poles on the sliding surface are at −λ, 1/s (smc).
     pub lambda: f64,
     /// Pole towards the sliding surface, 1/s (smc).
@@ -138,6 +140,7 @@ impl Default for Request {
             dt: 1e-3,
             hold: 2.0,
             degree: 4,
+            bounded: false,
             lambda: 10.0,
             rate: 50.0,
             eta: None,
@@ -184,7 +187,10 @@ pub fn control(
 ) -> Result<Results, Failure> {
     let model = &loaded.model;
     let refused = |e: greybox_control::ControlError| Failure::file(&loaded.path, e);
-
+    if request.bounded && request.method != Way::Hjb {
+        return Err(Failure::input("only a law of the method `hjb` can be bounded by its cost")
+            .help("choose the method `hjb`, or leave `bounded` out: the limits then clip the law"));
+    }
     let plant = Plant::of(model, &input(request, loaded)?, &options(request)).map_err(refused)?;
     let tracked = match &request.track {
         Some(name) => name.clone(),
@@ -324,7 +330,7 @@ fn options(request: &Request) -> PlantOptions {
 fn method(request: &Request) -> Method {
     match request.method {
         Way::Lqr => Method::Lqr,
-        Way::Hjb => Method::Hjb { degree: request.degree, domain: Vec::new() },
+        Way::Hjb => Method::Hjb { degree: request.degree, domain: Vec::new(), bounded: request.bounded },
         Way::Smc => {
             let eta = request.eta.unwrap_or(10.0 * request.input_size);
             Method::Smc { lambda: request.lambda, eta, phi: eta / request.rate }

@@ -98,8 +98,8 @@ impl Controller {
         &self.feed_forward
     }
 
-    /// What the value function of an HJB law was found to do; its numbers are those of states counted in half widths
-    /// of the domain.
+    /// What the value function of an HJB law was found to do, without limits unless the law is bounded; its numbers are
+    /// those of states counted in half widths of the domain.
     #[must_use]
     pub fn verification(&self) -> Option<&Verification> {
         self.verification.as_ref()
@@ -112,7 +112,7 @@ impl Controller {
         &self.law
     }
 
-    /// The command without limits, behind the dead zone.
+    /// The command without limits, behind the dead zone; a bounded law ([`Method::Hjb`]) is within them.
     #[must_use]
     pub fn unlimited(&self) -> &Expr {
         &self.unlimited

@@ -90,10 +90,12 @@ pub fn design(plant: &Plant, method: &Method, options: &DesignOptions) -> Result
         dt: options.dt,
         weights: &weights,
         feed_forward: &feed_forward,
+        tracked: &options.tracked,
+        limits: (low, high),
     };
     let made = match method {
         Method::Lqr => design.lqr(options.scheduled)?,
-        Method::Hjb { degree, domain } => design.hjb(*degree, domain)?,
+        Method::Hjb { degree, domain, bounded } => design.hjb(*degree, domain, *bounded)?,
         Method::Smc { lambda, eta, phi } => design.smc(*lambda, *eta, *phi, options.compensate_friction)?,
     };
     let mut variables = plant.symbols().to_vec();

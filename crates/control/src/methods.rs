@@ -1,6 +1,6 @@
 //! The laws, in symbols.
 
-use greybox_hjb::{Domain, Linear, Verification};
+use greybox_hjb::{Domain, InputRange, Linear, Monomials, Verification};
 use greybox_model::{Expr, Func};
 use greybox_smc::{BoundaryLayer, Rate, SmcError, Surface, Tangent};
 use nalgebra::{DMatrix, dmatrix};
@@ -14,6 +14,9 @@ use crate::specification::Weights;
 /// Relative size of the even part of a drift below which it counts as odd.
 const ODD: f64 = 1e-9;
 
+/// The share of the input's range that a set point must leave to either limit of a bounded law.
+const ROOM: f64 = 1e-6;
+
 /// What every method starts from.
 pub(crate) struct Design<'a> {
     pub(crate) plant: &'a Plant,
@@ -24,6 +27,9 @@ pub(crate) struct Design<'a> {
     pub(crate) dt: f64,
     pub(crate) weights: &'a Weights,
     pub(crate) feed_forward: &'a FeedForward,
+    /// Name of the tracked state.
+    pub(crate) tracked: &'a str,
+    pub(crate) limits: (f64, f64),
 }
 
 /// A law without limits.
@@ -104,26 +110,28 @@ impl Design<'_> {
         (q, dmatrix![self.weights.input * unit * unit])
     }
 
-    /// u = u_e(r) − ½ R⁻¹ Σ gᵢ(x) ∂V/∂xᵢ, V a polynomial of the deviations counted in half widths of the domain.
-    pub(crate) fn hjb(&self, degree: u8, domain: &[f64]) -> Result<Made, ControlError> {
+    /// u = u_e(r) − ½ R⁻¹ Σ gᵢ(x) ∂V/∂xᵢ, V a polynomial of the deviations counted in half widths of the domain; or
+    /// `bounded`.
+    pub(crate) fn hjb(&self, degree: u8, domain: &[f64], bounded: bool) -> Result<Made, ControlError> {
         let n = self.plant.order();
-        let widths = if domain.is_empty() { self.plant.sizes().to_vec() } else { domain.to_vec() };
-        if widths.len() != n {
-            return Err(ControlError::Size { what: "the domain", found: widths.len(), wanted: n });
-        }
-        for (width, name) in widths.iter().zip(self.plant.state_names()) {
-            if !(*width > 0.0 && width.is_finite()) {
-                let what = format!("the half width of the domain in `{name}`");
-                return Err(ControlError::Option { what, value: *width, wanted: "a positive finite number" });
-            }
-        }
+        let widths = self.half_widths(domain)?;
         let unit = self.plant.input_size();
         let shifted = Shifted { plant: self.plant, at: self.at, widths: &widths, unit };
         let (q, r) = self.cost(&widths, unit);
         let wrap = |source| ControlError::Hjb { set_point: self.set_point, source, hint: self.hint() };
         let box_ = Domain::symmetric(&vec![1.0; n]).map_err(wrap)?;
-        let odd_terms = degree % 2 == 1 || !shifted.is_odd(&box_.halton(40).map_err(wrap)?);
-        let optimal = greybox_hjb::design(&shifted, &q, &r, &box_, degree, odd_terms).map_err(wrap)?;
+        let limits = bounded.then(|| self.limits_behind_dead_zone()).transpose()?;
+        let range = match limits {
+            Some((low, high)) => {
+                InputRange::new((low - self.at.input) / unit, (high - self.at.input) / unit).map_err(wrap)?
+            }
+            None => InputRange::UNLIMITED,
+        };
+        let even_cost = !range.is_limited() || (range.low() + range.high()).abs() <= ODD * range.high();
+        let odd_terms = degree % 2 == 1 || !even_cost || !shifted.is_odd(&box_.halton(40).map_err(wrap)?);
+        let basis = if odd_terms { Monomials::full(n, degree) } else { Monomials::even(n, degree) };
+        let basis = basis.map_err(wrap)?;
+        let optimal = greybox_hjb::design_within(&shifted, &q, &r, &[range], &box_, &basis).map_err(wrap)?;
         let scaled: Vec<Expr> = (0..n).map(|i| self.deviation(i) / Expr::Num(widths[i])).collect();
         let basis = optimal.feedback.basis();
         let gradient = |i: usize| {
@@ -138,8 +146,64 @@ impl Design<'_> {
         let (_, g) = self.plant.frictionless();
         let acting = (0..n).filter(|i| g[*i] != Expr::Num(0.0));
         let pull = sum(acting.map(|i| (0.5 / (self.weights.input * widths[i]), g[i].clone() * gradient(i))));
-        let law = (self.feed_forward.input.clone() - pull).simplify();
+        let law = match limits {
+            Some(limits) => self.bounded(pull, limits),
+            None => (self.feed_forward.input.clone() - pull).simplify(),
+        };
         Ok(Made { frictionless: law.clone(), law, verification: Some(optimal.verification) })
+    }
+
+    /// Half widths of the box of a value function.
+    fn half_widths(&self, domain: &[f64]) -> Result<Vec<f64>, ControlError> {
+        let n = self.plant.order();
+        let widths = if domain.is_empty() { self.plant.sizes().to_vec() } else { domain.to_vec() };
+        if widths.len() != n {
+            return Err(ControlError::Size { what: "the domain", found: widths.len(), wanted: n });
+        }
+        for (width, name) in widths.iter().zip(self.plant.state_names()) {
+            if !(*width > 0.0 && width.is_finite()) {
+                let what = format!("the half width of the domain in `{name}`");
+                return Err(ControlError::Option { what, value: *width, wanted: "a positive finite number" });
+            }
+        }
+        Ok(widths)
+    }
+
+    /// What the limits leave of the input behind the dead zone, with u_e(r) inside for every set point of the range.
+    fn limits_behind_dead_zone(&self) -> Result<(f64, f64), ControlError> {
+        let (low, high) = self.limits;
+        if let Some(value) = [low, high].into_iter().find(|v| !v.is_finite()) {
+            let what = "a limit of the input".to_owned();
+            let wanted = "a finite number, above and below, for a bounded law: state the limits";
+            return Err(ControlError::Option { what, value, wanted });
+        }
+        let swallowed = self.plant.dead_zone();
+        let (low, high) = (low + swallowed, high - swallowed);
+        let room = self.feed_forward.input_error + ROOM * (high - low);
+        let (first, last) = self.feed_forward.range;
+        let points = &self.feed_forward.equilibria;
+        match points.iter().position(|at| !(low + room < at.input && at.input < high - room)) {
+            None => Ok((low, high)),
+            Some(k) => Err(ControlError::Unholdable {
+                tracked: self.tracked.to_owned(),
+                value: first + (last - first) * k as f64 / (points.len() - 1).max(1) as f64,
+                input: points[k].input,
+                low,
+                high,
+            }),
+        }
+    }
+
+    /// The law of [`InputRange`] around u_e(r), where `pull` is −(u − u_e(r)) without limits: with
+    /// T = (u_e(r) − m)/h, u = m + h tanh(atanh T − pull/(h (1 − T²))), the sum of angles written out.
+    fn bounded(&self, pull: Expr, (low, high): (f64, f64)) -> Expr {
+        let (middle, half) = (0.5 * (low + high), 0.5 * (high - low));
+        let rest = ((self.feed_forward.input.clone() - Expr::Num(middle)) / Expr::Num(half)).simplify();
+        let one = || Expr::Num(1.0);
+        let share = (one() - rest.clone() * rest.clone()).simplify();
+        let turn = Expr::call(Func::Tanh, vec![(pull / (Expr::Num(half) * share)).simplify()]);
+        let angle = (rest.clone() - turn.clone()) / (one() - rest * turn);
+        (Expr::Num(middle) + Expr::Num(half) * angle).simplify()
     }
 
     /// u = −(L f(x) + (η/φ) sat_φ(L (x − x_e(r)))) / (L g(x)) with L = Σ aₖ c Aᵏ.

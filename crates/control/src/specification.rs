@@ -16,6 +16,17 @@ pub enum Method {
         /// Half widths of the box, one for each state; empty for the plant's sizes. It must hold the largest
         /// deviations from the set point that occur, for beyond it a polynomial means nothing.
         domain: Vec<f64>,
+        /// Whether the limits of the input are in the cost ([`greybox_hjb::InputRange`]), so that the law stays within
+        /// them by itself and knows that braking takes time. Both limits must be finite. The range is that between the
+        /// limits, less a dead zone, around u_e(r): with its middle m, half h and T = (u_e(r) − m)/h the law is
+        ///
+        /// ```text
+        /// u = m + h tanh(atanh T − R⁻¹gᵀ∇V / (2 h (1 − T²)))
+        /// ```
+        ///
+        /// which uses all of the range on both sides, rests at u_e(r), and near there is the law without limits. V is
+        /// that of the design point. Without this (the default) the limits clip the law.
+        bounded: bool,
     },
     /// The flat-output sliding-mode law ([`greybox_smc::Law`] with [`greybox_smc::Rate::Model`]) of the tangent at
     /// the design point: ṡ = −η sat(s/φ) holds whatever the nonlinearity.

@@ -1,6 +1,7 @@
 //! The integration tests, in one program: to link one for each file takes longer than most of them run.
 #![allow(missing_docs, clippy::unwrap_used)]
 
+mod bounded;
 mod common;
 mod errors;
 mod link;

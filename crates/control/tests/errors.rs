@@ -157,9 +157,13 @@ fn designs_that_cannot_work_are_refused() {
     refused(DesignOptions { weights: Some(weights), ..good.clone() }, Method::Lqr, &["weights", "needs 2"]);
     let weights = greybox_control::Weights { states: vec![1.0, 1.0], input: 0.0 };
     refused(DesignOptions { weights: Some(weights), ..good.clone() }, Method::Lqr, &["linear design", "R"]);
-    refused(good.clone(), Method::Hjb { degree: 1, domain: vec![] }, &["degree"]);
-    refused(good.clone(), Method::Hjb { degree: 4, domain: vec![1.0] }, &["domain", "needs 2"]);
-    refused(good.clone(), Method::Hjb { degree: 4, domain: vec![1.0, -1.0] }, &["`x'`"]);
+    refused(good.clone(), Method::Hjb { degree: 1, domain: vec![], bounded: false }, &["degree"]);
+    refused(
+        good.clone(),
+        Method::Hjb { degree: 4, domain: vec![1.0], bounded: false },
+        &["domain", "needs 2"],
+    );
+    refused(good.clone(), Method::Hjb { degree: 4, domain: vec![1.0, -1.0], bounded: false }, &["`x'`"]);
     refused(good.clone(), Method::Smc { lambda: -1.0, eta: 1.0, phi: 1.0 }, &["sliding-mode"]);
     refused(good.clone(), Method::Smc { lambda: 5.0, eta: 1e4, phi: 1.0 }, &["sliding-mode", "sample"]);
     // A command held too long for the loop that it closes.
@@ -211,7 +215,7 @@ fn extreme_numbers_are_refused_and_never_panic() {
         [0.0, -0.0, f64::NAN, f64::INFINITY, f64::NEG_INFINITY, 1e300, -1e300, 1e-300, f64::MIN_POSITIVE];
     let methods = [
         Method::Lqr,
-        Method::Hjb { degree: 3, domain: vec![] },
+        Method::Hjb { degree: 3, domain: vec![], bounded: false },
         Method::Smc { lambda: 8.0, eta: 20.0, phi: 2.0 },
     ];
     let mut designed = 0;

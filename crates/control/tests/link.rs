@@ -75,7 +75,7 @@ fn the_regulator_has_the_gains_of_the_thesis() {
 fn methods() -> [Method; 3] {
     [
         Method::Lqr,
-        Method::Hjb { degree: 4, domain: vec![0.75, 6.0, 0.25, 6.0] },
+        Method::Hjb { degree: 4, domain: vec![0.75, 6.0, 0.25, 6.0], bounded: false },
         Method::Smc { lambda: 16.0, eta: 50.0, phi: 0.5 },
     ]
 }

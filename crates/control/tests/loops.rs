@@ -21,7 +21,7 @@ fn a_pendulum_is_held_anywhere() {
     let set_points = [-2.0, -0.5, 0.0, 1.5, 2.5];
     for method in [
         Method::Lqr,
-        Method::Hjb { degree: 6, domain: vec![4.5, 20.0] },
+        Method::Hjb { degree: 6, domain: vec![4.5, 20.0], bounded: false },
         Method::Smc { lambda: 10.0, eta: 4.0, phi: 0.2 },
     ] {
         let law = design(&plant, &method, &DesignOptions::new("theta", &set_points, 2e-3)).unwrap();
@@ -246,8 +246,8 @@ fn units_play_no_part() {
         let methods = [
             (Method::Lqr, Method::Lqr),
             (
-                Method::Hjb { degree: 6, domain: vec![1.7, 6.0] },
-                Method::Hjb { degree: 6, domain: vec![1.7 * by, 6.0 * by] },
+                Method::Hjb { degree: 6, domain: vec![1.7, 6.0], bounded: false },
+                Method::Hjb { degree: 6, domain: vec![1.7 * by, 6.0 * by], bounded: false },
             ),
             (
                 Method::Smc { lambda: 6.0, eta: 30.0, phi: 2.0 },
@@ -292,7 +292,7 @@ fn a_pole_is_balanced_while_the_cart_moves() {
     wanted.limit = Some(20.0);
     for method in [
         Method::Lqr,
-        Method::Hjb { degree: 4, domain: vec![1.0, 3.0, 0.6, 3.0] },
+        Method::Hjb { degree: 4, domain: vec![1.0, 3.0, 0.6, 3.0], bounded: false },
         Method::Smc { lambda: 2.5, eta: 40.0, phi: 4.0 },
     ] {
         let law = design(&plant, &method, &wanted).unwrap();

@@ -145,7 +145,7 @@ fn the_demo_is_controlled_by_every_method() {
     wanted.compensate_friction = true;
     for method in [
         Method::Lqr,
-        Method::Hjb { degree: 4, domain: vec![0.7, 10.0, 0.4, 10.0] },
+        Method::Hjb { degree: 4, domain: vec![0.7, 10.0, 0.4, 10.0], bounded: false },
         Method::Smc { lambda: 12.0, eta: 60.0, phi: 1.0 },
     ] {
         let law = design(&plant, &method, &wanted).unwrap_or_else(|e| panic!("{}: {e}", method.name()));

@@ -103,7 +103,7 @@ pub struct Training {
 
 /// Minimises J(W) = ½ Σ e(xᵢ)² over the collocation points from the weights `start`, N values.
 ///
-/// e is a polynomial of degree two in W, e = F θ(W). With more points than products of weights, an orthogonal
+/// Where no input has limits, e is a polynomial of degree two in W, e = F θ(W). With more points than products of weights, an orthogonal
 /// transformation F = Q R leaves J = ½‖R θ‖² as it is, to rounding, and an iteration costs the same however many points
 /// there are.
 ///
@@ -189,7 +189,7 @@ impl Objective<'_> {
     fn of(problem: &Problem) -> Objective<'_> {
         let count = problem.basis().len();
         let features = 1 + count + count * (count + 1) / 2;
-        if problem.points() <= features {
+        if problem.points() <= features || !problem.is_quadratic() {
             return Objective::Points(problem);
         }
         let f = problem.features();

@@ -3,7 +3,8 @@
 use nalgebra::DMatrix;
 
 use crate::dense::is_symmetric;
-use crate::error::RiccatiError;
+use crate::error::{HjbError, RiccatiError};
+use crate::range::InputRange;
 
 pub(crate) fn shape(
     matrix: &'static str,
@@ -36,4 +37,14 @@ pub(crate) fn finite(matrix: &'static str, m: &DMatrix<f64>) -> Result<(), Ricca
 
 pub(crate) fn symmetric(matrix: &'static str, m: &DMatrix<f64>) -> Result<(), RiccatiError> {
     if is_symmetric(m) { Ok(()) } else { Err(RiccatiError::NotSymmetric { matrix }) }
+}
+
+/// One range for each input, and no limit where `factor`, the Cholesky factor of R, couples inputs.
+pub(crate) fn ranges(ranges: &[InputRange], factor: &DMatrix<f64>) -> Result<(), HjbError> {
+    let inputs = factor.nrows();
+    if ranges.len() != inputs {
+        return Err(HjbError::Size { what: "the list of ranges", found: ranges.len(), wanted: inputs });
+    }
+    let coupled = (0..inputs).any(|j| (j + 1..inputs).any(|i| factor[(i, j)] != 0.0));
+    if coupled && ranges.iter().any(InputRange::is_limited) { Err(HjbError::CoupledInputs) } else { Ok(()) }
 }

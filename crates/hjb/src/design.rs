@@ -10,6 +10,7 @@ use crate::plant::{Linear, Plant, tangent};
 use crate::points::Domain;
 use crate::policy::{Policy, PolicyOptions, policy_iteration};
 use crate::problem::Problem;
+use crate::range::InputRange;
 use crate::riccati::Riccati;
 
 /// ‖f(0)‖ over the size of f across the domain above which the origin is no equilibrium.
@@ -19,6 +20,8 @@ const AT_REST: f64 = 1e-9;
 const POINTS_PER_WEIGHT: usize = 8;
 /// Fewest points on which a law is checked.
 const CHECK_POINTS: usize = 2000;
+/// Ranges of the inputs over those asked for, in the order in which they are narrowed.
+const WIDER: [f64; 5] = [16.0, 8.0, 4.0, 2.0, 1.0];
 
 /// An optimal law.
 #[derive(Debug, Clone)]
@@ -79,8 +82,53 @@ pub fn design(
         return Err(HjbError::Size { what: "the domain", found: domain.states(), wanted: n });
     }
     let basis = if odd_terms { Monomials::full(n, degree)? } else { Monomials::even(n, degree)? };
+    let unlimited = vec![InputRange::UNLIMITED; plant.inputs()];
+    design_within(plant, q, r, &unlimited, domain, &basis)
+}
+
+/// [`design`] with inputs that stay within ranges, one for each, at the cost of [`InputRange`], and with a basis.
+///
+/// The quadratic part of V and the gain at the origin are those without limits: near the origin no limit binds. The
+/// weights of higher degree are first those without limits, from which policy iteration goes on.
+///
+/// No law with limits stabilises an unstable plant from everywhere. Where V is infinite no polynomial follows it: the
+/// domain should lie within the states that the limits can bring back, and [`Verification::level`] says how far the
+/// law was found to. Ranges that are not symmetric make V so: the basis then needs odd terms as well.
+///
+/// ```
+/// use greybox_hjb::{Domain, InputRange, Linear, Monomials, design_within};
+/// use nalgebra::dmatrix;
+/// // ẋ = −x + u within ±½: far from the origin the input hardly pays.
+/// let plant = Linear { a: dmatrix![-1.0], b: dmatrix![1.0] };
+/// let one = dmatrix![1.0];
+/// let range = InputRange::new(-0.5, 0.5)?;
+/// let optimal =
+///     design_within(&plant, &one, &one, &[range], &Domain::symmetric(&[3.0])?, &Monomials::even(1, 12)?)?;
+/// let u = |x: f64| optimal.feedback.control(&[x], &[1.0])[0];
+/// // −(√2 − 1) x near the origin, and never beyond the limit.
+/// assert!((u(1e-3) + 1e-3 * (2f64.sqrt() - 1.0)).abs() < 1e-7);
+/// assert!(u(3.0) > -0.5 && u(3.0) < -0.4);
+/// assert!(optimal.verification.holds_everywhere());
+/// # Ok::<(), greybox_hjb::HjbError>(())
+/// ```
+///
+/// # Errors
+/// Those of [`design`]; [`HjbError::Size`] for another number of ranges, [`HjbError::CoupledInputs`] for limits with an
+/// R that is not diagonal.
+pub fn design_within(
+    plant: &impl Plant,
+    q: &DMatrix<f64>,
+    r: &DMatrix<f64>,
+    ranges: &[InputRange],
+    domain: &Domain,
+    basis: &Monomials,
+) -> Result<Optimal, HjbError> {
+    let n = plant.states();
+    if domain.states() != n {
+        return Err(HjbError::Size { what: "the domain", found: domain.states(), wanted: n });
+    }
     let points = domain.halton((POINTS_PER_WEIGHT * basis.len()).max(CHECK_POINTS / 4))?;
-    let problem = Problem::new(plant, q, r, basis.clone(), &points)?;
+    let mut problem = Problem::new(plant, q, r, basis.clone(), &points)?;
     let mut f = vec![0.0; n];
     let norm = |f: &[f64]| f.iter().map(|f| f * f).sum::<f64>().sqrt();
     let mut largest = 0.0f64;
@@ -98,11 +146,20 @@ pub fn design(
     let linear = lqr(&a, &b, q, r)?;
     let start = basis.quadratic(|i, j| linear.solution[(i, j)]);
     let options = PolicyOptions { hold_quadratic: true, ..PolicyOptions::default() };
-    let policy = policy_iteration(&problem, &start, options)?;
+    let mut policy = policy_iteration(&problem, &start, options)?;
+    if ranges.iter().any(InputRange::is_limited) {
+        for wider in WIDER {
+            let ranges: Vec<InputRange> = ranges.iter().map(|r| r.times(wider)).collect();
+            let before = policy.steps;
+            problem = problem.within(&ranges)?;
+            policy = policy_iteration(&problem, &policy.weights, options)?;
+            policy.steps += before;
+        }
+    }
     // Checked where it was not fitted: the points of the sequence that follow.
     let unseen = domain.halton(points.len() + CHECK_POINTS)?.split_off(points.len());
     let check = |weights: Vec<f64>| -> Result<(Feedback, Verification), HjbError> {
-        let feedback = Feedback::new(basis.clone(), weights, r)?;
+        let feedback = Feedback::new(basis.clone(), weights, r)?.within(ranges)?;
         let verification = verify(plant, q, &feedback, &unseen)?;
         Ok((feedback, verification))
     };

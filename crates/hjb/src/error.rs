@@ -117,6 +117,22 @@ pub enum HjbError {
         /// Upper bound.
         high: f64,
     },
+    /// A range of an input that its cost cannot hold.
+    #[error(
+        "the range of an input is [{low}, {high}], counted from the input at the origin: give a finite number below zero \
+         and one above, or infinities for both"
+    )]
+    Range {
+        /// Lower limit.
+        low: f64,
+        /// Upper limit.
+        high: f64,
+    },
+    /// Limits of inputs that the cost couples.
+    #[error(
+        "R has elements off its diagonal, and the cost of inputs with limits is a sum over the inputs: give a diagonal R"
+    )]
+    CoupledInputs,
     /// No or too many collocation points, or points that determine nothing.
     #[error("{wanted} collocation points: give one count per state, and from 1 to {most} points in all")]
     Points {

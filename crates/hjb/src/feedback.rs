@@ -5,13 +5,16 @@ use nalgebra::{Cholesky, Complex, DMatrix, DVector};
 use crate::basis::Monomials;
 use crate::error::{HjbError, RiccatiError};
 use crate::plant::{Linear, Plant, tangent};
+use crate::range::InputRange;
 
-/// u(x) = −½ R⁻¹ g(x)ᵀ ∇φ(x)ᵀ W (thesis Eq 4.27).
+/// u(x) = −½ R⁻¹ g(x)ᵀ ∇φ(x)ᵀ W (thesis Eq 4.27), or the saturated law of [`InputRange`] where inputs have limits.
 #[derive(Debug, Clone)]
 pub struct Feedback {
     basis: Monomials,
     weights: Vec<f64>,
     r: Cholesky<f64, nalgebra::Dyn>,
+    /// Empty where no input has limits.
+    ranges: Vec<InputRange>,
 }
 
 impl Feedback {
@@ -31,7 +34,18 @@ impl Feedback {
             let smallest = r.clone().symmetric_eigenvalues().min();
             RiccatiError::NotPositive { matrix: "R", definite: true, smallest }
         })?;
-        Ok(Feedback { basis, weights, r: cholesky })
+        Ok(Feedback { basis, weights, r: cholesky, ranges: Vec::new() })
+    }
+
+    /// The same with inputs that stay within ranges, one for each ([`InputRange::command`]).
+    ///
+    /// # Errors
+    /// [`HjbError::Size`] for another number of ranges, [`HjbError::CoupledInputs`] for limits with an R that is not
+    /// diagonal.
+    pub fn within(mut self, ranges: &[InputRange]) -> Result<Feedback, HjbError> {
+        crate::check::ranges(ranges, &self.r.l())?;
+        self.ranges = if ranges.iter().any(InputRange::is_limited) { ranges.to_vec() } else { Vec::new() };
+        Ok(self)
     }
 
     /// The basis.
@@ -62,10 +76,33 @@ impl Feedback {
         let gradient = self.basis.gradient(&self.weights, x);
         let products = g.chunks(x.len()).map(|g| g.iter().zip(&gradient).map(|(g, v)| g * v).sum());
         let right = DVector::from_iterator(inputs, products);
-        (self.r.solve(&right) * -0.5).as_slice().to_vec()
+        if self.ranges.is_empty() {
+            return (self.r.solve(&right) * -0.5).as_slice().to_vec();
+        }
+        let limited = self.ranges.iter().enumerate().zip(right.iter());
+        limited.map(|((k, range), p)| range.command(*p, self.weight(k))).collect()
     }
 
-    /// The gain K, m × n, of the law's linear part u = −K x at the origin.
+    /// R's element of an input, where inputs are not coupled.
+    fn weight(&self, input: usize) -> f64 {
+        self.r.l_dirty()[(input, input)].powi(2)
+    }
+
+    /// What an input u costs: uᵀRu, or U(u) of [`InputRange::cost`] where inputs have limits; not a number for another
+    /// number of inputs.
+    #[must_use]
+    pub fn input_cost(&self, u: &[f64]) -> f64 {
+        let inputs = self.r.l_dirty().nrows();
+        if u.len() != inputs {
+            return f64::NAN;
+        }
+        if self.ranges.is_empty() {
+            return (self.r.l().transpose() * DVector::from_column_slice(u)).norm_squared();
+        }
+        self.ranges.iter().zip(u).enumerate().map(|(k, (range, u))| range.cost(*u, self.weight(k))).sum()
+    }
+
+    /// The gain K, m × n, of the law's linear part u = −K x at the origin, which no limit changes.
     #[must_use]
     pub fn gain(&self, b: &DMatrix<f64>) -> DMatrix<f64> {
         let n = self.basis.states();
@@ -110,7 +147,7 @@ impl Verification {
     }
 }
 
-/// Checks a law on its plant with running cost xᵀQx + uᵀRu: at the origin and at points of n values.
+/// Checks a law on its plant with running cost xᵀQx + uᵀRu, or that of its [`InputRange`]s: at the origin and at points of n values.
 ///
 /// # Errors
 /// [`HjbError`]: sizes, a plant that is not finite.
@@ -155,9 +192,12 @@ pub fn verify(
         let rate = |i: usize| f[i] + (0..m).map(|j| g[j * n + i] * u[j]).sum::<f64>();
         let falling: f64 = (0..n).map(|i| gradient[i] * rate(i)).sum();
         let state_cost: f64 = (0..n * n).map(|k| x[k / n] * q[(k / n, k % n)] * x[k % n]).sum();
-        // u minimises the Hamiltonian: uᵀRu = −½ ∇Vᵀ g u.
-        let input_cost: f64 = -0.5
-            * (0..n).map(|i| gradient[i] * (0..m).map(|j| g[j * n + i] * u[j]).sum::<f64>()).sum::<f64>();
+        let input_cost: f64 = if feedback.ranges.is_empty() {
+            // u minimises the Hamiltonian: uᵀRu = −½ ∇Vᵀ g u.
+            -0.5 * (0..n).map(|i| gradient[i] * (0..m).map(|j| g[j * n + i] * u[j]).sum::<f64>()).sum::<f64>()
+        } else {
+            feedback.input_cost(&u)
+        };
         let e = falling + state_cost + input_cost;
         if !e.is_finite() {
             return Err(HjbError::NotFinite { point: x.clone() });

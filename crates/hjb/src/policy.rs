@@ -43,7 +43,8 @@ pub struct Policy {
 ///
 /// The Lyapunov equation at the points is J W' = −(q + ¼‖BᵀW‖²) with J = ∂e/∂W: the Gauss–Newton step for ½ eᵀe, which
 /// for a linear plant and a quadratic basis is D. Kleinman's method (1968): from a stabilising start it converges,
-/// quadratically, to the stabilising solution and no other. A step that does not lower the loss is halved.
+/// quadratically, to the stabilising solution and no other. With limits ([`Problem::within`]) the right side is
+/// −(q + U(u)), which is the successive approximation of M. Abu-Khalaf and F. L. Lewis (2005). A step that does not lower the loss is halved.
 ///
 /// # Errors
 /// [`HjbError::Size`] for a start of another size, [`HjbError::Undetermined`] when the points do not determine the

@@ -5,10 +5,14 @@ use nalgebra::{Cholesky, DMatrix};
 use crate::basis::Monomials;
 use crate::error::{HjbError, RiccatiError};
 use crate::plant::Plant;
+use crate::range::InputRange;
 
 /// Residuals of thesis Eq 4.37 at P points, for N weights:
 ///
 /// e(x) = Wᵀ∇φ f − ¼ Wᵀ∇φ g R⁻¹ gᵀ∇φᵀ W + xᵀQx = aᵀW − ¼‖BᵀW‖² + q, with a = ∇φ f, B = ∇φ g R^(−1/2).
+///
+/// Where inputs have limits ([`Problem::within`]), −¼ (BᵀW)² of each is the least of [`InputRange::least`], for limits
+/// ±ū −2 ū² r ln cosh(BᵀW/(2 ū √r)).
 #[derive(Debug, Clone)]
 pub struct Problem {
     basis: Monomials,
@@ -19,6 +23,10 @@ pub struct Problem {
     b: Vec<DMatrix<f64>>,
     /// P.
     q: Vec<f64>,
+    /// L of R = L Lᵀ.
+    factor: DMatrix<f64>,
+    /// Of Lᵀu, one for each input.
+    ranges: Vec<InputRange>,
 }
 
 impl Problem {
@@ -59,6 +67,8 @@ impl Problem {
             a: DMatrix::zeros(points.len(), count),
             b: vec![DMatrix::zeros(points.len(), count); m],
             q: Vec::with_capacity(points.len()),
+            factor: cholesky.l(),
+            ranges: vec![InputRange::UNLIMITED; m],
         };
         let (mut f, mut g) = (vec![0.0; n], DMatrix::zeros(n, m));
         for (p, x) in points.iter().enumerate() {
@@ -81,6 +91,17 @@ impl Problem {
             problem.q.push((0..n * n).map(|k| x[k / n] * q[(k / n, k % n)] * x[k % n]).sum());
         }
         Ok(problem)
+    }
+
+    /// The same with inputs that stay within ranges, one for each, at the cost of [`InputRange`].
+    ///
+    /// # Errors
+    /// [`HjbError::Size`] for another number of ranges, [`HjbError::CoupledInputs`] for limits with an R that is not
+    /// diagonal.
+    pub fn within(mut self, ranges: &[InputRange]) -> Result<Problem, HjbError> {
+        crate::check::ranges(ranges, &self.factor)?;
+        self.ranges = ranges.iter().enumerate().map(|(k, r)| r.times(self.factor[(k, k)])).collect();
+        Ok(self)
     }
 
     /// The basis.
@@ -110,6 +131,11 @@ impl Problem {
         Ok(self.evaluate(weights).0)
     }
 
+    /// Whether the residuals are polynomials of degree two in the weights: no input has limits.
+    pub(crate) fn is_quadratic(&self) -> bool {
+        !self.ranges.iter().any(InputRange::is_limited)
+    }
+
     pub(crate) fn check(&self, weights: &[f64]) -> Result<(), HjbError> {
         let wanted = self.basis.len();
         if weights.len() == wanted {
@@ -124,25 +150,26 @@ impl Problem {
         let mut e = self.q.clone();
         accumulate(&self.a, weights, &mut e);
         let mut inputs = Vec::with_capacity(self.inputs);
-        for b in &self.b {
+        for (b, range) in self.b.iter().zip(&self.ranges) {
             let mut c = vec![0.0; e.len()];
             accumulate(b, weights, &mut c);
             for (e, c) in e.iter_mut().zip(&c) {
-                *e -= 0.25 * c * c;
+                *e += range.least(*c, 1.0);
             }
             inputs.push(c);
         }
         (e, inputs)
     }
 
-    /// ∂e/∂W = a − ½ B BᵀW at every point, P × N: the Lyapunov operator (thesis Eq 4.23) of the policy that W stands
-    /// for.
+    /// ∂e/∂W = a + B u* at every point, P × N, with u* = −½ BᵀW where there are no limits: the Lyapunov operator (thesis
+    /// Eq 4.23) of the policy that W stands for, for u* minimises what it is put into.
     pub(crate) fn jacobian(&self, inputs: &[Vec<f64>]) -> DMatrix<f64> {
         let mut jacobian = self.a.clone();
-        for (b, c) in self.b.iter().zip(inputs) {
+        for ((b, c), range) in self.b.iter().zip(inputs).zip(&self.ranges) {
+            let commands: Vec<f64> = c.iter().map(|c| range.command(*c, 1.0)).collect();
             for j in 0..jacobian.ncols() {
-                for (p, c) in c.iter().enumerate() {
-                    jacobian[(p, j)] -= 0.5 * c * b[(p, j)];
+                for (p, u) in commands.iter().enumerate() {
+                    jacobian[(p, j)] += u * b[(p, j)];
                 }
             }
         }
@@ -150,7 +177,7 @@ impl Problem {
     }
 
     /// The residuals as linear functions of the weights and their products: P × (1 + N + N(N+1)/2), so that
-    /// e = F θ with θ = (1, Wᵢ, WᵢWⱼ for i ≤ j).
+    /// e = F θ with θ = (1, Wᵢ, WᵢWⱼ for i ≤ j); where no input has limits.
     pub(crate) fn features(&self) -> DMatrix<f64> {
         let count = self.basis.len();
         let mut f = DMatrix::zeros(self.points(), 1 + count + count * (count + 1) / 2);

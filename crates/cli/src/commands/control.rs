@@ -69,6 +69,10 @@ pub(crate) struct Arguments {
     #[arg(long, value_name = "EVEN", value_parser = even, default_value_t = 4, allow_negative_numbers = true)]
     degree: u8,
 
+    /// Hold the limits of the command by the cost, so that the law slows down in time; without this they clip it (hjb)
+    #[arg(long)]
+    bounded: bool,
+
     /// Poles on the sliding surface are at −λ, 1/s (smc)
     #[arg(long, value_name = "RATE", default_value_t = 10.0, allow_negative_numbers = true)]
     lambda: f64,
@@ -258,6 +262,7 @@ fn request(arguments: &Arguments) -> Result<Request, Failure> {
         dt: arguments.dt,
         hold: arguments.hold,
         degree: arguments.degree,
+        bounded: arguments.bounded,
         lambda: arguments.lambda,
         rate: arguments.rate,
         eta: arguments.eta,

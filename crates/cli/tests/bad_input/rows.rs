@@ -979,6 +979,8 @@ fn designs() -> Vec<Row> {
         all("a limit that is no number", "greybox control model.toml --limit NaN --out out"),
         all("a sample time of zero", "greybox control model.toml --dt 0 --out out"),
         all("an odd degree", "greybox control model.toml --method hjb --degree 3 --out out"),
+        all("limits in a cost that knows none", "greybox control model.toml --limit 1 --bounded --out out"),
+        all("a bounded law without limits", "greybox control model.toml --method hjb --bounded --out out"),
         all("a pole that is unstable", "greybox control model.toml --method smc --lambda -10 --out out"),
         all("a set point at infinity", "greybox control model.toml --to inf --out out"),
         all("an observer's number without an observer", "greybox control model.toml --noise x=1 --out out"),

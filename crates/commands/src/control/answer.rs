@@ -62,6 +62,7 @@ pub(super) fn report(page: &ControlPage, designed: &Designed<'_>) -> Value {
         "tracked": plant.state_names().get(controller.tracked()),
         "dt": controller.dt(),
         "limits": [limit(low), limit(high)],
+        "bounded": matches!(controller.method(), Method::Hjb { bounded: true, .. }),
         "gains": controller.gains(),
         "law": match output {
             Some(output) => vec![output.law().to_string()],
@@ -130,7 +131,8 @@ pub(super) fn in_words(designed: &Designed<'_>) -> String {
         "{} of {} for {tracked}, commanded by {} every {} s\n",
         match controller.method() {
             Method::Lqr => "Linear-quadratic regulator",
-            Method::Hjb { .. } => "Optimal law",
+            Method::Hjb { bounded: false, .. } => "Optimal law",
+            Method::Hjb { bounded: true, .. } => "Optimal law, its limits in the cost,",
             Method::Smc { .. } => "Sliding-mode law",
         },
         file,

@@ -172,7 +172,12 @@ fn settings(
     let mut out = Vec::new();
     match controller.method() {
         Method::Lqr => {}
-        Method::Hjb { degree, .. } => out.push(("Degree of the value function", degree.to_string())),
+        Method::Hjb { degree, bounded, .. } => {
+            out.push(("Degree of the value function", degree.to_string()));
+            if *bounded {
+                out.push(("Limits of the command", "in the cost: the law stays within them".to_owned()));
+            }
+        }
         Method::Smc { lambda, eta, phi } => {
             out.push(("Poles on the surface", format!("{} 1/s", format::plain(-lambda))));
             out.push(("Pole towards the surface", format!("{} 1/s", format::plain(-eta / phi))));
