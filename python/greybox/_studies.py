@@ -259,7 +259,7 @@ def control(
     integral: bool = True,
     delay: float = 0.0,
     report: str | os.PathLike[str] | Diagnosis | Calibration | None = None,
-    members: int = 50,
+    members: int = 200,
     seed: int = 0,
     progress: Progress | None = None,
 ) -> Control:
@@ -282,7 +282,8 @@ def control(
             (``bandwidth``, 1/s); the law takes the disturbance that it estimates off the command, its ``integral`` action.
         noise, resolution: standard deviations and steps of the measured states' sensors.
         delay: of the simulated loop, s.
-        report: how sure the model's parameters are, for the perturbed plants (``members``, ``seed``).
+        report: how sure the model's parameters are, for the perturbed plants (``members``, ``seed``); the report has
+            the worst of them, margins included.
         progress: hears what is being done.
 
     >>> import greybox

@@ -67,6 +67,21 @@ fn every_method_gives_a_law_that_tracks_and_code_that_agrees() {
             assert!(point["final_error"].as_f64().unwrap().abs() < 0.02, "{method}: {point}");
         }
         assert_eq!(report["family"]["diverged"], 0, "{method}");
+        let of = |name: &str, which: &str| report["family"]["margins"][name][which].as_f64().unwrap();
+        let own = |name: &str| {
+            let all = report["checks"].as_array().unwrap().iter();
+            all.map(|c| c["margins"][name].as_f64().unwrap()).fold(f64::INFINITY, f64::min)
+        };
+        for name in ["gain", "phase", "delay"] {
+            let (worst, median) = (of(name, "worst"), of(name, "median"));
+            // Ten plants, perturbed by a tenth: some are worse than the model, and none is without margin.
+            assert!(0.5 * own(name) < worst && worst < own(name), "{method} {name}: {worst} {}", own(name));
+            assert!(worst < median, "{method} {name}: {worst} {median}");
+        }
+        assert_eq!(report["family"]["unstable"], 0, "{method}");
+        for name in ["effort", "peak_to_peak"] {
+            assert!(report["family"][name]["worst"].as_f64() >= report["family"][name]["median"].as_f64());
+        }
         assert_eq!(report["verdict"], "settles", "{method}");
         for check in report["checks"].as_array().unwrap() {
             let radius = |p: &serde_json::Value| p[0].as_f64().unwrap().hypot(p[1].as_f64().unwrap());
@@ -117,7 +132,7 @@ fn a_loop_that_does_not_settle_is_not_praised() {
     assert!(!html.contains("<section id=\"family\""));
     // A gravity so uncertain that a law without integral action is often off.
     std::fs::write(folder.path().join("arm.toml"), MODEL.replace("std = 0.03", "std = 0.2")).unwrap();
-    let (reported, html) = verdict(&["--size", "theta=0.2", "--hold", "4"]);
+    let (reported, html) = verdict(&["--size", "theta=0.2", "--hold", "4", "--members", "40"]);
     assert_eq!(reported, "fragile");
     assert!(html.contains("not on every perturbed plant"));
 }

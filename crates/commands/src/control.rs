@@ -145,7 +145,7 @@ impl Default for Request {
             compensate_friction: false,
             observer: None,
             delay: 0.0,
-            members: 50,
+            members: 200,
             seed: 0,
         }
     }

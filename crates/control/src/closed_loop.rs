@@ -90,7 +90,7 @@ pub struct ClosedLoop<'a> {
     held: Vec<f64>,
     integration: Integration,
     delays: bool,
-    output: Option<OutputFeedback>,
+    pub(crate) output: Option<OutputFeedback>,
     delay: f64,
     seed: u64,
 }

@@ -28,7 +28,7 @@ pub use controller::Controller;
 pub use design::design;
 pub use equilibrium::{Equilibrium, equilibrium};
 pub use error::ControlError;
-pub use family::{Envelope, Family, FamilyOptions, Spread};
+pub use family::{Envelope, Family, FamilyOptions, MarginSpread, Spread};
 pub use feedforward::FeedForward;
 pub use greybox_smc::check::Pole;
 pub use margins::Margins;

@@ -139,10 +139,25 @@ pub struct Perturbed {
     pub deviations: Vec<(Quantity, f64, f64)>,
     /// A figure's name, its unit, and the median and the worst of the members; infinite where not reached.
     pub figures: Vec<Figure>,
+    /// Margins on the perturbed plants; none where the law has none on its own.
+    pub margins: Option<PerturbedMargins>,
     /// Least and largest tracked state of the members that did not diverge, at the times of the run.
     pub tracked: [Vec<f64>; 2],
     /// The same of the command.
     pub command: [Vec<f64>; 2],
+}
+
+/// Margins over the perturbed plants, of each plant those of its worst set point, margin by margin.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct PerturbedMargins {
+    /// On the model itself.
+    pub own: Margins,
+    /// Half of the plants have more.
+    pub median: Margins,
+    /// The worst plant.
+    pub worst: Margins,
+    /// Plants on which the linearised loop is unstable at a set point.
+    pub unstable: usize,
 }
 
 /// A figure over the perturbed plants.

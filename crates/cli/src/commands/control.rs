@@ -126,7 +126,7 @@ pub(crate) struct Arguments {
     report: Option<PathBuf>,
 
     /// Perturbed plants on which the law is tried: parameters vary as the report says, else by the model's `std`
-    #[arg(long, value_name = "N", default_value_t = 50, allow_negative_numbers = true)]
+    #[arg(long, value_name = "N", default_value_t = 200, allow_negative_numbers = true)]
     members: usize,
 
     /// Seed of the perturbed plants

@@ -81,7 +81,13 @@ pub(super) fn report(page: &ControlPage, designed: &Designed<'_>) -> Value {
         "family": family.map(|f| json!({
             "members": f.members, "diverged": f.diverged, "settled": f.settled,
             "settling": spread(&f.settling), "overshoot": spread(&f.overshoot),
-            "final_error": spread(&f.final_error), "largest_command": spread(&f.largest_command),
+            "final_error": spread(&f.final_error), "peak_to_peak": spread(&f.peak_to_peak),
+            "largest_command": spread(&f.largest_command), "effort": spread(&f.effort),
+            "unstable": f.unstable,
+            "margins": f.margins.map(|m| json!({
+                "gain": spread(&m.gain), "lower_gain": spread(&m.lower_gain), "phase": spread(&m.phase),
+                "delay": spread(&m.delay), "sensitivity": spread(&m.sensitivity),
+            })),
         })),
     })
 }
@@ -120,6 +126,16 @@ fn worst_margins(controller: &Controller, output: Option<&OutputFeedback>) -> Op
         None => controller.margins().into_iter().flatten().collect(),
     };
     all.into_iter().reduce(Margins::worse)
+}
+
+fn margins_in_words(m: &Margins) -> String {
+    format!(
+        "gain × {} to {}, phase {}°, delay {} s",
+        format::number(m.lower_gain),
+        format::number(m.gain),
+        format::number(m.phase.to_degrees()),
+        format::number(m.delay),
+    )
 }
 
 pub(super) fn in_words(designed: &Designed<'_>) -> String {
@@ -166,16 +182,8 @@ pub(super) fn in_words(designed: &Designed<'_>) -> String {
         let integral = if output.integral() { "" } else { "; no integral action" };
         let _ = writeln!(text, "  {}; measured: {}{integral}", observer_in_words(output), sensors.join(", "));
     }
-    let worst = worst_margins(controller, output);
-    if let Some(m) = worst {
-        let _ = writeln!(
-            text,
-            "  margins: gain × {} to {}, phase {}°, delay {} s",
-            format::number(m.lower_gain),
-            format::number(m.gain),
-            format::number(m.phase.to_degrees()),
-            format::number(m.delay),
-        );
+    if let Some(m) = worst_margins(controller, output) {
+        let _ = writeln!(text, "  margins: {}", margins_in_words(&m));
     }
     for dropped in plant.dropped() {
         let _ = writeln!(text, "  left out of {}: {}", dropped.equation, dropped.term);
@@ -204,6 +212,15 @@ pub(super) fn in_words(designed: &Designed<'_>) -> String {
             "  on {} perturbed plants: {} settle, {} diverge",
             f.members, f.settled, f.diverged
         );
+        match f.margins {
+            Some(_) if f.unstable > 0 => {
+                let _ = writeln!(text, "  linearised, {} of them are unstable at a set point", f.unstable);
+            }
+            Some(m) => {
+                let _ = writeln!(text, "  their worst margins: {}", margins_in_words(&m.worst()));
+            }
+            None => {}
+        }
     }
     text
 }

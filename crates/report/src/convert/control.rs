@@ -8,7 +8,8 @@ use greybox_model::{Expr, Model};
 use super::coherent;
 use crate::contract::{ModelId, Producer};
 use crate::control::{
-    ControlPage, Figure, LawKind, LawState, LoopRun, ObserverPage, Perturbed, Quantity, SensorPage, SetPoint,
+    ControlPage, Figure, LawKind, LawState, LoopRun, ObserverPage, Perturbed, PerturbedMargins, Quantity,
+    SensorPage, SetPoint,
 };
 use crate::format;
 
@@ -75,6 +76,7 @@ pub fn page(sources: &ControlSources<'_>) -> ControlPage {
         poles: c.poles.iter().map(pole).collect(),
         held_poles: c.held_poles.iter().map(pole).collect(),
     });
+    let set_points: Vec<SetPoint> = set_points.collect();
     let symbols = model
         .states
         .iter()
@@ -128,11 +130,11 @@ pub fn page(sources: &ControlSources<'_>) -> ControlPage {
         }),
         delay: sources.delay,
         left_out: plant.dropped().iter().map(|d| (d.equation.clone(), d.term.to_string())).collect(),
-        set_points: set_points.collect(),
         steps: run.metrics.clone(),
         family: sources.family.map(|(family, deviations)| {
             let unit = states.get(controller.tracked()).map_or("", |s| s.quantity.unit.as_str());
-            perturbed(family, deviations, model, &run.metrics, [unit, &input.unit])
+            let margins = set_points.iter().filter_map(|s| s.margins).reduce(Margins::worse);
+            perturbed(family, deviations, model, (&run.metrics, margins), [unit, &input.unit])
         }),
         run: LoopRun {
             t: run.t.clone(),
@@ -143,6 +145,7 @@ pub fn page(sources: &ControlSources<'_>) -> ControlPage {
             diverged: run.diverged.and_then(|k| run.t.get(k).copied()),
         },
         files: sources.files.to_vec(),
+        set_points,
         states,
         input,
     }
@@ -151,6 +154,11 @@ pub fn page(sources: &ControlSources<'_>) -> ControlPage {
 /// Zero where a value is nothing against its size.
 fn rounded(value: f64, size: f64) -> f64 {
     if value.abs() < 1e-12 * size { 0.0 } else { value }
+}
+
+/// `V` → `(V)^2 s`
+pub(crate) fn squared(unit: &str) -> String {
+    if unit.is_empty() { String::new() } else { format!("({unit})^2 s") }
 }
 
 /// `rad` → `rad/s^2`
@@ -205,10 +213,10 @@ fn perturbed(
     family: &Family,
     deviations: &[(String, f64)],
     model: &Model,
-    own: &[Metrics],
+    (own_metrics, own_margins): (&[Metrics], Option<Margins>),
     [tracked, input]: [&str; 2],
 ) -> Perturbed {
-    let own = |of: fn(&Metrics) -> f64| own.iter().map(of).fold(0.0, f64::max);
+    let own = |of: fn(&Metrics) -> f64| own_metrics.iter().map(of).fold(0.0, f64::max);
     let figure = |name, unit: &str, own: f64, spread: Spread| Figure {
         name,
         unit: unit.to_owned(),
@@ -230,8 +238,16 @@ fn perturbed(
             figure("Settling", "s", own(|m| m.settling.unwrap_or(f64::INFINITY)), family.settling),
             figure("Overshoot", "%", own(|m| m.overshoot), family.overshoot),
             figure("Final error", tracked, own(|m| m.final_error.abs()), family.final_error),
+            figure("Peak to peak at rest", tracked, own(|m| m.peak_to_peak), family.peak_to_peak),
             figure("Largest command", input, own(|m| m.largest_command), family.largest_command),
+            figure("∫ u² dt", &squared(input), own_metrics.iter().map(|m| m.effort).sum(), family.effort),
         ],
+        margins: family.margins.zip(own_margins).map(|(margins, own)| PerturbedMargins {
+            own,
+            median: margins.median(),
+            worst: margins.worst(),
+            unstable: family.unstable,
+        }),
         tracked: [family.tracked.lowest.clone(), family.tracked.highest.clone()],
         command: [family.command.lowest.clone(), family.command.highest.clone()],
     }

@@ -1,10 +1,11 @@
 //! The page of a controller: what its loop reached, the law, its poles, and what it does not promise.
 
 use askama::Template;
-use greybox_control::{Metrics, Verdict};
+use greybox_control::{Margins, Metrics, Verdict};
 
 use super::{Assets, Common, Island, PlotData, PlotView, SeriesData, extent, quantity_html, series, span};
 use crate::control::{ControlPage, LawKind, Quantity};
+use crate::convert::control::squared;
 use crate::decimate::{Buckets, MAX_POINTS};
 use crate::{ReportError, expression, format, sentence, svg};
 
@@ -76,6 +77,9 @@ struct FamilyView {
     settled: usize,
     parameters: Vec<[String; 4]>,
     figures: Vec<[String; 4]>,
+    /// A row for the model, the median and the worst plant; empty without margins.
+    margins: Vec<[String; 6]>,
+    unstable: usize,
 }
 
 struct PoleRow {
@@ -244,19 +248,23 @@ fn fed_back(page: &ControlPage) -> String {
 /// A row for each set point that has margins.
 fn margins(page: &ControlPage) -> Vec<[String; 6]> {
     let unit = page.states.get(page.tracked).map_or("", |s| s.quantity.unit.as_str());
-    let bounded = |v: f64| if v.is_finite() { format::number(v) } else { "any".to_owned() };
     let row = |s: &crate::control::SetPoint| {
-        let m = s.margins?;
-        Some([
-            format::with_unit(&format::plain(s.value), unit),
-            bounded(m.gain),
-            format::number(m.lower_gain),
-            format::number(m.phase.to_degrees()),
-            bounded(m.delay),
-            format::number(m.sensitivity),
-        ])
+        Some(margin_row(format::with_unit(&format::plain(s.value), unit), &s.margins?))
     };
     page.set_points.iter().filter_map(row).collect()
+}
+
+/// Of whom, gain, lower gain, phase, delay, sensitivity.
+fn margin_row(of: String, m: &Margins) -> [String; 6] {
+    let bounded = |v: f64| if v.is_finite() { format::number(v) } else { "any".to_owned() };
+    [
+        of,
+        bounded(m.gain),
+        format::number(m.lower_gain),
+        format::number(m.phase.to_degrees()),
+        bounded(m.delay),
+        if m.sensitivity.is_finite() { format::number(m.sensitivity) } else { "unbounded".to_owned() },
+    ]
 }
 
 /// The headline figures: name, value, what it is.
@@ -355,7 +363,7 @@ fn plots(page: &ControlPage, island: &mut Island) -> Vec<PlotView> {
 fn step_heads(tracked: &Quantity, input: &Quantity) -> Vec<(&'static str, String)> {
     let unit =
         |unit: &str| if unit.is_empty() { String::new() } else { format!("in {}", format::unit(unit)) };
-    let squared = if input.unit.is_empty() { String::new() } else { format!("({})^2 s", input.unit) };
+    let squared = squared(&input.unit);
     vec![
         ("Set point", unit(&tracked.unit)),
         ("Step", unit(&tracked.unit)),
@@ -403,7 +411,13 @@ fn family(page: &ControlPage) -> Option<FamilyView> {
             format::unit(&quantity.unit),
         ]
     };
+    let margins = family.margins.iter().flat_map(|m| {
+        [("Model", m.own), ("Median plant", m.median), ("Worst plant", m.worst)]
+            .map(|(of, margins)| margin_row(of.to_owned(), &margins))
+    });
     Some(FamilyView {
+        margins: margins.collect(),
+        unstable: family.margins.map_or(0, |m| m.unstable),
         members: family.members,
         diverged: family.diverged,
         settled: family.settled,

@@ -2,7 +2,7 @@
 
 use greybox_control::{Metrics, Verdict};
 
-use crate::control::ControlPage;
+use crate::control::{ControlPage, PerturbedMargins};
 use crate::{expression, format};
 
 /// The conclusion, most important first: how the loop settles, then what holds on perturbed plants, then the command.
@@ -25,8 +25,27 @@ pub fn summary(page: &ControlPage) -> Vec<String> {
             )
         }
     });
+    out.extend(page.family.as_ref().and_then(|f| f.margins).map(|m| margins(&m)));
     out.push(command(page));
     out
+}
+
+/// What the loop has to spare on the worst of the perturbed plants.
+fn margins(of: &PerturbedMargins) -> String {
+    match of.unstable {
+        0 => {}
+        1 => return "On one of them the linearised loop is unstable at a set point.".to_owned(),
+        n => return format!("On {n} of them the linearised loop is unstable at a set point."),
+    }
+    let bounded = |v: f64, unit: &str| {
+        if v.is_finite() { format!("at least {}{unit}", format::number(v)) } else { "unlimited".to_owned() }
+    };
+    format!(
+        "On all of them the gain margin is {}, the phase margin {} and the delay margin {}.",
+        bounded(of.worst.gain, ""),
+        bounded(of.worst.phase.to_degrees(), "°"),
+        bounded(of.worst.delay, " s"),
+    )
 }
 
 fn reached(page: &ControlPage, name: &str, unit: &str) -> String {
