@@ -239,6 +239,8 @@ def control(
     input: str | None = None,
     track: str | None = None,
     to: float = 1.0,
+    reference: RecordingLike | None = None,
+    feed_forward: str = "dynamic",
     size: Mapping[str, float] | None = None,
     input_size: float = 1.0,
     limit: float | None = None,
@@ -271,6 +273,8 @@ def control(
             ``eta``).
         input: input that commands; the model's only one where it has one.
         track, to: state to bring to the set points ± ``to``.
+        reference: trajectory for that state to follow instead, a recording with a channel of it; the law reads its value
+            alone (``feed_forward`` is ``static``) or its first two derivatives too (``dynamic``).
         size, input_size: typical sizes of states and command, from which the weights follow.
         limit: the actuator gives ± this at most.
         dt: sample time of the law, s.
@@ -318,6 +322,7 @@ def control(
         "input": input,
         "track": track,
         "to": to,
+        "feed_forward": feed_forward,
         "size": [(name, float(value)) for name, value in (size or {}).items()],
         "input_size": input_size,
         "limit": limit,
@@ -340,4 +345,5 @@ def control(
         "members": members,
         "seed": seed,
     }
-    return Control(_native.control(native(model), wanted, told, progress))
+    followed = None if reference is None else recordings([reference], "reference", None)[0]
+    return Control(_native.control(native(model), wanted, followed, told, progress))

@@ -8,7 +8,7 @@ use rayon::prelude::*;
 use crate::closed_loop::ClosedLoop;
 use crate::error::ControlError;
 use crate::margins::Margins;
-use crate::metrics::{Metrics, Verdict};
+use crate::metrics::{Metrics, Tracking, Verdict};
 use crate::run::{Reference, Run};
 
 /// Most members of a family.
@@ -37,11 +37,22 @@ pub struct Spread {
 }
 
 impl Spread {
+    const UNKNOWN: Spread = Spread { median: f64::NAN, worst: f64::NAN };
+
     /// Of values that are better the smaller they are; none where there is no value.
     fn of(mut values: Vec<f64>) -> Option<Spread> {
         values.sort_by(f64::total_cmp);
         Some(Spread { median: *values.get(values.len() / 2)?, worst: *values.last()? })
     }
+}
+
+/// [`Tracking::later_error`] over a family.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct TrackingSpread {
+    /// Root mean square.
+    pub rms_error: Spread,
+    /// Largest magnitude.
+    pub largest_error: Spread,
 }
 
 /// [`Margins`] over a family: the worst over the set points of each member is taken first.
@@ -107,19 +118,21 @@ pub struct Family {
     pub members: usize,
     /// Members whose state or command left every bound.
     pub diverged: usize,
-    /// Members that settled to 2 % at every set point.
+    /// Members that settled to 2 % at every set point, or stayed within 2 % of the span of a trajectory.
     pub settled: usize,
-    /// Settling time, s.
+    /// Settling time, s; not a number along a trajectory, as are the next two.
     pub settling: Spread,
     /// Overshoot over the step.
     pub overshoot: Spread,
     /// Size of the final error.
     pub final_error: Spread,
+    /// Errors along a trajectory after the first quarter of the time; none for set points.
+    pub tracking: Option<TrackingSpread>,
     /// Largest |u|.
     pub largest_command: Spread,
     /// ∫ u² dt over all set points.
     pub effort: Spread,
-    /// Largest less least tracked state in the last quarter of the time of a set point.
+    /// Largest less least tracked state in the last quarter of the time of a set point; not a number along a trajectory.
     pub peak_to_peak: Spread,
     /// Margins of the law (and its observer) on each member's plant; none where the law has none on its own.
     pub margins: Option<MarginSpread>,
@@ -167,7 +180,8 @@ impl Envelope {
 /// Members run so far, in order.
 #[derive(Default)]
 struct Members {
-    metrics: Vec<Option<Vec<Metrics>>>,
+    /// None where the run diverged.
+    metrics: Vec<Option<(Vec<Metrics>, Option<Tracking>)>>,
     margins: Vec<Option<Margins>>,
     tracked: Envelope,
     command: Envelope,
@@ -182,7 +196,7 @@ impl Members {
         }
         self.tracked = self.tracked.join(Envelope::of(&run.x[run.tracked]));
         self.command = self.command.join(Envelope::of(&run.u));
-        self.metrics.push(Some(std::mem::take(&mut run.metrics)));
+        self.metrics.push(Some((std::mem::take(&mut run.metrics), run.tracking)));
         self
     }
 
@@ -233,27 +247,63 @@ impl ClosedLoop<'_> {
             .map(member)
             .try_fold(Members::default, |before, found| Ok::<_, ControlError>(before.with(found?)))
             .try_reduce(Members::default, |a, b| Ok(a.join(b)))?;
-        let spread = |of: &dyn Fn(&[Metrics]) -> f64| {
-            let values = runs.iter().map(|run| run.as_ref().map_or(f64::INFINITY, |m| of(m)));
-            Spread::of(values.collect()).unwrap_or(Spread { median: f64::NAN, worst: f64::NAN })
-        };
-        let worst = |of: fn(&Metrics) -> f64| move |m: &[Metrics]| m.iter().map(of).fold(0.0, f64::max);
-        let settled = |m: &Vec<Metrics>| m.iter().all(|m| m.settling.is_some());
+        let settled = runs.iter().flatten().filter(|(m, tracking)| settled(m, tracking.as_ref())).count();
+        let figures = Figures { runs: &runs, moves: matches!(reference, Reference::Trajectory(_)) };
         Ok(Family {
             members: runs.len(),
             diverged: runs.iter().filter(|run| run.is_none()).count(),
-            settled: runs.iter().flatten().filter(|m| settled(m)).count(),
-            settling: spread(&worst(|m| m.settling.unwrap_or(f64::INFINITY))),
-            overshoot: spread(&worst(|m| m.overshoot)),
-            final_error: spread(&worst(|m| m.final_error.abs())),
-            largest_command: spread(&worst(|m| m.largest_command)),
-            effort: spread(&|m: &[Metrics]| m.iter().map(|m| m.effort).sum()),
-            peak_to_peak: spread(&worst(|m| m.peak_to_peak)),
+            settled,
+            settling: figures.at_set_points(|m| m.settling.unwrap_or(f64::INFINITY)),
+            overshoot: figures.at_set_points(|m| m.overshoot),
+            final_error: figures.at_set_points(|m| m.final_error.abs()),
+            peak_to_peak: figures.at_set_points(|m| m.peak_to_peak),
+            largest_command: figures.spread(|m, t| {
+                largest(m.iter().map(|m| m.largest_command).chain(t.map(|t| t.largest_command)))
+            }),
+            effort: figures.spread(|m, t| m.iter().map(|m| m.effort).chain(t.map(|t| t.effort)).sum()),
+            tracking: figures.moves.then(|| TrackingSpread {
+                rms_error: figures.spread(|_, t| t.map_or(f64::INFINITY, |t| t.later_error.rms)),
+                largest_error: figures.spread(|_, t| t.map_or(f64::INFINITY, |t| t.later_error.largest)),
+            }),
             unstable: margins.iter().flatten().filter(|m| **m == Margins::NONE).count(),
             margins: margins.into_iter().collect::<Option<Vec<_>>>().and_then(|all| MarginSpread::of(&all)),
             tracked,
             command,
         })
+    }
+}
+
+/// Whether a run settled at every set point, or stayed with its trajectory.
+fn settled(metrics: &[Metrics], tracking: Option<&Tracking>) -> bool {
+    match tracking {
+        Some(tracking) => tracking.is_close(),
+        None => !metrics.is_empty() && metrics.iter().all(|m| m.settling.is_some()),
+    }
+}
+
+fn largest(values: impl Iterator<Item = f64>) -> f64 {
+    values.fold(0.0, f64::max)
+}
+
+/// What the members reached.
+struct Figures<'a> {
+    runs: &'a [Option<(Vec<Metrics>, Option<Tracking>)>],
+    /// Along a trajectory.
+    moves: bool,
+}
+
+impl Figures<'_> {
+    /// A figure of every member; infinite of those that diverged.
+    fn spread(&self, of: impl Fn(&[Metrics], Option<&Tracking>) -> f64) -> Spread {
+        let value = |run: &Option<(Vec<Metrics>, Option<Tracking>)>| {
+            run.as_ref().map_or(f64::INFINITY, |(metrics, tracking)| of(metrics, tracking.as_ref()))
+        };
+        Spread::of(self.runs.iter().map(value).collect()).unwrap_or(Spread::UNKNOWN)
+    }
+
+    /// The worst set point of every member.
+    fn at_set_points(&self, of: fn(&Metrics) -> f64) -> Spread {
+        if self.moves { Spread::UNKNOWN } else { self.spread(|m, _| largest(m.iter().map(of))) }
     }
 }
 
@@ -278,14 +328,18 @@ impl Run {
     /// What this run did, and the same law on perturbed plants, where they were tried.
     #[must_use]
     pub fn verdict(&self, family: Option<&Family>) -> Verdict {
+        let (good, bad) = match self.tracking {
+            Some(_) => (Verdict::Tracks, Verdict::Strays),
+            None => (Verdict::Settles, Verdict::Unsettled),
+        };
         if self.diverged.is_some() {
             Verdict::Diverges
-        } else if self.metrics.is_empty() || self.metrics.iter().any(|m| m.settling.is_none()) {
-            Verdict::Unsettled
+        } else if !settled(&self.metrics, self.tracking.as_ref()) {
+            bad
         } else if family.is_some_and(|f| f.settled < f.members) {
             Verdict::Fragile
         } else {
-            Verdict::Settles
+            good
         }
     }
 }

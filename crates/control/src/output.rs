@@ -175,7 +175,8 @@ impl OutputFeedback {
         };
         let law = limited(&law, plant, low, high);
         let mut variables = plant.symbols().to_vec();
-        variables.extend([(disturbance.clone(), 0), (controller.reference().to_owned(), 0)]);
+        variables.push((disturbance.clone(), 0));
+        variables.extend((0..3).map(|primes| (controller.reference().to_owned(), primes)));
         let compiled = Compiled::new(std::slice::from_ref(&law), &variables, plant.parameters())?;
         let mut feedback = OutputFeedback {
             observer,
@@ -249,11 +250,17 @@ impl OutputFeedback {
     /// measurement that is not a number is left out of the estimate. Not a number where the law is none there: the
     /// caller must then do what is safe.
     pub fn command(&self, memory: &mut OutputMemory, y: &[f64], r: f64) -> f64 {
+        self.command_along(memory, y, &[r, 0.0, 0.0])
+    }
+
+    /// The same for a reference r that moves, with r′ and r″ ([`Controller::command_along`]); where the command acts late, those of
+    /// the time at which it acts.
+    pub fn command_along(&self, memory: &mut OutputMemory, y: &[f64], reference: &[f64; 3]) -> f64 {
         let u = memory.command;
         let behind = if u.is_finite() { u - u.clamp(-self.dead_zone, self.dead_zone) } else { 0.0 };
         self.observer.update(&mut memory.observer, y, behind);
         let mut at = self.observer.ahead(&memory.observer);
-        at.push(r);
+        at.extend(reference);
         let mut u = [f64::NAN];
         if at.iter().all(|v| v.is_finite()) {
             self.compiled.eval(&at, 0, &mut u);
@@ -388,7 +395,7 @@ impl Controller {
     /// ∂u/∂x at a state of rest, friction dropped.
     pub(crate) fn frictionless_gain(&self, x: &[f64], r: f64) -> Vec<f64> {
         let mut at = x.to_vec();
-        at.push(r);
+        at.extend([r, 0.0, 0.0]);
         self.frictionless.jacobian(&at).row(0).iter().take(x.len()).copied().collect()
     }
 

@@ -7,3 +7,4 @@ mod link;
 mod loops;
 mod output;
 mod plants;
+mod trajectories;

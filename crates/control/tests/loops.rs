@@ -26,7 +26,7 @@ fn a_pendulum_is_held_anywhere() {
     ] {
         let law = design(&plant, &method, &DesignOptions::new("theta", &set_points, 2e-3)).unwrap();
         assert_eq!(law.limits(), (-3.0, 3.0));
-        let reference = Reference {
+        let reference = Reference::SetPoints {
             set_points: set_points.iter().enumerate().map(|(k, r)| (3.0 * k as f64, *r)).collect(),
             duration: 15.0,
         };
@@ -190,8 +190,10 @@ fn what_runs_away_is_told() {
     let run = looped.run_with(&[0.02, 0.0, 0.0], &Reference::step(1.0, 20.0)).unwrap();
     assert!(run.diverged.is_some_and(|k| k < 1000 && run.t.len() == k + 1), "{:?}", run.diverged);
     assert!(run.metrics.iter().all(|m| m.settling.is_none()));
-    let reference =
-        |set_points: &[(f64, f64)], duration: f64| Reference { set_points: set_points.to_vec(), duration };
+    let reference = |set_points: &[(f64, f64)], duration: f64| Reference::SetPoints {
+        set_points: set_points.to_vec(),
+        duration,
+    };
     for bad in [
         reference(&[], 1.0),
         reference(&[(1.0, 0.0)], 2.0),

@@ -249,7 +249,8 @@ fn a_late_command_is_predicted_over() {
     let set_points = DesignOptions::new("theta", &[-1.0, 1.0], 2e-3);
     let prompt = law(&arm(0.0));
     // At rest first: what a delayed command was before the start is what it is there.
-    let reference = Reference { set_points: vec![(0.0, 0.0), (0.2, 0.5), (3.2, -0.5)], duration: 6.2 };
+    let reference =
+        Reference::SetPoints { set_points: vec![(0.0, 0.0), (0.2, 0.5), (3.2, -0.5)], duration: 6.2 };
     let fine = Sensor { noise: 1e-5, resolution: 0.0 };
     let wanted = run(&arm(0.0), &prompt, &LoopOptions::default(), &reference);
     // A part of a sample, whole samples, both.

@@ -1,7 +1,7 @@
 //! The page of a controller: its structure, its words, that nothing escapes from its place, and a browser.
 #![allow(clippy::unwrap_used, reason = "helpers of tests panic like the tests themselves")]
 
-use greybox_control::{Margins, Metrics, Verdict};
+use greybox_control::{Margins, Metrics, Tracking, TrackingError, Verdict};
 use greybox_report::ControlPage;
 use greybox_report::contract::{ModelId, Producer};
 use greybox_report::control::{
@@ -67,6 +67,9 @@ fn page() -> ControlPage {
         left_out: vec![("arm".into(), "ad*sin(om*t)".into())],
         set_points: vec![point(-0.5), point(0.5)],
         steps: vec![step(0.5), step(-0.5)],
+        is_trajectory: false,
+        reads_derivatives: false,
+        tracking: None,
         family: Some(Perturbed {
             members: 50,
             diverged: 0,
@@ -262,4 +265,37 @@ fn an_unstable_plant_is_told() {
     assert!(!html.contains("On all of them"));
     page.family.as_mut().unwrap().margins = None;
     assert!(!page.to_html().unwrap().contains("Median plant</th><td"));
+}
+
+/// Along a trajectory the page has errors in the place of steps, and says what the law is given.
+#[test]
+fn a_trajectory_has_its_errors() {
+    let mut page = page();
+    page.steps.clear();
+    (page.is_trajectory, page.reads_derivatives, page.verdict) = (true, true, Verdict::Strays);
+    page.tracking = Some(Tracking {
+        span: 1.0,
+        error: TrackingError { rms: 0.021, largest: 0.132 },
+        later_error: TrackingError { rms: 0.0123, largest: 0.0456 },
+        largest_command: 7.5,
+        saturated: 0.03,
+        effort: 4.5,
+    });
+    let html = page.to_html().unwrap().replace('\u{a0}', " ");
+    for text in [
+        "The loop does not stay with its trajectory",
+        "After the first quarter of the time θ is 0.0456 rad from its trajectory at most, 4.6 % of its span, and 0.0123 rad in \
+         the root mean square; over the whole of the time 0.132 rad at most.",
+        "50 stay with the trajectory; none diverges.",
+        "v reaches 7.50 V, its limit, and is there for 3.0 % of the time.",
+        "<sub>d</sub>",
+        "the law must be given the rate and the acceleration",
+    ] {
+        assert!(html.contains(text), "the page lacks {text:?}");
+    }
+    assert!(!html.contains("What each step of") && !html.contains("Settling to 2"));
+    (page.tracking, page.verdict) = (None, Verdict::Diverges);
+    page.run.diverged = Some(0.3);
+    let html = page.to_html().unwrap();
+    assert!(html.contains("<dd>not reached<small>") && html.contains("leaves every bound after 0.3 s"));
 }

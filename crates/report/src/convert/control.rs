@@ -1,7 +1,8 @@
 //! From a controller and its simulated loops to the page.
 
 use greybox_control::{
-    Controller, Family, Margins, Method, Metrics, ObserverMethod, OutputFeedback, Run, Spread,
+    Controller, Family, Margins, Method, Metrics, ObserverMethod, OutputFeedback, Run, Spread, Tracking,
+    TrackingSpread,
 };
 use greybox_model::{Expr, Model};
 
@@ -28,6 +29,8 @@ pub struct ControlSources<'a> {
     pub delay: f64,
     /// Its loop on the model.
     pub run: &'a Run,
+    /// Whether that followed a trajectory instead of set points.
+    pub is_trajectory: bool,
     /// The perturbed plants, with the standard deviations (SI) of their parameters.
     pub family: Option<(&'a Family, &'a [(String, f64)])>,
     /// Version and seed.
@@ -131,10 +134,13 @@ pub fn page(sources: &ControlSources<'_>) -> ControlPage {
         delay: sources.delay,
         left_out: plant.dropped().iter().map(|d| (d.equation.clone(), d.term.to_string())).collect(),
         steps: run.metrics.clone(),
+        is_trajectory: sources.is_trajectory,
+        reads_derivatives: controller.trajectories(),
+        tracking: run.tracking,
         family: sources.family.map(|(family, deviations)| {
             let unit = states.get(controller.tracked()).map_or("", |s| s.quantity.unit.as_str());
             let margins = set_points.iter().filter_map(|s| s.margins).reduce(Margins::worse);
-            perturbed(family, deviations, model, (&run.metrics, margins), [unit, &input.unit])
+            perturbed(family, deviations, model, (run, margins), [unit, &input.unit])
         }),
         run: LoopRun {
             t: run.t.clone(),
@@ -213,17 +219,9 @@ fn perturbed(
     family: &Family,
     deviations: &[(String, f64)],
     model: &Model,
-    (own_metrics, own_margins): (&[Metrics], Option<Margins>),
-    [tracked, input]: [&str; 2],
+    (own, own_margins): (&Run, Option<Margins>),
+    units: [&str; 2],
 ) -> Perturbed {
-    let own = |of: fn(&Metrics) -> f64| own_metrics.iter().map(of).fold(0.0, f64::max);
-    let figure = |name, unit: &str, own: f64, spread: Spread| Figure {
-        name,
-        unit: unit.to_owned(),
-        own,
-        median: spread.median,
-        worst: spread.worst,
-    };
     let parameters = deviations.iter().filter_map(|(name, deviation)| {
         let parameter = &model.parameters[model.parameter(name)?];
         let unit = parameter.unit.as_ref().map(coherent).unwrap_or_default();
@@ -234,14 +232,10 @@ fn perturbed(
         diverged: family.diverged,
         settled: family.settled,
         deviations: parameters.collect(),
-        figures: vec![
-            figure("Settling", "s", own(|m| m.settling.unwrap_or(f64::INFINITY)), family.settling),
-            figure("Overshoot", "%", own(|m| m.overshoot), family.overshoot),
-            figure("Final error", tracked, own(|m| m.final_error.abs()), family.final_error),
-            figure("Peak to peak at rest", tracked, own(|m| m.peak_to_peak), family.peak_to_peak),
-            figure("Largest command", input, own(|m| m.largest_command), family.largest_command),
-            figure("∫ u² dt", &squared(input), own_metrics.iter().map(|m| m.effort).sum(), family.effort),
-        ],
+        figures: match &family.tracking {
+            Some(tracking) => followed(family, tracking, own, units),
+            None => reached(family, &own.metrics, units),
+        },
         margins: family.margins.zip(own_margins).map(|(margins, own)| PerturbedMargins {
             own,
             median: margins.median(),
@@ -251,4 +245,32 @@ fn perturbed(
         tracked: [family.tracked.lowest.clone(), family.tracked.highest.clone()],
         command: [family.command.lowest.clone(), family.command.highest.clone()],
     }
+}
+
+fn figure(name: &'static str, unit: &str, own: f64, spread: Spread) -> Figure {
+    Figure { name, unit: unit.to_owned(), own, median: spread.median, worst: spread.worst }
+}
+
+/// What the plants reached at set points.
+fn reached(family: &Family, own: &[Metrics], [tracked, input]: [&str; 2]) -> Vec<Figure> {
+    let most = |of: fn(&Metrics) -> f64| own.iter().map(of).fold(0.0, f64::max);
+    vec![
+        figure("Settling", "s", most(|m| m.settling.unwrap_or(f64::INFINITY)), family.settling),
+        figure("Overshoot", "%", most(|m| m.overshoot), family.overshoot),
+        figure("Final error", tracked, most(|m| m.final_error.abs()), family.final_error),
+        figure("Peak to peak at rest", tracked, most(|m| m.peak_to_peak), family.peak_to_peak),
+        figure("Largest command", input, most(|m| m.largest_command), family.largest_command),
+        figure("∫ u² dt", &squared(input), own.iter().map(|m| m.effort).sum(), family.effort),
+    ]
+}
+
+/// How the plants followed a trajectory.
+fn followed(family: &Family, of: &TrackingSpread, own: &Run, [tracked, input]: [&str; 2]) -> Vec<Figure> {
+    let own = |value: fn(&Tracking) -> f64| own.tracking.as_ref().map_or(f64::INFINITY, value);
+    vec![
+        figure("RMS error", tracked, own(|t| t.later_error.rms), of.rms_error),
+        figure("Largest error", tracked, own(|t| t.later_error.largest), of.largest_error),
+        figure("Largest command", input, own(|t| t.largest_command), family.largest_command),
+        figure("∫ u² dt", &squared(input), own(|t| t.effort), family.effort),
+    ]
 }
