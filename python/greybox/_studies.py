@@ -239,6 +239,8 @@ def control(
     input: str | None = None,
     track: str | None = None,
     to: float = 1.0,
+    reference: RecordingLike | None = None,
+    feed_forward: str = "dynamic",
     size: Mapping[str, float] | None = None,
     input_size: float = 1.0,
     limit: float | None = None,
@@ -260,7 +262,7 @@ def control(
     integral: bool = True,
     delay: float = 0.0,
     report: str | os.PathLike[str] | Diagnosis | Calibration | None = None,
-    members: int = 50,
+    members: int = 200,
     seed: int = 0,
     progress: Progress | None = None,
 ) -> Control:
@@ -272,6 +274,8 @@ def control(
             ``eta``).
         input: input that commands; the model's only one where it has one.
         track, to: state to bring to the set points ± ``to``.
+        reference: trajectory for that state to follow instead, a recording with a channel of it; the law reads its value
+            alone (``feed_forward`` is ``static``) or its first two derivatives too (``dynamic``).
         size, input_size: typical sizes of states and command, from which the weights follow.
         limit: the actuator gives ± this at most.
         bounded: hold the limits by the cost, so that the law slows down in time; without this they clip it (hjb).
@@ -284,7 +288,8 @@ def control(
             (``bandwidth``, 1/s); the law takes the disturbance that it estimates off the command, its ``integral`` action.
         noise, resolution: standard deviations and steps of the measured states' sensors.
         delay: of the simulated loop, s.
-        report: how sure the model's parameters are, for the perturbed plants (``members``, ``seed``).
+        report: how sure the model's parameters are, for the perturbed plants (``members``, ``seed``); the report has
+            the worst of them, margins included.
         progress: hears what is being done.
 
     >>> import greybox
@@ -319,6 +324,7 @@ def control(
         "input": input,
         "track": track,
         "to": to,
+        "feed_forward": feed_forward,
         "size": [(name, float(value)) for name, value in (size or {}).items()],
         "input_size": input_size,
         "limit": limit,
@@ -342,4 +348,5 @@ def control(
         "members": members,
         "seed": seed,
     }
-    return Control(_native.control(native(model), wanted, told, progress))
+    followed = None if reference is None else recordings([reference], "reference", None)[0]
+    return Control(_native.control(native(model), wanted, followed, told, progress))

@@ -2,14 +2,14 @@
 
 use std::path::PathBuf;
 
-use greybox_commands::Failure;
 use greybox_commands::control::{self as design, ObserverKind, ObserverRequest, Request, Way};
+use greybox_commands::{Failure, loading};
 use numpy::PyArray1;
 use pyo3::prelude::*;
 use pyo3::types::PyBytes;
 
 use crate::error::raised;
-use crate::input::Model;
+use crate::input::{Model, Source};
 use crate::watch::watched;
 
 /// As the arguments of `greybox control`.
@@ -20,6 +20,7 @@ pub(crate) struct Wanted {
     input: Option<String>,
     track: Option<String>,
     to: f64,
+    feed_forward: String,
     size: Vec<(String, f64)>,
     input_size: f64,
     limit: Option<f64>,
@@ -78,6 +79,14 @@ impl Wanted {
 
     fn request(self) -> Result<Request, Failure> {
         let observer = self.observer()?;
+        let static_feed_forward = match self.feed_forward.as_str() {
+            "static" => true,
+            "dynamic" => false,
+            other => {
+                return Err(Failure::input(format!("`{other}` is no feed-forward"))
+                    .help("choose `static` or `dynamic`"));
+            }
+        };
         let method = match self.method.as_str() {
             "lqr" => Way::Lqr,
             "hjb" => Way::Hjb,
@@ -97,6 +106,8 @@ impl Wanted {
             input: self.input,
             track: self.track,
             to: self.to,
+            trajectory: None,
+            static_feed_forward,
             sizes: self.size,
             input_size: self.input_size,
             limit: self.limit,
@@ -128,18 +139,26 @@ type Controlled<'py> = (
     (Array<'py>, Array<'py>, Array<'py>, Vec<(String, Array<'py>)>),
 );
 
-/// `report` is the report that the model is from: what errors call it, and its text.
+/// `report` is the report that the model is from: what errors call it, and its text; `reference` the trajectory.
 #[pyfunction]
-#[pyo3(signature = (model, wanted, report, progress))]
+#[pyo3(signature = (model, wanted, reference, report, progress))]
 pub(crate) fn control<'py>(
     py: Python<'py>,
     model: &Model,
     wanted: Wanted,
+    reference: Option<Source>,
     report: Option<(PathBuf, String)>,
     progress: Option<&Bound<'py, PyAny>>,
 ) -> PyResult<Controlled<'py>> {
     let loaded = model.loaded();
-    let request = raised(py, wanted.request())?;
+    let track = wanted.track.clone();
+    let mut request = raised(py, wanted.request())?;
+    if let Some(reference) = reference {
+        let channel = design::channel(&loaded.model, track.as_deref()).map(|c| vec![c]);
+        let recording = raised(py, reference.read(&loading::Wanted::default().of_names(channel)))?;
+        let path = PathBuf::from(&recording.name);
+        request.trajectory = Some(raised(py, design::trajectory(&loaded, track.as_deref(), &recording, &path))?);
+    }
     let results = watched(py, progress, move |watch| {
         let report = report.as_ref().map(|(path, text)| (path.as_path(), text.as_str()));
         design::control(&loaded, &request, report, &|what| watch.stage(what))

@@ -112,6 +112,17 @@ pub(crate) enum Source {
     File(PathBuf),
 }
 
+impl Source {
+    /// # Errors
+    /// Bad input: a file that is no recording.
+    pub(crate) fn read(self, wanted: &Wanted) -> Result<greybox_recording::Recording, Failure> {
+        match self {
+            Source::Memory(recording) => Ok(recording.get().0.clone()),
+            Source::File(path) => loading::recordings(&[path], wanted).and_then(only),
+        }
+    }
+}
+
 /// The recordings to learn from and those held out, not read yet.
 pub(crate) struct Sources {
     train: Vec<Place>,

@@ -84,6 +84,19 @@ def test_an_observer_is_the_command_s(cart, command, tmp_path):
         greybox.control(cart["model"], resolution={"x": 0.001})
 
 
+def test_a_trajectory_is_the_command_s(cart, command, tmp_path):
+    t = np.arange(101) / 50
+    move = tmp_path / "move.csv"
+    np.savetxt(move, np.c_[t, 0.1 * np.sin(t)], delimiter=",", header="t,x [m]", comments="")
+    command("control", cart["model"], "--track", "x", "--size", "x=0.2", "--reference", move, "--out", tmp_path / "out")
+    law = greybox.control(cart["model"], track="x", size={"x": 0.2}, reference=move)
+    assert law.to_json() == (tmp_path / "out" / "report.json").read_text()
+    for name, content in law.files.items():
+        assert content == (tmp_path / "out" / name).read_bytes(), name
+    with pytest.raises(greybox.InputError, match="feed-forward"):
+        greybox.control(cart["model"], reference=move, feed_forward="none")
+
+
 def test_a_check_is_the_command_s(cart, command):
     done = command("check", cart["files"][0], "--model", cart["model"], "--json")
     assert greybox.check(cart["files"][0], cart["model"]).report == json.loads(done.stdout)

@@ -72,6 +72,27 @@ fn every_method_gives_a_law_that_tracks_and_code_that_agrees() {
             assert!(point["final_error"].as_f64().unwrap().abs() < 0.02, "{name}: {point}");
         }
         assert_eq!(report["family"]["diverged"], 0, "{name}");
+        let of = |name: &str, which: &str| report["family"]["margins"][name][which].as_f64().unwrap();
+        let own = |name: &str| {
+            let all = report["checks"].as_array().unwrap().iter();
+            all.map(|c| c["margins"][name].as_f64().unwrap()).fold(f64::INFINITY, f64::min)
+        };
+        for margin in ["gain", "phase", "delay"] {
+            let (worst, median) = (of(margin, "worst"), of(margin, "median"));
+            // Ten plants, perturbed by a tenth: some are worse than the model, and none is without margin.
+            assert!(
+                0.5 * own(margin) < worst && worst < own(margin),
+                "{name} {margin}: {worst} {}",
+                own(margin)
+            );
+            assert!(worst < median, "{name} {margin}: {worst} {median}");
+        }
+        assert_eq!(report["family"]["unstable"], 0, "{name}");
+        for figure in ["effort", "peak_to_peak"] {
+            assert!(
+                report["family"][figure]["worst"].as_f64() >= report["family"][figure]["median"].as_f64()
+            );
+        }
         assert_eq!(report["verdict"], "settles", "{name}");
         for check in report["checks"].as_array().unwrap() {
             let radius = |p: &serde_json::Value| p[0].as_f64().unwrap().hypot(p[1].as_f64().unwrap());
@@ -122,7 +143,7 @@ fn a_loop_that_does_not_settle_is_not_praised() {
     assert!(!html.contains("<section id=\"family\""));
     // A gravity so uncertain that a law without integral action is often off.
     std::fs::write(folder.path().join("arm.toml"), MODEL.replace("std = 0.03", "std = 0.2")).unwrap();
-    let (reported, html) = verdict(&["--size", "theta=0.2", "--hold", "4"]);
+    let (reported, html) = verdict(&["--size", "theta=0.2", "--hold", "4", "--members", "40"]);
     assert_eq!(reported, "fragile");
     assert!(html.contains("not on every perturbed plant"));
 }
@@ -135,14 +156,18 @@ fn agrees(folder: &Path, vectors: &str) {
     }
     let rows: Vec<&str> = vectors.lines().skip(1).collect();
     assert!(rows.len() >= 64);
+    // The state, the reference with what derivatives the law reads, the command.
+    let columns = rows[0].split(',').count();
     let main = format!(
-        "#include <stdio.h>\nvoid control_law(const double state[2], const double set_point[1], double out[1]);\n\
-         static const double in[{n}][4] = {{{}}};\nint main(void) {{\n double worst = 0.0;\n\
+        "#include <stdio.h>\nvoid control_law(const double state[2], const double set_point[{r}], double out[1]);\n\
+         static const double in[{n}][{columns}] = {{{}}};\nint main(void) {{\n double worst = 0.0;\n\
          for (int i = 0; i < {n}; i++) {{\n  double u[1];\n  control_law(in[i], in[i] + 2, u);\n\
-         const double off = u[0] > in[i][3] ? u[0] - in[i][3] : in[i][3] - u[0];\n\
+         const double off = u[0] > in[i][{last}] ? u[0] - in[i][{last}] : in[i][{last}] - u[0];\n\
          if (!(off <= worst)) worst = off;\n }}\n printf(\"%.3e\\n\", worst);\n return 0;\n}}\n",
         rows.iter().map(|r| format!("{{{r}}}")).collect::<Vec<_>>().join(", "),
-        n = rows.len()
+        n = rows.len(),
+        r = columns - 3,
+        last = columns - 1
     );
     std::fs::write(folder.join("main.c"), main).unwrap();
     let strict = ["-std=c99", "-O2", "-ffreestanding", "-Wall", "-Werror", "-c", "law.c", "-o", "law.o"];
@@ -279,21 +304,28 @@ fn output_feedback_gives_code_that_repeats_the_loop() {
 fn repeats(folder: &Path, vectors: &str) {
     let rows: Vec<Vec<f64>> =
         vectors.lines().skip(1).map(|line| line.split(',').map(|v| v.parse().unwrap()).collect()).collect();
-    assert_eq!(vectors.lines().next(), Some("t,theta,set_point,command"));
-    assert!(rows.len() == 2000 && rows[0].len() == 4);
-    let n = rows.len();
+    // Time, angle, the reference with what derivatives the law reads, the command.
+    let (n, last) = (rows.len(), rows[0].len() - 1);
+    assert!(
+        vectors.starts_with("t,theta,set_point,") && (1000..=2000).contains(&n) && [3, 5].contains(&last)
+    );
     let cells = |open: &str, close: &str| {
-        let row = |r: &Vec<f64>| format!("{open}{:?}, {:?}{close}", r[1], r[2]);
+        let row = |r: &Vec<f64>| {
+            let given: Vec<String> = r[1..last].iter().map(|v| format!("{v:?}")).collect();
+            format!("{open}{}{close}", given.join(", "))
+        };
         rows.iter().map(row).collect::<Vec<_>>().join(", ")
     };
     let rust = format!(
         "#![allow(dead_code)]\nmod libm {{\n pub fn sin(x: f64) -> f64 {{ x.sin() }}\n pub fn cos(x: f64) -> f64 {{ x.cos() }}\n \
          pub fn pow(x: f64, y: f64) -> f64 {{ x.powf(y) }}\n pub fn fabs(x: f64) -> f64 {{ x.abs() }}\n}}\n\
          mod law {{\n use super::libm;\n include!(\"law.rs\");\n}}\nmod observer {{\n use super::libm;\n include!(\"observer.rs\");\n}}\n\
-         static IN: [[f64; 2]; {n}] = [{}];\nfn main() {{\n for missing in [false, true] {{\n  let mut o = observer::Observer::new();\n  \
-         for (k, [y, r]) in IN.iter().enumerate() {{\n   let y = if missing && k % 50 == 7 {{ f64::NAN }} else {{ *y }};\n   \
-         println!(\"{{:?}}\", o.step(&[y], &[*r], law::control_law));\n  }}\n }}\n}}\n",
-        cells("[", "]")
+         static IN: [[f64; {width}]; {n}] = [{}];\nfn main() {{\n for missing in [false, true] {{\n  let mut o = observer::Observer::new();\n  \
+         for (k, given) in IN.iter().enumerate() {{\n   let y = if missing && k % 50 == 7 {{ f64::NAN }} else {{ given[0] }};\n   \
+         let r = core::array::from_fn(|i| given[i + 1]);\n   \
+         println!(\"{{:?}}\", o.step(&[y], &r, law::control_law));\n  }}\n }}\n}}\n",
+        cells("[", "]"),
+        width = last - 1
     );
     std::fs::write(folder.join("main.rs"), rust).unwrap();
     let run = |program: &str| -> Vec<f64> {
@@ -314,10 +346,10 @@ fn repeats(folder: &Path, vectors: &str) {
             .map(|(a, b)| (a - b).abs())
             .fold(0.0, |worst: f64, d| if d <= worst { worst } else { d })
     };
-    let worst = off(&by_rust[..n], &mut rows.iter().map(|r| r[3]));
+    let worst = off(&by_rust[..n], &mut rows.iter().map(|r| r[last]));
     assert!(by_rust.len() == 2 * n && worst < 1e-8, "{worst:e}");
     // Forty missing measurements change little, and end nothing.
-    let missing = off(&by_rust[n..], &mut rows.iter().map(|r| r[3]));
+    let missing = off(&by_rust[n..], &mut rows.iter().map(|r| r[last]));
     assert!(missing > 1e-6 && missing < 8.0, "{missing}");
     if Command::new("gcc").arg("--version").output().is_err() {
         println!("skipped: no C compiler here");
@@ -327,12 +359,14 @@ fn repeats(folder: &Path, vectors: &str) {
     let kind = head.split("typedef struct").nth(1).unwrap().split("observer_memory;").next().unwrap();
     let main = format!(
         "#include <math.h>\n#include <stdio.h>\ntypedef struct{kind}observer_memory;\nvoid observer_start(observer_memory *memory);\n\
-         double observer_step(observer_memory *memory, const double measured[1], const double set_point[1]);\n\
-         static const double in[{n}][2] = {{{}}};\nint main(void) {{\n for (int missing = 0; missing < 2; missing++) {{\n  \
+         double observer_step(observer_memory *memory, const double measured[1], const double set_point[{references}]);\n\
+         static const double in[{n}][{width}] = {{{}}};\nint main(void) {{\n for (int missing = 0; missing < 2; missing++) {{\n  \
          observer_memory m;\n  observer_start(&m);\n  for (int i = 0; i < {n}; i++) {{\n   double y[1];\n   \
          y[0] = missing && i % 50 == 7 ? NAN : in[i][0];\n   printf(\"%.17g\\n\", observer_step(&m, y, in[i] + 1));\n  }}\n }}\n \
          return 0;\n}}\n",
-        cells("{", "}")
+        cells("{", "}"),
+        width = last - 1,
+        references = last - 2
     );
     std::fs::write(folder.join("main.c"), main).unwrap();
     let strict = [
@@ -356,4 +390,83 @@ fn repeats(folder: &Path, vectors: &str) {
     let by_c = run("run_c");
     let worst = off(&by_c, &mut by_rust.iter().copied());
     assert!(by_c.len() == 2 * n && worst < 1e-8, "{worst:e}");
+}
+
+/// Half a radian at 1 Hz, in degrees, every 20 ms.
+fn sine() -> String {
+    let mut text = "t [s],theta [deg]\n".to_owned();
+    for k in 0..=150 {
+        let t = 0.02 * f64::from(k);
+        text += &format!("{t},{}\n", (0.5 * (std::f64::consts::TAU * t).sin()).to_degrees());
+    }
+    text
+}
+
+/// The law that reads derivatives stays with a sine, behind an observer too, and its code reads them; the one that does not
+/// lags, and is not praised.
+#[test]
+fn a_trajectory_is_followed() {
+    let folder = tempfile::tempdir().unwrap();
+    std::fs::write(folder.path().join("arm.toml"), MODEL).unwrap();
+    std::fs::write(folder.path().join("sine.csv"), sine()).unwrap();
+    let settings = [
+        "--reference",
+        "sine.csv",
+        "--size",
+        "theta=0.4",
+        "--size",
+        "theta'=4",
+        "--input-size",
+        "5",
+        "--dt",
+        "0.002",
+        "--members",
+        "6",
+        "--json",
+    ];
+    let run = |place: &str, more: &[&str]| -> (serde_json::Value, String) {
+        let all = [&["control", "arm.toml", "--out", place][..], &settings, more].concat();
+        let (code, out, err) = greybox(folder.path(), &all);
+        assert_eq!(code, Some(0), "{place}: {err}");
+        let html = std::fs::read_to_string(folder.path().join(place).join("report.html")).unwrap();
+        (serde_json::from_str(&out).unwrap(), html)
+    };
+    let error = |report: &serde_json::Value| {
+        report["closed_loop"]["tracking"]["later_error"]["largest"].as_f64().unwrap()
+    };
+    let read =
+        |place: &str, name: &str| std::fs::read_to_string(folder.path().join(place).join(name)).unwrap();
+    let (lagging, html) = run("static", &["--feed-forward", "static"]);
+    assert_eq!((&lagging["verdict"], &lagging["reads_derivatives"]), (&"strays".into(), &false.into()));
+    assert!(html.contains("The loop does not stay with its trajectory"));
+    assert!(read("static", "law.c").contains("const double set_point[1]"));
+    agrees(&folder.path().join("static"), &read("static", "vectors.csv"));
+    for (place, more) in
+        [("state", &[][..]), ("output", &["--feedback", "output", "--resolution", "theta=0.0015"])]
+    {
+        let (report, html) = run(place, more);
+        assert_eq!((&report["verdict"], &report["reads_derivatives"]), (&"tracks".into(), &true.into()));
+        println!("{place}: {} of {}", error(&report), error(&lagging));
+        assert!(error(&report) < 0.02 * error(&lagging), "{place}: {} {}", error(&report), error(&lagging));
+        assert_eq!(report["family"]["settled"], 6, "{place}");
+        assert!(report["family"]["settling"]["worst"].is_null());
+        let worst = report["family"]["largest_error"]["worst"].as_f64().unwrap();
+        assert!(worst > error(&report) && worst < 0.02, "{place}: {worst}");
+        assert!(report["closed_loop"]["set_points"].as_array().unwrap().is_empty());
+        assert!(
+            html.contains("The loop stays with its trajectory")
+                && html.contains("6 stay with the trajectory")
+        );
+        assert!(read(place, "law.c").contains("const double set_point[3]"));
+        let loop_ = read(place, "closed_loop.csv");
+        assert_eq!(
+            (loop_.lines().next(), loop_.lines().count()),
+            (Some("t,set_point,command,theta,theta'"), 1502)
+        );
+    }
+    assert_eq!(read("state", "vectors.csv").lines().next(), Some("theta,theta',r,r',r'',v"));
+    agrees(&folder.path().join("state"), &read("state", "vectors.csv"));
+    let observed = read("output", "observer_vectors.csv");
+    assert_eq!(observed.lines().next(), Some("t,theta,set_point,set_point',set_point'',command"));
+    repeats(&folder.path().join("output"), &observed);
 }

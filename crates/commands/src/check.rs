@@ -81,7 +81,8 @@ fn health_of(recording: &Recording, model: Option<&Model>, inputs: &[String]) ->
     known(recording, inputs)?;
     let Some(model) = model else {
         let findings = check_with_inputs(recording, inputs);
-        let feeds = |name: &str, _: Option<&str>| inputs.iter().any(|i| i == name).then(|| "input".to_owned());
+        let feeds =
+            |name: &str, _: Option<&str>| inputs.iter().any(|i| i == name).then(|| "input".to_owned());
         return Ok(describe(recording, findings, feeds));
     };
     Data::new(model, std::slice::from_ref(recording))?;

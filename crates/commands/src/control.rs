@@ -3,12 +3,14 @@
 mod answer;
 mod code;
 mod designed;
+mod trajectory;
 
 use std::path::Path;
 
 use greybox_control::{
     ClosedLoop, Controller, DesignOptions, FamilyOptions, Feedback, LoopOptions, Method, ObserverMethod,
-    OutputFeedback, OutputOptions, Plant, PlantOptions, Reference, Run, Sensor, UNSTATED_NOISE, design,
+    OutputFeedback, OutputOptions, Plant, PlantOptions, Reference, Run, Sensor, Trajectory, UNSTATED_NOISE,
+    design, equilibrium,
 };
 use greybox_export::Language;
 use greybox_model::Model;
@@ -17,6 +19,7 @@ use greybox_report::convert::control::{self as convert, ControlSources};
 use serde_json::Value;
 
 use self::designed::Designed;
+pub use self::trajectory::{channel, trajectory};
 use crate::failure::Failure;
 use crate::loading::LoadedModel;
 
@@ -54,6 +57,10 @@ pub struct Request {
     pub track: Option<String>,
     /// Set point; the closed loop steps between it and its negative.
     pub to: f64,
+    /// What the tracked state is to follow, in the place of set points.
+    pub trajectory: Option<Trajectory>,
+    /// Whether the law takes every value of the trajectory for a set point, and does not read its derivatives.
+    pub static_feed_forward: bool,
     /// Typical sizes of states; 1 where none is stated.
     pub sizes: Vec<(String, f64)>,
     /// Typical size of the command.
@@ -134,6 +141,8 @@ impl Default for Request {
             input: None,
             track: None,
             to: 1.0,
+            trajectory: None,
+            static_feed_forward: false,
             sizes: Vec::new(),
             input_size: 1.0,
             limit: None,
@@ -148,7 +157,7 @@ impl Default for Request {
             compensate_friction: false,
             observer: None,
             delay: 0.0,
-            members: 50,
+            members: 200,
             seed: 0,
         }
     }
@@ -200,17 +209,26 @@ pub fn control(
     let wanted = DesignOptions {
         limit: request.limit,
         compensate_friction: request.compensate_friction,
-        ..DesignOptions::new(&tracked, &[-request.to, request.to], request.dt)
+        trajectories: request.trajectory.is_some() && !request.static_feed_forward,
+        ..DesignOptions::new(&tracked, &set_points(request), request.dt)
     };
     let controller = design(&plant, &method(request), &wanted).map_err(refused)?;
     stage("simulating");
     let output = request.observer.as_ref().map(|o| output_feedback(o, request, &controller)).transpose();
     let output = output.map_err(refused)?;
     let feedback = output.clone().map_or(Feedback::FullState, |o| Feedback::Output(Box::new(o)));
-    let options =
-        LoopOptions { feedback, delay: request.delay, seed: request.seed, ..LoopOptions::default() };
+    let options = LoopOptions {
+        start: start(request, &controller).map_err(refused)?,
+        feedback,
+        delay: request.delay,
+        seed: request.seed,
+        ..LoopOptions::default()
+    };
     let closed = ClosedLoop::new(model, &controller, &options).map_err(refused)?;
-    let reference = Reference::square(request.to, request.hold, 4);
+    let reference = match &request.trajectory {
+        Some(trajectory) => Reference::Trajectory(trajectory.clone()),
+        None => Reference::square(request.to, request.hold, 4),
+    };
     let run = closed.run(&reference).map_err(refused)?;
     stage("perturbing");
     let deviations = match report_of {
@@ -234,6 +252,7 @@ pub fn control(
         output: output.as_ref(),
         delay: request.delay,
         run: &run,
+        is_trajectory: request.trajectory.is_some(),
         family: family.as_ref().map(|f| (f, deviations.as_slice())),
         producer: &producer,
         files: &files[1..],
@@ -255,7 +274,7 @@ pub fn control(
     for language in [Language::C99, Language::Rust] {
         texts.push(law.code(language).map_err(written)?.into_bytes());
     }
-    texts.push(code::vectors(&designed, &law, request.to).map_err(written)?.into_bytes());
+    texts.push(code::vectors(&designed, &law).map_err(written)?.into_bytes());
     if let Some(output) = &output {
         let observer = code::observer_code(&designed, output, &law);
         for language in [Language::C99, Language::Rust] {
@@ -336,6 +355,25 @@ fn method(request: &Request) -> Method {
             Method::Smc { lambda: request.lambda, eta, phi: eta / request.rate }
         }
     }
+}
+
+/// Where the law is designed and checked: the ends of what it is to reach.
+fn set_points(request: &Request) -> [f64; 2] {
+    match &request.trajectory {
+        Some(trajectory) => trajectory.range().into(),
+        None => [-request.to, request.to],
+    }
+}
+
+/// The loop begins at rest where the trajectory begins; for set points at zero.
+fn start(
+    request: &Request,
+    controller: &Controller,
+) -> Result<Option<Vec<f64>>, greybox_control::ControlError> {
+    let Some(trajectory) = &request.trajectory else { return Ok(None) };
+    let near = &controller.design_point().equilibrium;
+    let at = equilibrium(controller.plant(), controller.tracked(), trajectory.at(0.0)[0], near)?;
+    Ok(Some(at.state))
 }
 
 /// The files of a request.

@@ -126,8 +126,8 @@ impl<'a> Builder<'a> {
             })
             .collect::<Result<_, ControlError>>()?;
         // A command that acts at two times cannot be predicted over one.
-        let input_delay = late.first().copied().unwrap_or(0.0);
-        if !late.is_empty() && (late.len() < mentions || late.iter().any(|tau| *tau != input_delay)) {
+        let (late_by, input_delay) = late.first().cloned().unwrap_or((Expr::Num(0.0), 0.0));
+        if !late.is_empty() && (late.len() < mentions || late.iter().any(|(_, tau)| *tau != input_delay)) {
             return Err(ControlError::SeveralDelays { input: self.input.to_owned() });
         }
         let limits = range.limits;
@@ -173,6 +173,7 @@ impl<'a> Builder<'a> {
             dead_zone: range.dead_zone.unwrap_or(0.0),
             dropped,
             input_delay,
+            late_by,
             open_gaps: !self.options.close_gaps && !closed_gaps.is_empty(),
             closed_gaps: if self.options.close_gaps { closed_gaps } else { Vec::new() },
             sizes: self.sizes.clone(),

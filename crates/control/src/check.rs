@@ -40,7 +40,7 @@ impl Examined<'_> {
     /// ∂u/∂x, one row.
     pub(crate) fn gain(&self, law: &Compiled, x: &[f64], r: f64) -> DMatrix<f64> {
         let mut at = x.to_vec();
-        at.push(r);
+        at.extend([r, 0.0, 0.0]);
         law.jacobian(&at).columns(0, x.len()).into_owned()
     }
 

@@ -7,6 +7,7 @@ use rand_pcg::Pcg64Mcg;
 
 use crate::controller::Controller;
 use crate::error::{ControlError, listed};
+use crate::metrics::Tracking;
 use crate::output::OutputFeedback;
 use crate::run::metrics;
 pub use crate::run::{MOST_SAMPLES, Reference, Run};
@@ -90,7 +91,7 @@ pub struct ClosedLoop<'a> {
     held: Vec<f64>,
     integration: Integration,
     delays: bool,
-    output: Option<OutputFeedback>,
+    pub(crate) output: Option<OutputFeedback>,
     delay: f64,
     seed: u64,
 }
@@ -203,6 +204,7 @@ impl<'a> ClosedLoop<'a> {
         let mut run = Run {
             t: Vec::with_capacity(samples + 1),
             r: Vec::with_capacity(samples + 1),
+            given: [const { Vec::new() }; 3],
             u: Vec::with_capacity(samples + 1),
             x: vec![Vec::with_capacity(samples + 1); self.system.nx],
             y: vec![Vec::new(); self.output.as_ref().map_or(0, |o| o.observer().measured().len())],
@@ -210,8 +212,10 @@ impl<'a> ClosedLoop<'a> {
             tracked: self.places[self.controller.tracked()],
             diverged: None,
             metrics: Vec::new(),
+            tracking: None,
         };
-        let largest = reference.set_points.iter().fold(0.0f64, |m, (_, r)| m.max(r.abs()));
+        let largest = reference.largest();
+        let ahead = self.preview(reference);
         let sizes = self.controller.plant().sizes();
         let far: Vec<f64> = self
             .places
@@ -226,7 +230,8 @@ impl<'a> ClosedLoop<'a> {
         let mut known: Vec<f64> = self.places.iter().map(|&p| x[p]).collect();
         for k in 0..=samples {
             let t = k as f64 * dt;
-            let r = reference.at(t);
+            let given = reference.at(t + ahead);
+            run.given.iter_mut().zip(given).for_each(|(series, r)| series.push(r));
             let before = known.clone();
             for (series, x) in run.x.iter_mut().zip(&x) {
                 series.push(*x);
@@ -245,12 +250,12 @@ impl<'a> ClosedLoop<'a> {
                     let sensors = output.observer().measured().iter().zip(output.sensors());
                     let y: Vec<f64> = sensors.map(|(&i, s)| s.read(known[i], &mut random)).collect();
                     run.y.iter_mut().zip(&y).for_each(|(series, y)| series.push(*y));
-                    output.command(memory, &y, r)
+                    output.command_along(memory, &y, &given)
                 }
-                _ => self.controller.command(&known, r),
+                _ => self.controller.command_along(&known, &given),
             };
             run.t.push(t);
-            run.r.push(r);
+            run.r.push(reference.at(t)[0]);
             run.u.push(u);
             let away = self.places.iter().zip(&far).any(|(&p, far)| x[p].abs() > *far);
             if away || !u.is_finite() {
@@ -269,7 +274,20 @@ impl<'a> ClosedLoop<'a> {
             }
         }
         run.metrics = metrics(&run, reference, dt, self.controller.limits());
+        if matches!(reference, Reference::Trajectory(_)) && run.diverged.is_none() {
+            let y = &run.x[run.tracked];
+            run.tracking = Tracking::of(y, &run.r, &run.u[..samples], dt, self.controller.limits());
+        }
         Ok(run)
+    }
+
+    /// How far ahead of the time the law is given the reference, s: a command that acts late is made for when it acts. A
+    /// set point is not known before it is given.
+    fn preview(&self, reference: &Reference) -> f64 {
+        match reference {
+            Reference::SetPoints { .. } => 0.0,
+            Reference::Trajectory(_) => self.controller.plant().input_delay(),
+        }
     }
 
     /// A state as the law is given it at sample `k`, the last of `series`.

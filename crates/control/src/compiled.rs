@@ -43,6 +43,17 @@ impl Compiled {
         Ok(Compiled { tape, registers, modes, variables: n, tangents })
     }
 
+    /// The same functions with other values of the parameters, in the order that they were given in.
+    pub(crate) fn with_parameters(&self, values: &[f64]) -> Compiled {
+        let mut changed = self.clone();
+        for (register, value) in changed.registers[self.variables..].iter_mut().zip(values) {
+            *register = *value;
+        }
+        changed.modes.fill(1);
+        changed.tape.prepare(&mut changed.registers, &mut changed.modes);
+        changed
+    }
+
     fn run(&self, x: &[f64]) -> (Vec<f64>, Vec<i8>) {
         let (mut registers, mut modes) = (self.registers.clone(), self.modes.clone());
         for (register, x) in registers[..self.variables].iter_mut().zip(x) {

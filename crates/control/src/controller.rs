@@ -16,6 +16,7 @@ pub struct Controller {
     pub(crate) method: Method,
     pub(crate) tracked: usize,
     pub(crate) reference: String,
+    pub(crate) trajectories: bool,
     pub(crate) dt: f64,
     pub(crate) limits: (f64, f64),
     pub(crate) weights: Weights,
@@ -105,8 +106,8 @@ impl Controller {
         self.verification.as_ref()
     }
 
-    /// The command, within the limits, as an expression of the states, the set point ([`reference`](Self::reference))
-    /// and the plant's parameters.
+    /// The command, within the limits, as an expression of the states, the set point ([`reference`](Self::reference)), of a
+    /// law for [`trajectories`](Self::trajectories) its first two derivatives, and the plant's parameters.
     #[must_use]
     pub fn law(&self) -> &[Expr] {
         &self.law
@@ -118,15 +119,29 @@ impl Controller {
         &self.unlimited
     }
 
+    /// Whether the law is made for a reference that moves: whether it reads r′ and r″
+    /// ([`DesignOptions::trajectories`](crate::DesignOptions)).
+    #[must_use]
+    pub fn trajectories(&self) -> bool {
+        self.trajectories
+    }
+
     /// The command, within the limits, at a state (in the plant's order) for a set point. Not a number where the
     /// state has another length, or where the law divides by zero: the caller must then do what is safe.
     #[must_use]
     pub fn command(&self, x: &[f64], r: f64) -> f64 {
-        if x.len() != self.plant.order() || !x.iter().all(|x| x.is_finite()) || !r.is_finite() {
+        self.command_along(x, &[r, 0.0, 0.0])
+    }
+
+    /// The same for a reference r that moves, with r′ and r″. A law that is made for set points reads r alone.
+    #[must_use]
+    pub fn command_along(&self, x: &[f64], reference: &[f64; 3]) -> f64 {
+        let finite = |values: &[f64]| values.iter().all(|v| v.is_finite());
+        if x.len() != self.plant.order() || !finite(x) || !finite(reference) {
             return f64::NAN;
         }
         let mut at = x.to_vec();
-        at.push(r);
+        at.extend(reference);
         let mut u = [f64::NAN];
         self.compiled.eval(&at, 0, &mut u);
         // The comparisons of a limit would make a number of what is none.

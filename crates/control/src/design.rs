@@ -92,6 +92,7 @@ pub fn design(plant: &Plant, method: &Method, options: &DesignOptions) -> Result
         feed_forward: &feed_forward,
         tracked: &options.tracked,
         limits: (low, high),
+        target: &feed_forward.target(plant, tracked, &reference, options.trajectories)?,
     };
     let made = match method {
         Method::Lqr => design.lqr(options.scheduled)?,
@@ -99,7 +100,7 @@ pub fn design(plant: &Plant, method: &Method, options: &DesignOptions) -> Result
         Method::Smc { lambda, eta, phi } => design.smc(*lambda, *eta, *phi, options.compensate_friction)?,
     };
     let mut variables = plant.symbols().to_vec();
-    variables.push((reference.clone(), 0));
+    variables.extend((0..3).map(|primes| (reference.clone(), primes)));
     let compile = |e: &Expr| Compiled::new(std::slice::from_ref(e), &variables, plant.parameters());
     let limited = limited(&made.law, plant, low, high);
     let examined = Examined {
@@ -126,6 +127,7 @@ pub fn design(plant: &Plant, method: &Method, options: &DesignOptions) -> Result
         method: method.clone(),
         tracked,
         reference,
+        trajectories: options.trajectories,
         dt: options.dt,
         limits: (low, high),
         weights,

@@ -142,6 +142,47 @@ pub fn equilibrium(
     Err(ControlError::NoEquilibrium { tracked: name.clone(), value, step: last })
 }
 
+/// What the derivatives of a moving reference add to an equilibrium of the tangent ẋ = A x + B u: X₀, X₁, … and U₀, U₁, … of
+/// x_d = Σ Xₖ r⁽ᵏ⁾, u_d = Σ Uₖ r⁽ᵏ⁾, from A X₀ + B U₀ = 0 with a tracked entry of one, and
+///
+/// ```text
+/// A Xₖ + B Uₖ = Xₖ₋₁        with a tracked entry of zero
+/// ```
+///
+/// # Errors
+/// [`ControlError::SingularEquilibrium`].
+pub(crate) fn along(
+    plant: &Plant,
+    tracked: usize,
+    at: &Equilibrium,
+    derivatives: usize,
+) -> Result<Vec<Equilibrium>, ControlError> {
+    let n = plant.order();
+    let mut sizes = plant.sizes().to_vec();
+    sizes[tracked] = plant.input_size();
+    let tangent = plant.frictionless_tangent(&at.state, at.input);
+    let slope =
+        DMatrix::from_fn(n, n, |i, j| sizes[j] * if j == tracked { tangent.b[i] } else { tangent.a[(i, j)] });
+    let name = plant.state_names().swap_remove(tracked);
+    let newton = Newton::of(slope).map_err(|_| ControlError::SingularEquilibrium {
+        tracked: name,
+        value: at.state[tracked],
+        by: String::new(),
+    })?;
+    let mut found: Vec<Equilibrium> = Vec::with_capacity(derivatives + 1);
+    for k in 0..=derivatives {
+        let right = match found.last() {
+            None => tangent.a.column(tracked).into_owned(),
+            Some(before) => -DVector::from_column_slice(&before.state),
+        };
+        let unknowns = newton.step(&right);
+        let mut state: Vec<f64> = unknowns.iter().zip(&sizes).map(|(y, s)| y * s).collect();
+        let input = std::mem::replace(&mut state[tracked], if k == 0 { 1.0 } else { 0.0 });
+        found.push(Equilibrium { state, input });
+    }
+    Ok(found)
+}
+
 /// Rows scaled and factored.
 struct Newton {
     rows: Vec<f64>,

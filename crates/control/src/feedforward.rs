@@ -3,7 +3,7 @@
 use greybox_model::{Expr, Func};
 use nalgebra::{DMatrix, DVector};
 
-use crate::equilibrium::{Equilibrium, equilibrium};
+use crate::equilibrium::{Equilibrium, along, equilibrium};
 use crate::error::ControlError;
 use crate::plant::Plant;
 
@@ -13,6 +13,9 @@ const INTERVALS: usize = 80;
 const MOST_DEGREES: usize = 9;
 /// Error of a polynomial, in the stated sizes, with which its degree is high enough.
 const GOOD: f64 = 1e-7;
+/// Part of a state or the input, in its size and at the fastest rate of the plant, below which what a derivative of the reference
+/// adds is rounding.
+const ROUNDING: f64 = 1e-9;
 /// Error above which a broken line is tried.
 const POOR: f64 = 1e-5;
 
@@ -120,6 +123,52 @@ impl FeedForward {
         Ok(this)
     }
 
+    /// Where the plant is to be. With `trajectories`, at every equilibrium of the grid what r′ and r″ add is computed and
+    /// fitted as the equilibria are.
+    ///
+    /// # Errors
+    /// [`ControlError::SingularEquilibrium`].
+    pub(crate) fn target(
+        &self,
+        plant: &Plant,
+        tracked: usize,
+        reference: &str,
+        trajectories: bool,
+    ) -> Result<Target, ControlError> {
+        let n = plant.order();
+        let mut target =
+            Target { state: self.state.clone(), input: self.input.clone(), rate: vec![Expr::Num(0.0); n] };
+        if !trajectories {
+            return Ok(target);
+        }
+        let all = self.equilibria.iter().map(|at| along(plant, tracked, at, 2));
+        let all = all.collect::<Result<Vec<_>, _>>()?;
+        let fastest = fastest(plant, &self.equilibria[self.equilibria.len() / 2]);
+        // Column n is the input.
+        let part = |k: usize, i: usize| -> Expr {
+            let of = |at: &Equilibrium| at.state.get(i).copied().unwrap_or(at.input);
+            let values: Vec<f64> = all.iter().map(|at| of(&at[k])).collect();
+            let largest = values.iter().fold(0.0f64, |m, v| m.max(v.abs()));
+            let size = plant.sizes().get(i).copied().unwrap_or_else(|| plant.input_size());
+            if largest * fastest.powi(k as i32) * plant.sizes()[tracked] <= ROUNDING * size {
+                return Expr::Num(0.0);
+            }
+            self.curve(&values, largest).0
+        };
+        let derivative = |k: usize| Expr::prime(reference, k as u8);
+        let add = |sum: &mut Expr, k: usize, i: usize, times: usize| {
+            *sum = (sum.clone() + part(k, i) * derivative(times)).simplify();
+        };
+        for k in 1..=2 {
+            for i in 0..n {
+                add(&mut target.state[i], k, i, k);
+                add(&mut target.rate[i], k - 1, i, k);
+            }
+            add(&mut target.input, k, n, k);
+        }
+        Ok(target)
+    }
+
     /// An expression of the set point through values at the equilibria, and its largest error.
     pub(crate) fn curve(&self, values: &[f64], size: f64) -> (Expr, f64) {
         let (low, high) = self.range;
@@ -129,6 +178,34 @@ impl FeedForward {
         let shifted = (self.held.clone() - Expr::Num(0.5 * (low + high))).simplify();
         curve(values, size, &(shifted / Expr::Num(0.5 * (high - low))))
     }
+}
+
+/// Where the plant is to be while the reference moves,
+///
+/// ```text
+/// x_d = x_e(r) + X₁(r) r′ + X₂(r) r″,    u_d = u_e(r) + U₁(r) r′ + U₂(r) r″,    ẋ_d = X₀(r) r′ + X₁(r) r″
+/// ```
+///
+/// the solution of the regulator equations of the tangent at x_e(r) for a reference whose third derivative is zero (B. A.
+/// Francis, SIAM J. Control Optim. 15(3), 1977; A. Isidori and C. I. Byrnes, IEEE Trans. Autom. Control 35(2), 1990): along
+/// such a reference a linear plant is tracked without an error. Of an arm with linear friction the series ends there, so that any smooth
+/// reference is; elsewhere what is left is of the order of r‴ and of r′². No inverse of the plant is needed, so that one whose zeros are
+/// unstable is tracked too. Without trajectories it is x_e(r), u_e(r), and ẋ_d zero.
+#[derive(Debug, Clone, PartialEq)]
+pub struct Target {
+    /// x_d, an expression for each state.
+    pub state: Vec<Expr>,
+    /// u_d.
+    pub input: Expr,
+    /// ẋ_d.
+    pub rate: Vec<Expr>,
+}
+
+/// A bound of the poles of the plant, 1/s: the largest row sum of A with the states counted in their sizes.
+fn fastest(plant: &Plant, at: &Equilibrium) -> f64 {
+    let (tangent, sizes) = (plant.frictionless_tangent(&at.state, at.input), plant.sizes());
+    let row = |i: usize| (0..sizes.len()).map(|j| (tangent.a[(i, j)] * sizes[j] / sizes[i]).abs()).sum();
+    (0..sizes.len()).map(row).fold(0.0, f64::max)
 }
 
 /// A curve through values on an even grid of s ∈ [−1, 1], and its largest error. Fitted to every other one.

@@ -7,7 +7,7 @@ use nalgebra::{DMatrix, dmatrix};
 
 use crate::equilibrium::Equilibrium;
 use crate::error::ControlError;
-use crate::feedforward::FeedForward;
+use crate::feedforward::{FeedForward, Target};
 use crate::plant::Plant;
 use crate::specification::Weights;
 
@@ -30,6 +30,8 @@ pub(crate) struct Design<'a> {
     /// Name of the tracked state.
     pub(crate) tracked: &'a str,
     pub(crate) limits: (f64, f64),
+    /// x_d and u_d: x_e(r) and u_e(r), with what r′ and r″ add.
+    pub(crate) target: &'a Target,
 }
 
 /// A law without limits.
@@ -60,12 +62,12 @@ impl Design<'_> {
         }
     }
 
-    /// xᵢ − x_eᵢ(r).
+    /// xᵢ − x_dᵢ.
     fn deviation(&self, i: usize) -> Expr {
-        (self.state(i) - self.feed_forward.state[i].clone()).simplify()
+        (self.state(i) - self.target.state[i].clone()).simplify()
     }
 
-    /// u = u_e(r) − K (x − x_e(r)), K constant or a function of r.
+    /// u = u_d − K (x − x_d), K constant or a function of r.
     pub(crate) fn lqr(&self, scheduled: bool) -> Result<Made, ControlError> {
         let (n, sizes) = (self.plant.order(), self.plant.sizes());
         let gains: Vec<Expr> = if scheduled {
@@ -86,7 +88,7 @@ impl Design<'_> {
         };
         let parts =
             gains.into_iter().enumerate().map(|(i, gain)| (1.0, (gain * self.deviation(i)).simplify()));
-        let law = (self.feed_forward.input.clone() - sum(parts)).simplify();
+        let law = (self.target.input.clone() - sum(parts)).simplify();
         Ok(Made { frictionless: law.clone(), law, verification: None })
     }
 
@@ -110,7 +112,7 @@ impl Design<'_> {
         (q, dmatrix![self.weights.input * unit * unit])
     }
 
-    /// u = u_e(r) − ½ R⁻¹ Σ gᵢ(x) ∂V/∂xᵢ, V a polynomial of the deviations counted in half widths of the domain; or
+    /// u = u_d − ½ R⁻¹ Σ gᵢ(x) ∂V/∂xᵢ, V a polynomial of the deviations counted in half widths of the domain; or
     /// `bounded`.
     pub(crate) fn hjb(&self, degree: u8, domain: &[f64], bounded: bool) -> Result<Made, ControlError> {
         let n = self.plant.order();
@@ -147,10 +149,16 @@ impl Design<'_> {
         let acting = (0..n).filter(|i| g[*i] != Expr::Num(0.0));
         let pull = sum(acting.map(|i| (0.5 / (self.weights.input * widths[i]), g[i].clone() * gradient(i))));
         let law = match limits {
-            Some(limits) => self.bounded(pull, limits),
-            None => (self.feed_forward.input.clone() - pull).simplify(),
+            Some(limits) => self.bounded(self.without_target(pull), limits),
+            None => (self.target.input.clone() - pull).simplify(),
         };
         Ok(Made { frictionless: law.clone(), law, verification: Some(optimal.verification) })
+    }
+
+    /// −(u − u_e(r)) of the law u_d − `pull`.
+    fn without_target(&self, pull: Expr) -> Expr {
+        let (rest, target) = (&self.feed_forward.input, &self.target.input);
+        if rest == target { pull } else { pull - (target.clone() - rest.clone()) }
     }
 
     /// Half widths of the box of a value function.
@@ -206,7 +214,7 @@ impl Design<'_> {
         (Expr::Num(middle) + Expr::Num(half) * angle).simplify()
     }
 
-    /// u = −(L f(x) + (η/φ) sat_φ(L (x − x_e(r)))) / (L g(x)) with L = Σ aₖ c Aᵏ.
+    /// u = −(L (f(x) − ẋ_d) + (η/φ) sat_φ(L (x − x_d))) / (L g(x)) with L = Σ aₖ c Aᵏ.
     pub(crate) fn smc(&self, lambda: f64, eta: f64, phi: f64, friction: bool) -> Result<Made, ControlError> {
         let states = self.plant.order();
         let row = match states {
@@ -226,7 +234,10 @@ impl Design<'_> {
         let deviations: Vec<Expr> = (0..states).map(|i| self.deviation(i)).collect();
         let surface = along(&deviations);
         let reaching = Expr::Num(eta / phi) * Expr::call(Func::Saturate, vec![surface, Expr::Num(phi)]);
-        let law = |f: &[Expr], g: &[Expr]| (-((along(f) + reaching.clone()) / along(g))).simplify();
+        let rate = along(&self.target.rate);
+        let law = |f: &[Expr], g: &[Expr]| {
+            (-((along(f) - rate.clone() + reaching.clone()).simplify() / along(g))).simplify()
+        };
         let (still_f, still_g) = self.plant.frictionless();
         let frictionless = law(still_f, still_g);
         let law = if friction { law(self.plant.f(), self.plant.g()) } else { frictionless.clone() };

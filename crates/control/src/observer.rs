@@ -97,7 +97,7 @@ pub struct InputDelay {
 }
 
 impl InputDelay {
-    fn new(delay: f64, dt: f64) -> Result<InputDelay, ControlError> {
+    pub(crate) fn new(delay: f64, dt: f64) -> Result<InputDelay, ControlError> {
         let all = delay / dt;
         let whole = (all + WHOLE).floor();
         let remainder = if all - whole < WHOLE { 0.0 } else { delay - whole * dt };
@@ -297,7 +297,7 @@ impl Observer {
             Kind::Kalman { gain } => {
                 let held = self.held(&plant, self.dt, set_point)?;
                 let all = extended(&held.a, &held.b);
-                let [older, newer] = self.inputs(&plant, set_point)?;
+                let [older, newer] = self.inputs(&plant, self.input_delay.remainder, set_point)?;
                 let below = |b: DMatrix<f64>| b.insert_row(n, 0.0);
                 let left = DMatrix::identity(n + 1, n + 1) - gain * self.selection(n + 1);
                 Ok(Tangent {
@@ -320,10 +320,16 @@ impl Observer {
             .ok_or(ControlError::NoPoles { set_point })
     }
 
-    /// What the commands do that act over one sample, first the older one, then the newer: Γ₁, Γ₀.
-    pub(crate) fn inputs(&self, plant: &Linear, set_point: f64) -> Result<[DMatrix<f64>; 2], ControlError> {
-        let first = self.held(plant, self.input_delay.remainder, set_point)?;
-        let rest = self.held(plant, self.dt - self.input_delay.remainder, set_point)?;
+    /// What the commands do that act over one sample, `remainder` late beside whole samples, first the older one, then
+    /// the newer: Γ₁, Γ₀.
+    pub(crate) fn inputs(
+        &self,
+        plant: &Linear,
+        remainder: f64,
+        set_point: f64,
+    ) -> Result<[DMatrix<f64>; 2], ControlError> {
+        let first = self.held(plant, remainder, set_point)?;
+        let rest = self.held(plant, self.dt - remainder, set_point)?;
         Ok([&rest.a * first.b, rest.b])
     }
 

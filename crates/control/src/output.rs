@@ -3,14 +3,14 @@
 use greybox_model::Expr;
 use nalgebra::DMatrix;
 
-use crate::check::largest;
 use crate::compiled::Compiled;
 use crate::controller::Controller;
 use crate::design::{free_name, limited};
 use crate::equilibrium::Equilibrium;
 use crate::error::{ControlError, listed};
 use crate::margins::{Margins, OpenLoop};
-use crate::observer::{Memory, Observer, ObserverMethod, Prediction, Sensor, Tangent};
+use crate::observer::{InputDelay, Memory, Observer, ObserverMethod, Prediction, Sensor, Tangent};
+use crate::plant::Plant;
 use crate::stability;
 
 /// Noise of a sensor of which nothing is stated, over the size of its state.
@@ -175,7 +175,8 @@ impl OutputFeedback {
         };
         let law = limited(&law, plant, low, high);
         let mut variables = plant.symbols().to_vec();
-        variables.extend([(disturbance.clone(), 0), (controller.reference().to_owned(), 0)]);
+        variables.push((disturbance.clone(), 0));
+        variables.extend((0..3).map(|primes| (controller.reference().to_owned(), primes)));
         let compiled = Compiled::new(std::slice::from_ref(&law), &variables, plant.parameters())?;
         let mut feedback = OutputFeedback {
             observer,
@@ -249,11 +250,17 @@ impl OutputFeedback {
     /// measurement that is not a number is left out of the estimate. Not a number where the law is none there: the
     /// caller must then do what is safe.
     pub fn command(&self, memory: &mut OutputMemory, y: &[f64], r: f64) -> f64 {
+        self.command_along(memory, y, &[r, 0.0, 0.0])
+    }
+
+    /// The same for a reference r that moves, with r′ and r″ ([`Controller::command_along`]); where the command acts late, those of
+    /// the time at which it acts.
+    pub fn command_along(&self, memory: &mut OutputMemory, y: &[f64], reference: &[f64; 3]) -> f64 {
         let u = memory.command;
         let behind = if u.is_finite() { u - u.clamp(-self.dead_zone, self.dead_zone) } else { 0.0 };
         self.observer.update(&mut memory.observer, y, behind);
         let mut at = self.observer.ahead(&memory.observer);
-        at.push(r);
+        at.extend(reference);
         let mut u = [f64::NAN];
         if at.iter().all(|v| v.is_finite()) {
             self.compiled.eval(&at, 0, &mut u);
@@ -269,16 +276,33 @@ impl OutputFeedback {
         set_point: f64,
         at: &Equilibrium,
     ) -> Result<OutputCheck, ControlError> {
-        let open = self.open_loop(controller, set_point, at)?;
-        let sizes = vec![1.0; open.a.nrows()];
-        let poles = stability::poles(&(&open.a + &open.b * &open.c), &sizes)
-            .ok_or(ControlError::NoPoles { set_point })?;
-        let spectral_radius = largest(&poles);
+        let open = self.open_loop(controller, controller.plant(), set_point, at)?;
+        let spectral_radius =
+            open.radius(&vec![1.0; open.a.nrows()]).ok_or(ControlError::NoPoles { set_point })?;
         if spectral_radius.is_nan() || spectral_radius >= 1.0 {
             let dt = controller.dt();
             return Err(ControlError::UnstableOutput { set_point, dt, radius: spectral_radius });
         }
         Ok(OutputCheck { set_point, spectral_radius, margins: open.margins(controller.dt()) })
+    }
+
+    /// Margins of law and observer, as they are, on another plant ([`Plant::with_parameters`]), in the order of the
+    /// controller's checks: linearised where its own plant rests, friction dropped, with the delay that the other
+    /// plant has. [`Margins::NONE`] where that loop is unstable, or the delay too long to compute; none where a number is
+    /// not finite, or the plant has other states.
+    #[must_use]
+    pub fn margins_with(&self, controller: &Controller, plant: &Plant) -> Vec<Option<Margins>> {
+        let of = |check: &crate::check::Check| {
+            if plant.symbols() != controller.plant().symbols() {
+                return None;
+            }
+            match self.open_loop(controller, plant, check.set_point, &check.equilibrium) {
+                Ok(open) => open.margins_if_stable(&vec![1.0; open.a.nrows()], controller.dt()),
+                Err(ControlError::LongDelay { .. }) => Some(Margins::NONE),
+                Err(_) => None,
+            }
+        };
+        controller.checks().iter().map(of).collect()
     }
 
     /// u = c z of z = (x̂ and d̂ as the observer remembers them, the last commands that the law gave).
@@ -296,28 +320,32 @@ impl OutputFeedback {
         (of_estimate * &observer.estimate, ahead.commands.iter().map(|c| (gain * c)[0]).collect())
     }
 
-    /// Plant, observer and law as one linear system at a state of rest. Its state is x, the commands that the plant was
-    /// given and that still act or will, the observer's memory, and the same commands as the law gave them.
+    /// A plant, the observer and the law as one linear system at a state of rest. Its state is x, the commands that the
+    /// plant was given and that still act or will, the observer's memory, and the commands as the law gave them, as many
+    /// as the observer remembers.
     fn open_loop(
         &self,
         controller: &Controller,
+        truth: &Plant,
         set_point: f64,
         at: &Equilibrium,
     ) -> Result<OpenLoop, ControlError> {
         let plant = controller.plant();
         let tangent = plant.frictionless_tangent(&at.state, at.input);
-        let held = stability::held(&tangent, controller.dt(), plant.sizes(), plant.input_size())
+        let true_tangent = truth.frictionless_tangent(&at.state, at.input);
+        let delay = InputDelay::new(truth.input_delay(), controller.dt())?;
+        let held = stability::held(&true_tangent, controller.dt(), plant.sizes(), plant.input_size())
             .ok_or(ControlError::NoPoles { set_point })?;
         let observer = self.observer.tangent(at, set_point)?;
-        let [older, newer] = self.observer.inputs(&tangent, set_point)?;
+        let [older, newer] = self.observer.inputs(&true_tangent, delay.remainder, set_point)?;
         let ahead = self.observer.prediction(&tangent, set_point)?;
         let gain =
             DMatrix::from_row_slice(1, plant.order(), &controller.frictionless_gain(&at.state, set_point));
         let (of_memory, of_commands) = self.law_of_memory(&gain, &observer, &ahead);
 
-        let (n, past, size) =
-            (plant.order(), self.observer.input_delay().samples + 1, observer.carry.nrows());
-        let (given, own, made) = (n, n + past, n + past + size);
+        let (n, size) = (plant.order(), observer.carry.nrows());
+        let (acting, past) = (delay.samples + 1, self.observer.input_delay().samples + 1);
+        let (given, own, made) = (n, n + acting, n + acting + size);
         let all = made + past;
         let mut c = DMatrix::zeros(1, all);
         c.view_mut((0, own), (1, size)).copy_from(&of_memory);
@@ -330,21 +358,26 @@ impl OutputFeedback {
             view += part;
         };
         add(0, 0, &held.a);
-        add(0, given + past - 1, &older);
+        add(0, given + acting - 1, &older);
         add(own, own, &observer.carry);
         add(own, made + past - 1, &observer.older);
         // The newer command of a sample is the one that is just made, unless it is late by a sample or more.
-        if past == 1 {
+        if acting == 1 {
             b.view_mut((0, 0), (n, 1)).copy_from(&newer);
+        } else {
+            add(0, given + acting - 2, &newer);
+        }
+        if past == 1 {
             add(own, 0, &(&observer.newer * &c));
         } else {
-            add(0, given + past - 2, &newer);
             add(own, made + past - 2, &observer.newer);
         }
         b[(given, 0)] = 1.0;
         add(made, 0, &c);
-        for j in 1..past {
+        for j in 1..acting {
             a[(given + j, given + j - 1)] = 1.0;
+        }
+        for j in 1..past {
             a[(made + j, made + j - 1)] = 1.0;
         }
         // What is measured is the next state.
@@ -362,25 +395,53 @@ impl Controller {
     /// ∂u/∂x at a state of rest, friction dropped.
     pub(crate) fn frictionless_gain(&self, x: &[f64], r: f64) -> Vec<f64> {
         let mut at = x.to_vec();
-        at.push(r);
+        at.extend([r, 0.0, 0.0]);
         self.frictionless.jacobian(&at).row(0).iter().take(x.len()).copied().collect()
     }
 
     /// Margins of the loop with the full state fed back, at each set point; none where a number is not finite.
     #[must_use]
     pub fn margins(&self) -> Vec<Option<Margins>> {
-        let plant = self.plant();
+        self.margins_with(&self.plant)
+    }
+
+    /// The same of the law, as it is, on another plant ([`Plant::with_parameters`]), linearised where its own plant rests,
+    /// friction dropped. [`Margins::NONE`] where that loop is unstable; none also where the plant has other states.
+    ///
+    /// ```
+    /// use greybox_control::{DesignOptions, Method, Plant, PlantOptions, design};
+    /// # let model = greybox_model::Model::from_toml(r#"
+    /// # [inputs]
+    /// # u = { unit = "V" }
+    /// # [states]
+    /// # theta = { unit = "rad" }
+    /// # [parameters]
+    /// # J = { value = 0.02, unit = "kg m^2" }
+    /// # kt = { value = 0.4, unit = "N m/V" }
+    /// # [equations]
+    /// # arm = "J*theta'' = kt*u"
+    /// # "#, "arm.toml")?;
+    /// let plant = Plant::of(&model, "u", &PlantOptions::default())?;
+    /// let law = design(&plant, &Method::Lqr, &DesignOptions::new("theta", &[0.0], 0.01))?;
+    /// // A motor that is half as strong again takes that much off the gain that may be added.
+    /// let stronger = plant.with_parameters(&[0.02, 0.6])?;
+    /// let (own, on_it) = (law.margins()[0].ok_or("none")?, law.margins_with(&stronger)[0].ok_or("none")?);
+    /// assert!((own.gain / on_it.gain - 1.5).abs() < 1e-9);
+    /// # Ok::<(), Box<dyn std::error::Error>>(())
+    /// ```
+    #[must_use]
+    pub fn margins_with(&self, plant: &Plant) -> Vec<Option<Margins>> {
         let of = |check: &crate::check::Check| {
             // A law of the state alone is none where the command is late.
-            if plant.input_delay() > 0.0 {
+            if plant.input_delay() > 0.0 || plant.symbols() != self.plant.symbols() {
                 return None;
             }
             let at = &check.equilibrium;
             let tangent = plant.frictionless_tangent(&at.state, at.input);
-            let held = stability::held(&tangent, self.dt(), plant.sizes(), plant.input_size())?;
+            let held = stability::held(&tangent, self.dt(), self.plant.sizes(), self.plant.input_size())?;
             let gain = self.frictionless_gain(&at.state, check.set_point);
             let c = DMatrix::from_row_slice(1, plant.order(), &gain);
-            Some(OpenLoop { a: held.a, b: held.b, c }.margins(self.dt()))
+            OpenLoop { a: held.a, b: held.b, c }.margins_if_stable(self.plant.sizes(), self.dt())
         };
         self.checks().iter().map(of).collect()
     }

@@ -111,6 +111,8 @@ pub struct Plant {
     pub(crate) dropped: Vec<Dropped>,
     pub(crate) closed_gaps: Vec<Dropped>,
     pub(crate) input_delay: f64,
+    /// The delay of the command as an expression of the parameters.
+    pub(crate) late_by: Expr,
     pub(crate) open_gaps: bool,
     pub(crate) sizes: Vec<f64>,
     pub(crate) input_size: f64,
@@ -174,6 +176,43 @@ impl Plant {
     #[must_use]
     pub fn parameters(&self) -> &[(String, f64)] {
         &self.parameters
+    }
+
+    /// The same plant with other values (SI) of its parameters, in the order of [`parameters`](Self::parameters): what a
+    /// law made for this one may meet. Limits, dead zone, sizes and the width of smoothed friction are choices of the
+    /// design and stay; the delay of the command does not.
+    ///
+    /// # Errors
+    /// [`ControlError::Size`] for another number of values; [`ControlError::Option`] for one that is not finite, and
+    /// where the delay of the command would be negative.
+    pub fn with_parameters(&self, values: &[f64]) -> Result<Plant, ControlError> {
+        if values.len() != self.parameters.len() {
+            let (found, wanted) = (values.len(), self.parameters.len());
+            return Err(ControlError::Size { what: "the list of parameters", found, wanted });
+        }
+        if let Some(((name, _), value)) = self.parameters.iter().zip(values).find(|(_, v)| !v.is_finite()) {
+            let what = format!("the parameter `{name}`");
+            return Err(ControlError::Option { what, value: *value, wanted: "a finite number" });
+        }
+        let parameters: Vec<(String, f64)> =
+            self.parameters.iter().zip(values).map(|((name, _), value)| (name.clone(), *value)).collect();
+        let of = |name: &str, _: u8| parameters.iter().find(|(n, _)| n == name).map(|(_, value)| *value);
+        let input_delay = self.late_by.eval(&of).unwrap_or(f64::NAN);
+        if !(input_delay >= 0.0 && input_delay.is_finite()) {
+            let what = "the delay of the command".to_owned();
+            return Err(ControlError::Option {
+                what,
+                value: input_delay,
+                wanted: "a finite time, zero or more",
+            });
+        }
+        Ok(Plant {
+            smooth: self.smooth.with_parameters(values),
+            frictionless: self.frictionless.with_parameters(values),
+            parameters,
+            input_delay,
+            ..self.clone()
+        })
     }
 
     /// The other inputs and what they are held at.

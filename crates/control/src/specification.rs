@@ -97,6 +97,9 @@ pub struct DesignOptions {
     /// often is not where friction is coupled into other coordinates. Without this (the default) what friction leaves
     /// is the error at which the law asks for less than the friction holds.
     pub compensate_friction: bool,
+    /// Whether the reference moves: the law then reads its first two derivatives too ([`Target`](crate::Target)), and
+    /// follows a smooth [`Trajectory`](crate::Trajectory) without the lag of one that takes every value for a set point.
+    pub trajectories: bool,
 }
 
 impl DesignOptions {
@@ -112,6 +115,7 @@ impl DesignOptions {
             scheduled: false,
             guess: None,
             compensate_friction: false,
+            trajectories: false,
         }
     }
 }

@@ -51,12 +51,12 @@ pub(crate) fn without_gaps(e: &Expr, moves: &dyn Fn(&Expr) -> bool, closed: &mut
     })
 }
 
-/// `delay(u, tau)` of the input by the input; how late it is goes to `late`, one entry for each place.
+/// `delay(u, tau)` of the input by the input; how late it is goes to `late`, one entry for each place: tau and its value.
 pub(crate) fn without_input_delay(
     e: &Expr,
     input: &str,
     value: &dyn Fn(&Expr) -> Option<f64>,
-    late: &mut Vec<f64>,
+    late: &mut Vec<(Expr, f64)>,
 ) -> Expr {
     e.map(&mut |e| {
         let Expr::Call(Func::Delay, args) = &e else { return e };
@@ -64,7 +64,7 @@ pub(crate) fn without_input_delay(
         if **name != *input || tau.is_nan() || tau < 0.0 {
             return e;
         }
-        late.push(tau);
+        late.push((args[1].clone(), tau));
         args[0].clone()
     })
 }

@@ -8,3 +8,4 @@ mod link;
 mod loops;
 mod output;
 mod plants;
+mod trajectories;

@@ -26,7 +26,7 @@ fn a_pendulum_is_held_anywhere() {
     ] {
         let law = design(&plant, &method, &DesignOptions::new("theta", &set_points, 2e-3)).unwrap();
         assert_eq!(law.limits(), (-3.0, 3.0));
-        let reference = Reference {
+        let reference = Reference::SetPoints {
             set_points: set_points.iter().enumerate().map(|(k, r)| (3.0 * k as f64, *r)).collect(),
             duration: 15.0,
         };
@@ -150,6 +150,36 @@ fn families_are_the_same_whatever_the_threads() {
     }
 }
 
+/// On a linear cart the plants whose linearised loop is unstable are those whose simulated loop runs away.
+#[test]
+fn a_plant_without_margin_is_one_that_runs_away() {
+    let model = load(
+        &CART
+            .replace("fc = { value = 1.5", "fc = { value = 0.0")
+            .replace("= u\"", "= k*u\"")
+            .replace("[equations]", "k = { value = 1.0, unit = \"1\" }\n[equations]"),
+    );
+    let plant = Plant::of(&model, "u", &sized(&[("x", 0.01), ("x'", 1.0)], 20.0)).unwrap();
+    let law = design(&plant, &Method::Lqr, &DesignOptions::new("x", &[0.0, 1.0], 0.02)).unwrap();
+    let looped = ClosedLoop::new(&model, &law, &LoopOptions::default()).unwrap();
+    let options = FamilyOptions { deviations: vec![("k".into(), 6.0)], members: 40, seed: 2 };
+    let family = looped.family(&Reference::step(1.0, 100.0), &options).unwrap();
+    println!("{} {} {:?} {:?}", family.unstable, family.diverged, family.margins, law.margins());
+    assert_eq!(family.unstable, family.diverged);
+    assert!((5..36).contains(&family.unstable), "{}", family.unstable);
+    let margins = family.margins.unwrap();
+    assert_eq!(margins.worst(), greybox_control::Margins::NONE);
+    assert!(margins.median().phase > 0.0 || family.unstable > 20);
+    let few = FamilyOptions { deviations: vec![("k".into(), 0.05)], members: 10, seed: 2 };
+    let few = looped.family(&Reference::step(1.0, 1.0), &few).unwrap();
+    let (own, worst) = (law.margins()[0].unwrap(), few.margins.unwrap().worst());
+    // Draws of one standard deviation and a half or so.
+    assert!(
+        few.unstable == 0 && worst.gain < own.gain / 1.02 && worst.gain > own.gain / 1.2,
+        "{worst:?} {own:?}"
+    );
+}
+
 #[test]
 fn what_runs_away_is_told() {
     // A plant ten times as light as the law believes, with a slow sample: the loop rings ever more.
@@ -160,8 +190,10 @@ fn what_runs_away_is_told() {
     let run = looped.run_with(&[0.02, 0.0, 0.0], &Reference::step(1.0, 20.0)).unwrap();
     assert!(run.diverged.is_some_and(|k| k < 1000 && run.t.len() == k + 1), "{:?}", run.diverged);
     assert!(run.metrics.iter().all(|m| m.settling.is_none()));
-    let reference =
-        |set_points: &[(f64, f64)], duration: f64| Reference { set_points: set_points.to_vec(), duration };
+    let reference = |set_points: &[(f64, f64)], duration: f64| Reference::SetPoints {
+        set_points: set_points.to_vec(),
+        duration,
+    };
     for bad in [
         reference(&[], 1.0),
         reference(&[(1.0, 0.0)], 2.0),

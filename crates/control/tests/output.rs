@@ -184,7 +184,21 @@ fn noise_is_that_of_its_seed() {
     let deviations = vec![("J".to_string(), 0.002), ("mgl".to_string(), 0.05)];
     let looped = ClosedLoop::new(&model, &law, &options).unwrap();
     let family = looped.family(&reference, &FamilyOptions { deviations, members: 8, seed: 1 }).unwrap();
-    assert_eq!(family.diverged, 0);
+    assert_eq!((family.diverged, family.unstable), (0, 0));
+    let own = looped.controller().checks().len();
+    let Feedback::Output(output) = &options.feedback else { unreachable!() };
+    assert_eq!(output.checks().len(), own);
+    let own = output.checks().iter().map(|c| c.margins).reduce(greybox_control::Margins::worse).unwrap();
+    let margins = family.margins.unwrap();
+    // Margins with the observer, not those with the full state, which are twice as large.
+    assert!(
+        margins.worst().phase < own.phase && margins.worst().phase > 0.7 * own.phase,
+        "{margins:?} {own:?}"
+    );
+    assert!(margins.median().phase > margins.worst().phase && margins.median().gain > margins.worst().gain);
+    let none = FamilyOptions { deviations: Vec::new(), members: 1, seed: 1 };
+    let same = looped.family(&reference, &none).unwrap().margins.unwrap().worst();
+    assert_eq!(same, own);
 }
 
 #[test]
@@ -235,7 +249,8 @@ fn a_late_command_is_predicted_over() {
     let set_points = DesignOptions::new("theta", &[-1.0, 1.0], 2e-3);
     let prompt = law(&arm(0.0));
     // At rest first: what a delayed command was before the start is what it is there.
-    let reference = Reference { set_points: vec![(0.0, 0.0), (0.2, 0.5), (3.2, -0.5)], duration: 6.2 };
+    let reference =
+        Reference::SetPoints { set_points: vec![(0.0, 0.0), (0.2, 0.5), (3.2, -0.5)], duration: 6.2 };
     let fine = Sensor { noise: 1e-5, resolution: 0.0 };
     let wanted = run(&arm(0.0), &prompt, &LoopOptions::default(), &reference);
     // A part of a sample, whole samples, both.
@@ -339,4 +354,62 @@ coil = "L*i' + R*i + ke*theta' = v"
     let refused = made(&law_of_angle, ESO).unwrap_err();
     assert!(matches!(&refused, ControlError::EsoUnmeasured { name } if name == "i"), "{refused}");
     assert!(matches!(made(&law(&motor("i")), KALMAN), Err(ControlError::Observer { .. })));
+}
+
+/// With law and observer as they are, what a plant does to the margins is known: a motor `p` times as strong takes a factor `p`
+/// off the gain margin, and `k` samples of further delay take `k dt` off the delay margin. Where that is all, the loop is
+/// unstable, and there is none.
+#[test]
+fn margins_on_another_plant_are_those_of_the_plant() {
+    let text = r#"
+[inputs]
+v = { unit = "V" }
+[states]
+theta = { unit = "rad" }
+[parameters]
+J = { value = 0.02, unit = "kg m^2" }
+b = { value = 0.15, unit = "N m s/rad" }
+mgl = { value = 0.5, unit = "N m" }
+kt = { value = 0.4, unit = "N m/V" }
+tau = { value = 0.008, unit = "s" }
+[equations]
+arm = "J*theta'' + b*theta' + mgl*sin(theta) = kt*delay(v, tau)"
+"#;
+    let model = Model::from_toml(text, "arm.toml").unwrap();
+    let sizes = vec![("theta".to_string(), 0.2), ("theta'".to_string(), 4.0)];
+    let options =
+        PlantOptions { sizes, input_size: 5.0, predict_input_delay: true, ..PlantOptions::default() };
+    let plant = Plant::of(&model, "v", &options).unwrap();
+    let dt = 2e-3;
+    let law = design(&plant, &Method::Lqr, &DesignOptions::new("theta", &[-1.0, 0.5], dt)).unwrap();
+    let with = |kt: f64, tau: f64| plant.with_parameters(&[0.02, 0.15, 0.5, kt, tau]).unwrap();
+    for method in [KALMAN, ESO] {
+        let wanted = OutputOptions { method, sensors: Vec::new(), integral: true };
+        let output = OutputFeedback::new(&law, &wanted).unwrap();
+        let on = |plant: &Plant| -> Vec<_> {
+            output.margins_with(&law, plant).into_iter().map(Option::unwrap).collect()
+        };
+        let own: Vec<_> = output.checks().iter().map(|c| c.margins).collect();
+        assert_eq!(on(&plant), own, "{method:?}");
+        let p = 0.5 * (1.0 + own[0].gain);
+        let samples = (0.5 * own[0].delay / dt).floor();
+        println!("{method:?} {own:?} {p} {samples}");
+        assert!(samples >= 1.0);
+        let (stronger, later) = (on(&with(0.4 * p, 0.008)), on(&with(0.4, 0.008 + samples * dt)));
+        for ((own, stronger), later) in own.iter().zip(stronger).zip(later) {
+            assert!((own.gain / stronger.gain / p - 1.0).abs() < 1e-9, "{method:?}: {own:?} {stronger:?}");
+            assert!((own.delay - later.delay - samples * dt).abs() < 1e-9, "{method:?}: {own:?} {later:?}");
+        }
+        // Less delay than the observer predicts over is another loop too, and one with margins of its own.
+        assert!(on(&with(0.4, 0.0)).iter().zip(&own).all(|(less, own)| less.delay > own.delay));
+        for lost in [with(0.4 * 1.01 * own[0].gain, 0.008), with(0.4, 0.008 + own[0].delay + 2.0 * dt)] {
+            assert_eq!(on(&lost)[0], greybox_control::Margins::NONE, "{method:?}");
+        }
+        assert_eq!(on(&with(0.4, 5.0))[0], greybox_control::Margins::NONE, "{method:?}");
+    }
+    assert!(matches!(plant.with_parameters(&[1.0]), Err(ControlError::Size { .. })));
+    for wrong in [f64::NAN, -1.0] {
+        let wrong = plant.with_parameters(&[0.02, 0.15, 0.5, 0.4, wrong]);
+        assert!(matches!(wrong, Err(ControlError::Option { .. })));
+    }
 }

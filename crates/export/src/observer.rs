@@ -43,7 +43,8 @@ pub struct ObserverCode {
     pub summary: Vec<String>,
     /// ẋ: arguments `state` (n) and `command` (1), n outputs.
     pub rate: Function,
-    /// The command: arguments `state` (n), `disturbance` (1) and `set_point` (1), one output. Its code is a file of its own.
+    /// The command: arguments `state` (n), `disturbance` (1) and `set_point` (1, or 3 with
+    /// its derivatives), one output. Its code is a file of its own.
     pub law: Function,
     /// Sample time, s.
     pub dt: f64,
@@ -107,6 +108,11 @@ impl ObserverCode {
 
     fn states(&self) -> usize {
         self.rate.outputs.len()
+    }
+
+    /// Entries of the set point.
+    fn references(&self) -> usize {
+        self.law.arguments.last().map_or(1, |group| group.members.len())
     }
 
     fn chains(&self) -> &[ChainForm] {

@@ -179,7 +179,8 @@ pub fn analyse(estimates: &[Estimate]) -> Option<Machines> {
         let estimate = coefficient(k + 1);
         let freedom = if column.level == Level::Between { machine_freedom } else { recording_freedom? };
         let p_value = 2.0 * freedom.sf((estimate.value / estimate.error).abs());
-        let per_unit = Predicted { value: estimate.value / column.scale, error: estimate.error / column.scale };
+        let per_unit =
+            Predicted { value: estimate.value / column.scale, error: estimate.error / column.scale };
         Some(Slope {
             covariate: column.covariate,
             level: column.level,

@@ -3,7 +3,7 @@
 //! Plain data, filled by the caller ([`crate::convert::control`]). All numbers are SI; units are those of
 //! [`Quantity::unit`]. A number that is not finite is shown as unknown.
 
-use greybox_control::{Margins, Metrics, Verdict};
+use greybox_control::{Margins, Metrics, Tracking, Verdict};
 
 use crate::contract::{ModelId, Producer};
 
@@ -46,6 +46,12 @@ pub struct ControlPage {
     pub set_points: Vec<SetPoint>,
     /// What the simulated loop reached, set point by set point.
     pub steps: Vec<Metrics>,
+    /// Whether the reference is a trajectory instead of set points.
+    pub is_trajectory: bool,
+    /// Whether the law reads its first two derivatives too.
+    pub reads_derivatives: bool,
+    /// How the trajectory was followed; none for set points, and where the loop left every bound.
+    pub tracking: Option<Tracking>,
     /// The same law on perturbed plants.
     pub family: Option<Perturbed>,
     /// The simulated loop.
@@ -133,16 +139,31 @@ pub struct Perturbed {
     pub members: usize,
     /// Those whose state or command left every bound.
     pub diverged: usize,
-    /// Those that settled at every set point.
+    /// Those that settled at every set point, or stayed with the trajectory.
     pub settled: usize,
     /// The perturbed parameters: quantity, value, standard deviation.
     pub deviations: Vec<(Quantity, f64, f64)>,
     /// A figure's name, its unit, and the median and the worst of the members; infinite where not reached.
     pub figures: Vec<Figure>,
+    /// Margins on the perturbed plants; none where the law has none on its own.
+    pub margins: Option<PerturbedMargins>,
     /// Least and largest tracked state of the members that did not diverge, at the times of the run.
     pub tracked: [Vec<f64>; 2],
     /// The same of the command.
     pub command: [Vec<f64>; 2],
+}
+
+/// Margins over the perturbed plants, of each plant those of its worst set point, margin by margin.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct PerturbedMargins {
+    /// On the model itself.
+    pub own: Margins,
+    /// Half of the plants have more.
+    pub median: Margins,
+    /// The worst plant.
+    pub worst: Margins,
+    /// Plants on which the linearised loop is unstable at a set point.
+    pub unstable: usize,
 }
 
 /// A figure over the perturbed plants.

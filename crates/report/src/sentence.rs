@@ -481,7 +481,9 @@ fn losses(fit: &Fit) -> impl Iterator<Item = String> + '_ {
         let to = fit.holdout.improved.get(channel)?;
         let judged = match fit.criterion {
             Criterion::FreeRun => (from.nrmse, to.nrmse),
-            Criterion::Windowed => (from.nrmse_windowed.unwrap_or(f64::NAN), to.nrmse_windowed.unwrap_or(f64::NAN)),
+            Criterion::Windowed => {
+                (from.nrmse_windowed.unwrap_or(f64::NAN), to.nrmse_windowed.unwrap_or(f64::NAN))
+            }
         };
         if judged.1.is_nan() || judged.1 <= LOSS * judged.0 {
             return None;

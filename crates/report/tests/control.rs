@@ -1,16 +1,22 @@
 //! The page of a controller: its structure, its words, that nothing escapes from its place, and a browser.
 #![allow(clippy::unwrap_used, reason = "helpers of tests panic like the tests themselves")]
 
-use greybox_control::{Metrics, Verdict};
+use greybox_control::{Margins, Metrics, Tracking, TrackingError, Verdict};
 use greybox_report::ControlPage;
 use greybox_report::contract::{ModelId, Producer};
-use greybox_report::control::{Figure, LawKind, LawState, LoopRun, Perturbed, Quantity, SetPoint};
+use greybox_report::control::{
+    Figure, LawKind, LawState, LoopRun, Perturbed, PerturbedMargins, Quantity, SetPoint,
+};
 
 #[path = "common/browser.rs"]
 mod browser;
 
 fn quantity(name: &str, unit: &str) -> Quantity {
     Quantity { name: name.into(), unit: unit.into() }
+}
+
+fn margins(gain: f64, phase: f64) -> Margins {
+    Margins { gain, lower_gain: 0.25, phase, delay: 0.0125, sensitivity: 1.5 }
 }
 
 /// A step of a second-order loop, and one back.
@@ -61,6 +67,9 @@ fn page() -> ControlPage {
         left_out: vec![("arm".into(), "ad*sin(om*t)".into())],
         set_points: vec![point(-0.5), point(0.5)],
         steps: vec![step(0.5), step(-0.5)],
+        is_trajectory: false,
+        reads_derivatives: false,
+        tracking: None,
         family: Some(Perturbed {
             members: 50,
             diverged: 0,
@@ -73,6 +82,12 @@ fn page() -> ControlPage {
                 median: 0.5,
                 worst: f64::INFINITY,
             }],
+            margins: Some(PerturbedMargins {
+                own: margins(2.5, 0.8),
+                median: margins(2.25, 0.7),
+                worst: Margins { delay: f64::INFINITY, ..margins(1.75, 0.5) },
+                unstable: 0,
+            }),
             tracked: [widened(-0.05), widened(0.05)],
             command: [vec![-10.0; t.len()], vec![10.0; t.len()]],
         }),
@@ -116,6 +131,9 @@ fn the_page_says_what_an_engineer_signs() {
         "Of 50 plants with parameters drawn around the model's, 50 settle at every set point; none diverges."
             .replace('\'', "&#39;")
             .as_str(),
+        // 0.5 rad.
+        "On all of them the gain margin is at least 1.75, the phase margin at least 28.6° and the delay margin unlimited.",
+        "<th scope=\"row\">Worst plant</th><td class=\"num\">1.75</td><td class=\"num\">0.250</td><td class=\"num\">28.6</td><td class=\"num\">any</td>",
         "v reaches 10.0 V, its limit, and is there for 4.0\u{a0}% of a step at most.",
         "<th scope=\"row\" class=\"math\"><var>θ</var>′</th><td class=\"num strong\">1.25</td><td class=\"unit\">V/(rad/s)</td>",
         "−6.00 ± 8.00\u{202f}i",
@@ -227,4 +245,57 @@ fn poles_that_cannot_be_drawn_are_left_out() {
 fn the_page_keeps_nobody_out() {
     let Some(faults) = browser::faults(&page().to_html().unwrap()) else { return };
     assert!(faults.is_empty(), "{faults:#?}");
+}
+
+/// A plant on which the loop is unstable has no margin, and the page says so instead of a number.
+#[test]
+fn an_unstable_plant_is_told() {
+    let mut page = page();
+    let family = page.family.as_mut().unwrap();
+    let margins = family.margins.as_mut().unwrap();
+    (margins.worst, margins.unstable) = (Margins::NONE, 3);
+    let html = page.to_html().unwrap();
+    for text in [
+        "On 3 of them the linearised loop is unstable at a set point.",
+        "3 plants are unstable at a set point",
+        "<td class=\"num\">unbounded</td>",
+    ] {
+        assert!(html.contains(text), "the page lacks {text:?}");
+    }
+    assert!(!html.contains("On all of them"));
+    page.family.as_mut().unwrap().margins = None;
+    assert!(!page.to_html().unwrap().contains("Median plant</th><td"));
+}
+
+/// Along a trajectory the page has errors in the place of steps, and says what the law is given.
+#[test]
+fn a_trajectory_has_its_errors() {
+    let mut page = page();
+    page.steps.clear();
+    (page.is_trajectory, page.reads_derivatives, page.verdict) = (true, true, Verdict::Strays);
+    page.tracking = Some(Tracking {
+        span: 1.0,
+        error: TrackingError { rms: 0.021, largest: 0.132 },
+        later_error: TrackingError { rms: 0.0123, largest: 0.0456 },
+        largest_command: 7.5,
+        saturated: 0.03,
+        effort: 4.5,
+    });
+    let html = page.to_html().unwrap().replace('\u{a0}', " ");
+    for text in [
+        "The loop does not stay with its trajectory",
+        "After the first quarter of the time θ is 0.0456 rad from its trajectory at most, 4.6 % of its span, and 0.0123 rad in \
+         the root mean square; over the whole of the time 0.132 rad at most.",
+        "50 stay with the trajectory; none diverges.",
+        "v reaches 7.50 V, its limit, and is there for 3.0 % of the time.",
+        "<sub>d</sub>",
+        "the law must be given the rate and the acceleration",
+    ] {
+        assert!(html.contains(text), "the page lacks {text:?}");
+    }
+    assert!(!html.contains("What each step of") && !html.contains("Settling to 2"));
+    (page.tracking, page.verdict) = (None, Verdict::Diverges);
+    page.run.diverged = Some(0.3);
+    let html = page.to_html().unwrap();
+    assert!(html.contains("<dd>not reached<small>") && html.contains("leaves every bound after 0.3 s"));
 }

@@ -7,7 +7,7 @@ use greybox_commands::control::{self as commands, ObserverKind, ObserverRequest,
 
 use crate::answer::Answer;
 use crate::failure::Failure;
-use crate::loading;
+use crate::loading::{self, Wanted};
 use crate::output::OutputFolder;
 use crate::progress::Progress;
 use crate::study::whole;
@@ -17,12 +17,13 @@ use crate::study::whole;
 #[command(after_help = "Examples:
   greybox control improved.toml --report report.json --track theta --to 0.5 --size theta=0.5 --size \"theta'=5\" --out controller
   greybox control improved.toml --track theta --to 0.5 --feedback output --resolution theta=0.0015 --out controller
+  greybox control improved.toml --track theta --reference move.csv --out controller
   greybox control improved.toml --method smc --lambda 16 --rate 100 --track theta --to 0.5 --limit 10 --out controller
 
 All numbers are in SI. Sizes are the typical deviations of states and input: weights (Bryson's rule), the width of
 smoothed friction and the perturbation of the state follow from them.
 DIR receives report.html (self-contained, with plots), report.json, closed_loop.csv (a square wave between the set
-points), law.c (C99), law.rs (no_std Rust) and vectors.csv (states and set points with the command that the code must give);
+points, or the trajectory of --reference), law.c (C99), law.rs (no_std Rust) and vectors.csv (states and set points with the command that the code must give);
 with --feedback output also observer.c, observer.rs and observer_vectors.csv.")]
 pub(crate) struct Arguments {
     /// Model (TOML), for example the improved.toml of a diagnosis
@@ -42,8 +43,22 @@ pub(crate) struct Arguments {
     track: Option<String>,
 
     /// Set point; the closed loop steps between it and its negative
-    #[arg(long, value_name = "VALUE", default_value_t = 1.0, allow_negative_numbers = true)]
+    #[arg(
+        long,
+        value_name = "VALUE",
+        default_value_t = 1.0,
+        allow_negative_numbers = true,
+        conflicts_with = "reference"
+    )]
     to: f64,
+
+    /// Trajectory to follow in the place of set points: a recording with a channel of the tracked state
+    #[arg(long, value_name = "FILE.csv")]
+    reference: Option<PathBuf>,
+
+    /// What the law reads of the trajectory: its value alone (static), or its first two derivatives too (dynamic)
+    #[arg(long, value_enum, default_value_t = FeedForward::Dynamic, requires = "reference")]
+    feed_forward: FeedForward,
 
     /// Typical size of a state, NAME=VALUE (may be given more than once); 1 where none is stated
     #[arg(long, value_name = "NAME=VALUE")]
@@ -62,7 +77,13 @@ pub(crate) struct Arguments {
     dt: f64,
 
     /// Time for each set point of the simulated square wave, s
-    #[arg(long, value_name = "SECONDS", default_value_t = 2.0, allow_negative_numbers = true)]
+    #[arg(
+        long,
+        value_name = "SECONDS",
+        default_value_t = 2.0,
+        allow_negative_numbers = true,
+        conflicts_with = "reference"
+    )]
     hold: f64,
 
     /// Degree of the value function (hjb)
@@ -130,7 +151,7 @@ pub(crate) struct Arguments {
     report: Option<PathBuf>,
 
     /// Perturbed plants on which the law is tried: parameters vary as the report says, else by the model's `std`
-    #[arg(long, value_name = "N", default_value_t = 50, allow_negative_numbers = true)]
+    #[arg(long, value_name = "N", default_value_t = 200, allow_negative_numbers = true)]
     members: usize,
 
     /// Seed of the perturbed plants
@@ -159,6 +180,15 @@ enum Way {
     Hjb,
     /// Flat-output sliding mode
     Smc,
+}
+
+/// What the law reads of a trajectory, as on the command line.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, ValueEnum)]
+enum FeedForward {
+    /// Its value: every one is a set point
+    Static,
+    /// Its value, rate and acceleration
+    Dynamic,
 }
 
 /// What the law is given, as on the command line.
@@ -192,9 +222,18 @@ impl From<Way> for commands::Way {
 pub(crate) fn run(arguments: &Arguments) -> Result<Answer, Failure> {
     let loaded = loading::model(&arguments.model)?;
     let out = OutputFolder::prepare(&arguments.out)?;
-    let request = request(arguments)?;
+    let mut request = request(arguments)?;
+    if let Some(path) = &arguments.reference {
+        let track = arguments.track.as_deref();
+        let wanted = Wanted::default().of_names(commands::channel(&loaded.model, track).map(|c| vec![c]));
+        let recordings = loading::recordings(std::slice::from_ref(path), &wanted)?;
+        let [recording] = recordings.as_slice() else {
+            return Err(Failure::internal("one recording was named, but not read"));
+        };
+        request.trajectory = Some(commands::trajectory(&loaded, track, recording, path)?);
+    }
     let names: Vec<&str> = commands::files(&request).iter().map(|(name, _)| *name).collect();
-    out.spares(&names, [&arguments.model])?;
+    out.spares(&names, [&arguments.model].into_iter().chain(&arguments.reference))?;
     let report = arguments.report.as_deref().map(loading::text).transpose()?;
     let report = arguments.report.as_deref().zip(report.as_deref());
     let progress = Progress::open();
@@ -256,6 +295,8 @@ fn request(arguments: &Arguments) -> Result<Request, Failure> {
         input: arguments.input.clone(),
         track: arguments.track.clone(),
         to: arguments.to,
+        trajectory: None,
+        static_feed_forward: arguments.feed_forward == FeedForward::Static,
         sizes: named("size", "size", &arguments.size)?,
         input_size: arguments.input_size,
         limit: arguments.limit,

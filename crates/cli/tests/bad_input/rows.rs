@@ -967,9 +967,20 @@ fn options() -> Vec<Row> {
     ]
 }
 
+/// A reference of two seconds, in steps of 0.05 s.
+fn moves(header: &str, value: impl Fn(u32) -> Option<f64>) -> String {
+    let mut text = format!("t [s],{header}\n");
+    for k in 0..=40 {
+        let cell = value(k).map_or_else(String::new, |v| v.to_string());
+        writeln!(text, "{},{cell}", 0.05 * f64::from(k)).unwrap();
+    }
+    text
+}
+
 fn designs() -> Vec<Row> {
     const S: &str = "Controllers";
     let all = |what, run| Row::new(S, what, NOTHING, run);
+    let with = |what: &'static str, make: fn(&Bench), run: &'static str| Row::new(S, what, make, run);
     vec![
         all("a state to track that is none", "greybox control model.toml --track y --out out"),
         all("an input to command that is none", "greybox control model.toml --input g --out out"),
@@ -996,6 +1007,32 @@ fn designs() -> Vec<Row> {
             "a bandwidth below zero",
             "greybox control model.toml --feedback output --observer eso --bandwidth -3 --out out",
         ),
+        all("a reference that is missing", "greybox control model.toml --reference move.csv --out out"),
+        with(
+            "a reference of something else",
+            |bench| bench.write("move.csv", &moves("y [m]", |k| Some(0.05 * f64::from(k)))),
+            "greybox control model.toml --reference move.csv --out out",
+        ),
+        with(
+            "a reference in a unit of something else",
+            |bench| bench.write("move.csv", &moves("x [N]", |k| Some(0.05 * f64::from(k)))),
+            "greybox control model.toml --reference move.csv --out out",
+        ),
+        with(
+            "a reference that does not move",
+            |bench| bench.write("move.csv", &moves("x [m]", |_| Some(0.2))),
+            "greybox control model.toml --reference move.csv --out out",
+        ),
+        with(
+            "a reference with a gap",
+            |bench| bench.write("move.csv", &moves("x [m]", |k| (k != 20).then_some(0.05 * f64::from(k)))),
+            "greybox control model.toml --reference move.csv --out out",
+        ),
+        all(
+            "a reference and a set point",
+            "greybox control model.toml --reference run.csv --to 0.2 --out out",
+        ),
+        all("a feed-forward of no reference", "greybox control model.toml --feed-forward static --out out"),
         all("a loop that is early", "greybox control model.toml --delay -0.1 --out out"),
         all("a report that is missing", "greybox control model.toml --report report.json --out out"),
     ]

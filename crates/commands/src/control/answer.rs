@@ -3,7 +3,8 @@
 use std::fmt::Write as _;
 
 use greybox_control::{
-    Controller, Margins, Method, Metrics, ObserverMethod, OutputFeedback, Plant, Pole, observer,
+    Controller, Margins, Method, Metrics, ObserverMethod, OutputFeedback, Plant, Pole, Run, Tracking,
+    TrackingError, observer,
 };
 use greybox_report::{ControlPage, format, sentence};
 use serde_json::{Value, json};
@@ -68,6 +69,7 @@ pub(super) fn report(page: &ControlPage, designed: &Designed<'_>) -> Value {
             Some(output) => vec![output.law().to_string()],
             None => controller.law().iter().map(ToString::to_string).collect(),
         },
+        "reads_derivatives": controller.trajectories(),
         "delay": page.delay,
         "input_delay": plant.input_delay(),
         "observer": output.map(|o| observer_report(plant, o)),
@@ -78,11 +80,20 @@ pub(super) fn report(page: &ControlPage, designed: &Designed<'_>) -> Value {
         "closed_loop": {
             "diverged": run.diverged.is_some(),
             "set_points": run.metrics.iter().map(metrics).collect::<Vec<_>>(),
+            "tracking": run.tracking.as_ref().map(tracking),
         },
         "family": family.map(|f| json!({
             "members": f.members, "diverged": f.diverged, "settled": f.settled,
             "settling": spread(&f.settling), "overshoot": spread(&f.overshoot),
-            "final_error": spread(&f.final_error), "largest_command": spread(&f.largest_command),
+            "final_error": spread(&f.final_error),
+            "rms_error": f.tracking.map(|t| spread(&t.rms_error)),
+            "largest_error": f.tracking.map(|t| spread(&t.largest_error)), "peak_to_peak": spread(&f.peak_to_peak),
+            "largest_command": spread(&f.largest_command), "effort": spread(&f.effort),
+            "unstable": f.unstable,
+            "margins": f.margins.map(|m| json!({
+                "gain": spread(&m.gain), "lower_gain": spread(&m.lower_gain), "phase": spread(&m.phase),
+                "delay": spread(&m.delay), "sensitivity": spread(&m.sensitivity),
+            })),
         })),
     })
 }
@@ -106,6 +117,14 @@ fn observer_report(plant: &Plant, output: &OutputFeedback) -> Value {
     })
 }
 
+fn tracking(t: &Tracking) -> Value {
+    let error = |e: &TrackingError| json!({ "rms": e.rms, "largest": e.largest });
+    json!({
+        "span": t.span, "error": error(&t.error), "later_error": error(&t.later_error),
+        "largest_command": t.largest_command, "saturated": t.saturated, "effort": t.effort,
+    })
+}
+
 fn metrics(m: &Metrics) -> Value {
     json!({
         "set_point": m.set_point, "settling": m.settling, "overshoot": m.overshoot,
@@ -121,6 +140,28 @@ fn worst_margins(controller: &Controller, output: Option<&OutputFeedback>) -> Op
         None => controller.margins().into_iter().flatten().collect(),
     };
     all.into_iter().reduce(Margins::worse)
+}
+
+fn tracking_in_words(run: &Run, t: &Tracking) -> String {
+    format!(
+        "along the trajectory of {} s: error {} RMS, {} at most after the first quarter of the time ({} at most over all), command up to \
+         {}",
+        format::number(run.t.last().copied().unwrap_or_default()),
+        format::number(t.later_error.rms),
+        format::number(t.later_error.largest),
+        format::number(t.error.largest),
+        format::number(t.largest_command),
+    )
+}
+
+fn margins_in_words(m: &Margins) -> String {
+    format!(
+        "gain × {} to {}, phase {}°, delay {} s",
+        format::number(m.lower_gain),
+        format::number(m.gain),
+        format::number(m.phase.to_degrees()),
+        format::number(m.delay),
+    )
 }
 
 pub(super) fn in_words(designed: &Designed<'_>) -> String {
@@ -168,16 +209,8 @@ pub(super) fn in_words(designed: &Designed<'_>) -> String {
         let integral = if output.integral() { "" } else { "; no integral action" };
         let _ = writeln!(text, "  {}; measured: {}{integral}", observer_in_words(output), sensors.join(", "));
     }
-    let worst = worst_margins(controller, output);
-    if let Some(m) = worst {
-        let _ = writeln!(
-            text,
-            "  margins: gain × {} to {}, phase {}°, delay {} s",
-            format::number(m.lower_gain),
-            format::number(m.gain),
-            format::number(m.phase.to_degrees()),
-            format::number(m.delay),
-        );
+    if let Some(m) = worst_margins(controller, output) {
+        let _ = writeln!(text, "  margins: {}", margins_in_words(&m));
     }
     for dropped in plant.dropped() {
         let _ = writeln!(text, "  left out of {}: {}", dropped.equation, dropped.term);
@@ -195,6 +228,9 @@ pub(super) fn in_words(designed: &Designed<'_>) -> String {
             format::number(m.largest_command),
         );
     }
+    if let Some(t) = &run.tracking {
+        let _ = writeln!(text, "  {}", tracking_in_words(run, t));
+    }
     if let Some(at) = run.diverged {
         let t = run.t.get(at).copied().unwrap_or_default();
         let _ =
@@ -203,9 +239,21 @@ pub(super) fn in_words(designed: &Designed<'_>) -> String {
     if let Some(f) = family {
         let _ = writeln!(
             text,
-            "  on {} perturbed plants: {} settle, {} diverge",
-            f.members, f.settled, f.diverged
+            "  on {} perturbed plants: {} {}, {} diverge",
+            f.members,
+            f.settled,
+            if f.tracking.is_some() { "track" } else { "settle" },
+            f.diverged
         );
+        match f.margins {
+            Some(_) if f.unstable > 0 => {
+                let _ = writeln!(text, "  linearised, {} of them are unstable at a set point", f.unstable);
+            }
+            Some(m) => {
+                let _ = writeln!(text, "  their worst margins: {}", margins_in_words(&m.worst()));
+            }
+            None => {}
+        }
     }
     text
 }

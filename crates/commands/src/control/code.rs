@@ -2,7 +2,7 @@
 
 use std::fmt::Write as _;
 
-use greybox_control::{OutputFeedback, Plant, Run, observer};
+use greybox_control::{Controller, OutputFeedback, Plant, Run, observer};
 use greybox_export::{ChainForm, Constant, Function, Group, Member, ObserverCode, ObserverForm};
 use greybox_model::Model;
 use greybox_recording::write_csv;
@@ -13,6 +13,8 @@ use crate::failure::Failure;
 
 /// Samples of the simulated loop that the observer's code must reproduce.
 const OBSERVED: usize = 2000;
+/// What the reference and its derivatives are called in tables.
+const GIVEN: [&str; 3] = ["set_point", "set_point'", "set_point''"];
 /// States at which the exported code must agree, for each set point.
 const VECTORS: usize = 32;
 
@@ -111,7 +113,9 @@ pub(super) fn observed(designed: &Designed<'_>, output: &OutputFeedback) -> Resu
     for (&i, y) in output.observer().measured().iter().zip(&run.y) {
         columns.push((names[i].as_str(), &y[..count]));
     }
-    columns.extend([("set_point", &run.r[..count]), ("command", &run.u[..count])]);
+    let given = GIVEN.into_iter().zip(&run.given).take(references(controller));
+    columns.extend(given.map(|(name, r)| (name, &r[..count])));
+    columns.push(("command", &run.u[..count]));
     let mut csv = Vec::new();
     write_csv(&mut csv, &run.t[..count], &columns)?;
     Ok(csv)
@@ -131,8 +135,11 @@ pub(super) fn function(designed: &Designed<'_>) -> Function {
         name: "disturbance".into(),
         members: vec![Member::new(o.disturbance(), 0, "units of the command")],
     });
-    let set_point =
-        Group { name: "set_point".into(), members: vec![member(&(controller.reference().to_owned(), 0))] };
+    let derivatives = (0..references(controller)).map(|p| (controller.reference().to_owned(), p as u8));
+    let set_point = Group {
+        name: "set_point".into(),
+        members: derivatives.map(|symbol| reference_member(designed, &symbol)).collect(),
+    };
     let state = Group { name: "state".into(), members: plant.symbols().iter().map(member).collect() };
     Function {
         name: "control_law".into(),
@@ -147,13 +154,30 @@ pub(super) fn function(designed: &Designed<'_>) -> Function {
     }
 }
 
+/// How much of the reference the law reads: itself, or its first two derivatives too.
+fn references(controller: &Controller) -> usize {
+    if controller.trajectories() { 3 } else { 1 }
+}
+
+/// The reference, or a derivative of it, with the unit of the tracked state's.
+fn reference_member(designed: &Designed<'_>, (name, primes): &(String, u8)) -> Member {
+    let Designed { model, controller, .. } = *designed;
+    let unit = controller
+        .plant()
+        .symbols()
+        .get(controller.tracked())
+        .map(|(tracked, own)| state_member(model, tracked, own + primes).unit);
+    Member::new(name, *primes, &unit.unwrap_or_default())
+}
+
 /// States around the set points, with the command that the code must give.
 pub(super) fn vectors(
     designed: &Designed<'_>,
     function: &Function,
-    to: f64,
 ) -> Result<String, greybox_export::ExportError> {
-    let Designed { controller, output, .. } = *designed;
+    let Designed { controller, output, run, .. } = *designed;
+    let largest = |values: &[f64]| values.iter().fold(0.0f64, |m, v| m.max(v.abs()));
+    let (low, high) = controller.feed_forward().range;
     let plant = controller.plant();
     let mut points = Vec::new();
     for check in controller.checks() {
@@ -166,13 +190,17 @@ pub(super) fn vectors(
             if output.is_some() {
                 point.push(plant.input_size() * spread(plant.order()));
             }
-            point.push(if k % 2 == 0 { check.set_point } else { 0.5 * to });
+            point.push(if k % 2 == 0 { check.set_point } else { low + 0.75 * (high - low) });
+            let derivatives = run.given.iter().enumerate().take(references(controller)).skip(1);
+            point.extend(derivatives.map(|(p, r)| largest(r) * spread(plant.order() + p)));
             points.push(point);
         }
     }
     let mut names = plant.state_names();
     names.extend(output.map(|o| o.disturbance().to_owned()));
-    names.extend([controller.reference().to_owned(), plant.input_name().to_owned()]);
+    let given = (0..references(controller))
+        .map(|p| greybox_model::Expr::prime(controller.reference(), p as u8).to_string());
+    names.extend(given.chain([plant.input_name().to_owned()]));
     let mut text = names.join(",") + "\n";
     for vector in function.vectors(&points)? {
         let numbers: Vec<String> =

@@ -5,7 +5,7 @@ use super::{ChainText, ObserverCode, ObserverForm};
 use crate::language::number;
 
 const MEMORY: &str = "
-void @LAW@(const double state[@N@], const double disturbance[1], const double set_point[1], double out[1]);
+void @LAW@(const double state[@N@], const double disturbance[1], const double set_point[@R@], double out[1]);
 
 typedef struct {
     double estimate[@N1@]; /* the states, then the disturbance */
@@ -15,7 +15,7 @@ typedef struct {
 @CHAINS@} observer_memory;
 
 void observer_start(observer_memory *memory);
-double observer_step(observer_memory *memory, const double measured[@M@], const double set_point[1]);
+double observer_step(observer_memory *memory, const double measured[@M@], const double set_point[@R@]);
 
 /* Before the first sample. */
 void observer_start(observer_memory *memory)
@@ -62,7 +62,7 @@ static void predict(double x[@N1@], double command, double time, int steps)
 
 const STEP: &str = "/* Once a sample, every @DT@ s: the command from the measurements and the set point. A measurement that is not a
    number is left out. */
-double observer_step(observer_memory *memory, const double measured[@M@], const double set_point[1])
+double observer_step(observer_memory *memory, const double measured[@M@], const double set_point[@R@])
 {
     static const int place[@M@] = {@PLACES@};
     double *x = memory->estimate, *past = memory->past;
@@ -146,6 +146,7 @@ const AHEAD: &str = "    /* The law acts on the states that its command will mee
 pub(super) fn write(code: &ObserverCode) -> String {
     let (n, m, delay) = (code.states(), code.measured.len(), code.input_delay.0);
     let (n1, past, (law, rate)) = (n + 1, delay + 2, (&code.law.name, &code.rate.name));
+    let r = code.references();
     let (k, size) = (code.chains().len(), code.chains().iter().map(|c| c.a.len()).sum::<usize>());
     let chained = |text: &str| match k {
         0 => String::new(),
@@ -160,6 +161,7 @@ pub(super) fn write(code: &ObserverCode) -> String {
             ("N", &n),
             ("N1", &n1),
             ("M", &m),
+            ("R", &r),
             ("PAST", &past),
             ("CHAINS", &chained(CHAINS)),
             ("START", &chained(START)),
@@ -196,6 +198,7 @@ pub(super) fn write(code: &ObserverCode) -> String {
         &[
             ("DT", &number(code.dt)),
             ("M", &m),
+            ("R", &r),
             ("PLACES", &list(code.measured.iter().map(usize::to_string))),
             ("GAP", &number(code.dead_zone)),
             ("OLDEST", &(delay + 1)),

@@ -54,8 +54,8 @@ impl Observer {
     pub fn step(
         &mut self,
         measured: &[f64; @M@],
-        set_point: &[f64; 1],
-        law: impl Fn(&[f64; @N@], &[f64; 1], &[f64; 1]) -> [f64; 1],
+        set_point: &[f64; @R@],
+        law: impl Fn(&[f64; @N@], &[f64; 1], &[f64; @R@]) -> [f64; 1],
     ) -> f64 {
         const PLACE: [usize; @M@] = [@PLACES@];
         const GAP: f64 = @GAP@;
@@ -205,6 +205,7 @@ pub(super) fn write(code: &ObserverCode) -> String {
             ("PAST", &(delay + 2)),
             ("FIELDS", &chained(FIELDS)),
             ("ZEROS", &chained(ZEROS)),
+            ("R", &code.references()),
             ("DT", &number(code.dt)),
             ("LAW", &code.law.name),
             ("PLACES", &list(code.measured.iter().map(usize::to_string))),

@@ -1,14 +1,16 @@
 //! From a controller and its simulated loops to the page.
 
 use greybox_control::{
-    Controller, Family, Margins, Method, Metrics, ObserverMethod, OutputFeedback, Run, Spread,
+    Controller, Family, Margins, Method, Metrics, ObserverMethod, OutputFeedback, Run, Spread, Tracking,
+    TrackingSpread,
 };
 use greybox_model::{Expr, Model};
 
 use super::coherent;
 use crate::contract::{ModelId, Producer};
 use crate::control::{
-    ControlPage, Figure, LawKind, LawState, LoopRun, ObserverPage, Perturbed, Quantity, SensorPage, SetPoint,
+    ControlPage, Figure, LawKind, LawState, LoopRun, ObserverPage, Perturbed, PerturbedMargins, Quantity,
+    SensorPage, SetPoint,
 };
 use crate::format;
 
@@ -27,6 +29,8 @@ pub struct ControlSources<'a> {
     pub delay: f64,
     /// Its loop on the model.
     pub run: &'a Run,
+    /// Whether that followed a trajectory instead of set points.
+    pub is_trajectory: bool,
     /// The perturbed plants, with the standard deviations (SI) of their parameters.
     pub family: Option<(&'a Family, &'a [(String, f64)])>,
     /// Version and seed.
@@ -75,6 +79,7 @@ pub fn page(sources: &ControlSources<'_>) -> ControlPage {
         poles: c.poles.iter().map(pole).collect(),
         held_poles: c.held_poles.iter().map(pole).collect(),
     });
+    let set_points: Vec<SetPoint> = set_points.collect();
     let symbols = model
         .states
         .iter()
@@ -128,11 +133,14 @@ pub fn page(sources: &ControlSources<'_>) -> ControlPage {
         }),
         delay: sources.delay,
         left_out: plant.dropped().iter().map(|d| (d.equation.clone(), d.term.to_string())).collect(),
-        set_points: set_points.collect(),
         steps: run.metrics.clone(),
+        is_trajectory: sources.is_trajectory,
+        reads_derivatives: controller.trajectories(),
+        tracking: run.tracking,
         family: sources.family.map(|(family, deviations)| {
             let unit = states.get(controller.tracked()).map_or("", |s| s.quantity.unit.as_str());
-            perturbed(family, deviations, model, &run.metrics, [unit, &input.unit])
+            let margins = set_points.iter().filter_map(|s| s.margins).reduce(Margins::worse);
+            perturbed(family, deviations, model, (run, margins), [unit, &input.unit])
         }),
         run: LoopRun {
             t: run.t.clone(),
@@ -143,6 +151,7 @@ pub fn page(sources: &ControlSources<'_>) -> ControlPage {
             diverged: run.diverged.and_then(|k| run.t.get(k).copied()),
         },
         files: sources.files.to_vec(),
+        set_points,
         states,
         input,
     }
@@ -151,6 +160,11 @@ pub fn page(sources: &ControlSources<'_>) -> ControlPage {
 /// Zero where a value is nothing against its size.
 fn rounded(value: f64, size: f64) -> f64 {
     if value.abs() < 1e-12 * size { 0.0 } else { value }
+}
+
+/// `V` → `(V)^2 s`
+pub(crate) fn squared(unit: &str) -> String {
+    if unit.is_empty() { String::new() } else { format!("({unit})^2 s") }
 }
 
 /// `rad` → `rad/s^2`
@@ -210,17 +224,9 @@ fn perturbed(
     family: &Family,
     deviations: &[(String, f64)],
     model: &Model,
-    own: &[Metrics],
-    [tracked, input]: [&str; 2],
+    (own, own_margins): (&Run, Option<Margins>),
+    units: [&str; 2],
 ) -> Perturbed {
-    let own = |of: fn(&Metrics) -> f64| own.iter().map(of).fold(0.0, f64::max);
-    let figure = |name, unit: &str, own: f64, spread: Spread| Figure {
-        name,
-        unit: unit.to_owned(),
-        own,
-        median: spread.median,
-        worst: spread.worst,
-    };
     let parameters = deviations.iter().filter_map(|(name, deviation)| {
         let parameter = &model.parameters[model.parameter(name)?];
         let unit = parameter.unit.as_ref().map(coherent).unwrap_or_default();
@@ -231,13 +237,45 @@ fn perturbed(
         diverged: family.diverged,
         settled: family.settled,
         deviations: parameters.collect(),
-        figures: vec![
-            figure("Settling", "s", own(|m| m.settling.unwrap_or(f64::INFINITY)), family.settling),
-            figure("Overshoot", "%", own(|m| m.overshoot), family.overshoot),
-            figure("Final error", tracked, own(|m| m.final_error.abs()), family.final_error),
-            figure("Largest command", input, own(|m| m.largest_command), family.largest_command),
-        ],
+        figures: match &family.tracking {
+            Some(tracking) => followed(family, tracking, own, units),
+            None => reached(family, &own.metrics, units),
+        },
+        margins: family.margins.zip(own_margins).map(|(margins, own)| PerturbedMargins {
+            own,
+            median: margins.median(),
+            worst: margins.worst(),
+            unstable: family.unstable,
+        }),
         tracked: [family.tracked.lowest.clone(), family.tracked.highest.clone()],
         command: [family.command.lowest.clone(), family.command.highest.clone()],
     }
+}
+
+fn figure(name: &'static str, unit: &str, own: f64, spread: Spread) -> Figure {
+    Figure { name, unit: unit.to_owned(), own, median: spread.median, worst: spread.worst }
+}
+
+/// What the plants reached at set points.
+fn reached(family: &Family, own: &[Metrics], [tracked, input]: [&str; 2]) -> Vec<Figure> {
+    let most = |of: fn(&Metrics) -> f64| own.iter().map(of).fold(0.0, f64::max);
+    vec![
+        figure("Settling", "s", most(|m| m.settling.unwrap_or(f64::INFINITY)), family.settling),
+        figure("Overshoot", "%", most(|m| m.overshoot), family.overshoot),
+        figure("Final error", tracked, most(|m| m.final_error.abs()), family.final_error),
+        figure("Peak to peak at rest", tracked, most(|m| m.peak_to_peak), family.peak_to_peak),
+        figure("Largest command", input, most(|m| m.largest_command), family.largest_command),
+        figure("∫ u² dt", &squared(input), own.iter().map(|m| m.effort).sum(), family.effort),
+    ]
+}
+
+/// How the plants followed a trajectory.
+fn followed(family: &Family, of: &TrackingSpread, own: &Run, [tracked, input]: [&str; 2]) -> Vec<Figure> {
+    let own = |value: fn(&Tracking) -> f64| own.tracking.as_ref().map_or(f64::INFINITY, value);
+    vec![
+        figure("RMS error", tracked, own(|t| t.later_error.rms), of.rms_error),
+        figure("Largest error", tracked, own(|t| t.later_error.largest), of.largest_error),
+        figure("Largest command", input, own(|t| t.largest_command), family.largest_command),
+        figure("∫ u² dt", &squared(input), own(|t| t.effort), family.effort),
+    ]
 }

@@ -1,10 +1,11 @@
 //! The page of a controller: what its loop reached, the law, its poles, and what it does not promise.
 
 use askama::Template;
-use greybox_control::{Metrics, Verdict};
+use greybox_control::{Margins, Metrics, Tracking, Verdict};
 
 use super::{Assets, Common, Island, PlotData, PlotView, SeriesData, extent, quantity_html, series, span};
 use crate::control::{ControlPage, LawKind, Quantity};
+use crate::convert::control::squared;
 use crate::decimate::{Buckets, MAX_POINTS};
 use crate::{ReportError, expression, format, sentence, svg};
 
@@ -42,7 +43,7 @@ struct View {
     steps: Vec<Vec<String>>,
     step_heads: Vec<(&'static str, String)>,
     family: Option<FamilyView>,
-    formula_html: &'static str,
+    formula_html: String,
     law_text: String,
     gains: Vec<[String; 4]>,
     settings: Vec<(&'static str, String)>,
@@ -56,6 +57,8 @@ struct View {
     input_html: String,
     dt: String,
     is_sliding: bool,
+    is_trajectory: bool,
+    reads_derivatives: bool,
     fed_back: String,
     is_integral: bool,
     observer: Option<ObserverView>,
@@ -76,6 +79,9 @@ struct FamilyView {
     settled: usize,
     parameters: Vec<[String; 4]>,
     figures: Vec<[String; 4]>,
+    /// A row for the model, the median and the worst plant; empty without margins.
+    margins: Vec<[String; 6]>,
+    unstable: usize,
 }
 
 struct PoleRow {
@@ -93,6 +99,11 @@ impl View {
     fn new(page: &ControlPage, island: &mut Island) -> View {
         let (verdict, verdict_class) = match page.verdict {
             Verdict::Settles => ("The loop settles", "consistent"),
+            Verdict::Tracks => ("The loop stays with its trajectory", "consistent"),
+            Verdict::Fragile if page.is_trajectory => {
+                ("The loop stays with its trajectory on the model, not on every perturbed plant", "careful")
+            }
+            Verdict::Strays => ("The loop does not stay with its trajectory", "careful"),
             Verdict::Fragile => ("The loop settles on the model, not on every perturbed plant", "careful"),
             Verdict::Unsettled => ("The loop does not settle at every set point", "careful"),
             Verdict::Diverges => ("The loop runs away", "failed"),
@@ -149,7 +160,7 @@ impl View {
             steps: steps(page),
             step_heads: step_heads(tracked, &page.input),
             family: page.family.as_ref().map(|_| family(page)).unwrap_or_default(),
-            formula_html: formula(page.method),
+            formula_html: formula(page.method, page.reads_derivatives),
             law_text: page.law.clone(),
             gains: gains(page),
             settings: page.settings.clone(),
@@ -180,6 +191,8 @@ impl View {
             input_html: expression::html(&page.input.name),
             dt: format::plain(page.dt),
             is_sliding: page.method == LawKind::Smc,
+            is_trajectory: page.is_trajectory,
+            reads_derivatives: page.reads_derivatives,
             fed_back: fed_back(page),
             is_integral: page.observer.as_ref().is_some_and(|o| o.integral),
             observer: page.observer.as_ref().map(|o| ObserverView {
@@ -213,7 +226,18 @@ fn method(kind: LawKind) -> &'static str {
 }
 
 /// The law before it is written out.
-fn formula(kind: LawKind) -> &'static str {
+/// The law's equation. One that reads derivatives is about x_d and u_d in the place of the equilibrium.
+fn formula(kind: LawKind, reads_derivatives: bool) -> String {
+    let of_set_points = formula_of_set_points(kind);
+    if !reads_derivatives {
+        return of_set_points.to_owned();
+    }
+    of_set_points
+        .replace("<sub>e</sub>(<var>r</var>)", "<sub>d</sub>")
+        .replace("<var>f</var>(<var>x</var>) +", "(<var>f</var>(<var>x</var>) − <var>ẋ</var><sub>d</sub>) +")
+}
+
+fn formula_of_set_points(kind: LawKind) -> &'static str {
     match kind {
         LawKind::Lqr => {
             "<var>u</var> = <var>u</var><sub>e</sub>(<var>r</var>) − <var>K</var>\u{202f}(<var>x</var> − \
@@ -244,19 +268,23 @@ fn fed_back(page: &ControlPage) -> String {
 /// A row for each set point that has margins.
 fn margins(page: &ControlPage) -> Vec<[String; 6]> {
     let unit = page.states.get(page.tracked).map_or("", |s| s.quantity.unit.as_str());
-    let bounded = |v: f64| if v.is_finite() { format::number(v) } else { "any".to_owned() };
     let row = |s: &crate::control::SetPoint| {
-        let m = s.margins?;
-        Some([
-            format::with_unit(&format::plain(s.value), unit),
-            bounded(m.gain),
-            format::number(m.lower_gain),
-            format::number(m.phase.to_degrees()),
-            bounded(m.delay),
-            format::number(m.sensitivity),
-        ])
+        Some(margin_row(format::with_unit(&format::plain(s.value), unit), &s.margins?))
     };
     page.set_points.iter().filter_map(row).collect()
+}
+
+/// Of whom, gain, lower gain, phase, delay, sensitivity.
+fn margin_row(of: String, m: &Margins) -> [String; 6] {
+    let bounded = |v: f64| if v.is_finite() { format::number(v) } else { "any".to_owned() };
+    [
+        of,
+        bounded(m.gain),
+        format::number(m.lower_gain),
+        format::number(m.phase.to_degrees()),
+        bounded(m.delay),
+        if m.sensitivity.is_finite() { format::number(m.sensitivity) } else { "unbounded".to_owned() },
+    ]
 }
 
 /// The headline figures: name, value, what it is.
@@ -266,20 +294,37 @@ fn figures(page: &ControlPage, unit: &str) -> Vec<[String; 3]> {
     let mut out = Vec::new();
     let mut push =
         |name: &str, value: String, small: &str| out.push([name.to_owned(), value, small.to_owned()]);
-    let settled = page.steps.iter().all(|s| s.settling.is_some()) && !page.steps.is_empty();
-    let settling =
-        if settled { number(worst(|s| s.settling.unwrap_or(0.0)), "s") } else { "not reached".to_owned() };
-    push("Settling", settling, "to 2 % of the step, slowest");
-    push("Overshoot", format::percent_short(worst(|s| s.overshoot)), "of the step, largest");
-    push("Final error", number(worst(|s| s.final_error.abs()), unit), "largest");
-    push("Largest command", number(worst(|s| s.largest_command), &page.input.unit), "magnitude");
-    push("At its limit", format::percent_short(worst(|s| s.saturated)), "of a step’s samples, most");
+    if page.is_trajectory {
+        let value = |of: fn(&Tracking) -> f64, unit: &str| {
+            page.tracking.as_ref().map_or_else(|| "not reached".to_owned(), |t| number(of(t), unit))
+        };
+        push("RMS error", value(|t| t.later_error.rms, unit), "after the first quarter of the time");
+        push("Largest error", value(|t| t.later_error.largest, unit), "after the first quarter of the time");
+        push("Largest error at all", value(|t| t.error.largest, unit), "over the whole of the time");
+        push("Largest command", value(|t| t.largest_command, &page.input.unit), "magnitude");
+        let saturated = page.tracking.as_ref().map(|t| format::percent_short(t.saturated));
+        push("At its limit", saturated.unwrap_or_else(|| format::UNKNOWN.to_owned()), "of the samples");
+        push("∫ u² dt", value(|t| t.effort, &squared(&page.input.unit)), "over the whole of the time");
+    } else {
+        let settled = page.steps.iter().all(|s| s.settling.is_some()) && !page.steps.is_empty();
+        let settling = if settled {
+            number(worst(|s| s.settling.unwrap_or(0.0)), "s")
+        } else {
+            "not reached".to_owned()
+        };
+        push("Settling", settling, "to 2 % of the step, slowest");
+        push("Overshoot", format::percent_short(worst(|s| s.overshoot)), "of the step, largest");
+        push("Final error", number(worst(|s| s.final_error.abs()), unit), "largest");
+        push("Largest command", number(worst(|s| s.largest_command), &page.input.unit), "magnitude");
+        push("At its limit", format::percent_short(worst(|s| s.saturated)), "of a step’s samples, most");
+    }
     if let Some(family) = &page.family {
         let value = format!("{} of {}", family.settled, family.members);
+        let do_what = if page.is_trajectory { "stay with it" } else { "settle" };
         let small = match family.diverged {
-            0 => "settle; none diverges".to_owned(),
-            1 => "settle; one diverges".to_owned(),
-            n => format!("settle; {n} diverge"),
+            0 => format!("{do_what}; none diverges"),
+            1 => format!("{do_what}; one diverges"),
+            n => format!("{do_what}; {n} diverge"),
         };
         push("Perturbed plants", value, &small);
     }
@@ -330,7 +375,11 @@ fn plots(page: &ControlPage, island: &mut Island) -> Vec<PlotView> {
         if let Some(family) = &page.family {
             lines.extend(envelope(&family.tracked));
         }
-        lines.push(line("set point", "reference", &run.reference));
+        lines.push(line(
+            if page.is_trajectory { "trajectory" } else { "set point" },
+            "reference",
+            &run.reference,
+        ));
         lines.push(line(&expression::text(&quantity.name), "improved", values));
         push(quantity, "Tracked", values, lines, 300);
     }
@@ -355,7 +404,7 @@ fn plots(page: &ControlPage, island: &mut Island) -> Vec<PlotView> {
 fn step_heads(tracked: &Quantity, input: &Quantity) -> Vec<(&'static str, String)> {
     let unit =
         |unit: &str| if unit.is_empty() { String::new() } else { format!("in {}", format::unit(unit)) };
-    let squared = if input.unit.is_empty() { String::new() } else { format!("({})^2 s", input.unit) };
+    let squared = squared(&input.unit);
     vec![
         ("Set point", unit(&tracked.unit)),
         ("Step", unit(&tracked.unit)),
@@ -403,7 +452,13 @@ fn family(page: &ControlPage) -> Option<FamilyView> {
             format::unit(&quantity.unit),
         ]
     };
+    let margins = family.margins.iter().flat_map(|m| {
+        [("Model", m.own), ("Median plant", m.median), ("Worst plant", m.worst)]
+            .map(|(of, margins)| margin_row(of.to_owned(), &margins))
+    });
     Some(FamilyView {
+        margins: margins.collect(),
+        unstable: family.margins.map_or(0, |m| m.unstable),
         members: family.members,
         diverged: family.diverged,
         settled: family.settled,

@@ -1,8 +1,8 @@
 //! What a control engineer wants to know first, in plain language.
 
-use greybox_control::{Metrics, Verdict};
+use greybox_control::{Metrics, Tracking, Verdict};
 
-use crate::control::ControlPage;
+use crate::control::{ControlPage, PerturbedMargins};
 use crate::{expression, format};
 
 /// The conclusion, most important first: how the loop settles, then what holds on perturbed plants, then the command.
@@ -12,7 +12,8 @@ pub fn summary(page: &ControlPage) -> Vec<String> {
     let name = tracked.map_or_else(|| "The tracked state".to_owned(), |q| expression::text(&q.name));
     let mut out = vec![reached(page, &name, unit)];
     out.push(match &page.family {
-        None => "No perturbed plants were tried: nothing is said about a plant that is not quite the model.".into(),
+        None => "No perturbed plants were tried: nothing is said about a plant that is not quite the model."
+            .into(),
         Some(family) => {
             let diverged = match family.diverged {
                 0 => "none diverges".to_owned(),
@@ -20,18 +21,42 @@ pub fn summary(page: &ControlPage) -> Vec<String> {
                 n => format!("{n} diverge"),
             };
             format!(
-                "Of {} plants with parameters drawn around the model's, {} settle at every set point; {diverged}.",
-                family.members, family.settled
+                "Of {} plants with parameters drawn around the model's, {} {}; {diverged}.",
+                family.members,
+                family.settled,
+                if page.is_trajectory { "stay with the trajectory" } else { "settle at every set point" },
             )
         }
     });
+    out.extend(page.family.as_ref().and_then(|f| f.margins).map(|m| margins(&m)));
     out.push(command(page));
     out
+}
+
+/// What the loop has to spare on the worst of the perturbed plants.
+fn margins(of: &PerturbedMargins) -> String {
+    match of.unstable {
+        0 => {}
+        1 => return "On one of them the linearised loop is unstable at a set point.".to_owned(),
+        n => return format!("On {n} of them the linearised loop is unstable at a set point."),
+    }
+    let bounded = |v: f64, unit: &str| {
+        if v.is_finite() { format!("at least {}{unit}", format::number(v)) } else { "unlimited".to_owned() }
+    };
+    format!(
+        "On all of them the gain margin is {}, the phase margin {} and the delay margin {}.",
+        bounded(of.worst.gain, ""),
+        bounded(of.worst.phase.to_degrees(), "°"),
+        bounded(of.worst.delay, " s"),
+    )
 }
 
 fn reached(page: &ControlPage, name: &str, unit: &str) -> String {
     if let Some(t) = page.run.diverged {
         return format!("{name} leaves every bound after {} s.", format::plain(t));
+    }
+    if let Some(tracking) = &page.tracking {
+        return followed(tracking, name, unit);
     }
     let worst = |of: fn(&Metrics) -> f64| page.steps.iter().map(of).fold(0.0, f64::max);
     let missed = page.steps.iter().filter(|s| s.settling.is_none()).count();
@@ -50,20 +75,37 @@ fn reached(page: &ControlPage, name: &str, unit: &str) -> String {
     )
 }
 
+fn followed(t: &Tracking, name: &str, unit: &str) -> String {
+    let value = |v: f64| format::with_unit(&format::number(v), unit);
+    let share = |v: f64| format::percent_short(v / t.span);
+    format!(
+        "After the first quarter of the time {name} is {} from its trajectory at most, {} of its span, and {} in the root mean \
+         square; over the whole of the time {} at most.",
+        value(t.later_error.largest),
+        share(t.later_error.largest),
+        value(t.later_error.rms),
+        value(t.error.largest),
+    )
+}
+
 fn command(page: &ControlPage) -> String {
-    let largest = page.steps.iter().map(|s| s.largest_command).fold(0.0, f64::max);
+    let along = page.tracking.iter();
+    let steps = || page.steps.iter();
+    let largest = steps().map(|s| s.largest_command).chain(along.clone().map(|t| t.largest_command));
+    let largest = largest.fold(0.0, f64::max);
     let reaches = format!(
         "{} reaches {}",
         expression::text(&page.input.name),
         format::with_unit(&format::number(largest), &page.input.unit)
     );
-    let saturated = page.steps.iter().map(|s| s.saturated).fold(0.0, f64::max);
+    let saturated = steps().map(|s| s.saturated).chain(along.map(|t| t.saturated)).fold(0.0, f64::max);
     if page.limits.iter().all(|l| l.is_infinite()) {
         format!("{reaches}; no limit of the actuator was stated.")
     } else if saturated > 0.0 {
         format!(
-            "{reaches}, its limit, and is there for {} of a step at most.",
-            format::percent_short(saturated)
+            "{reaches}, its limit, and is there for {} of {}.",
+            format::percent_short(saturated),
+            if page.is_trajectory { "the time" } else { "a step at most" }
         )
     } else {
         format!("{reaches} and stays within its limits.")
