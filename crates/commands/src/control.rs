@@ -225,10 +225,7 @@ pub fn control(
         ..LoopOptions::default()
     };
     let closed = ClosedLoop::new(model, &controller, &options).map_err(refused)?;
-    let reference = match &request.trajectory {
-        Some(trajectory) => Reference::Trajectory(trajectory.clone()),
-        None => Reference::square(request.to, request.hold, 4),
-    };
+    let reference = reference(request);
     let run = closed.run(&reference).map_err(refused)?;
     stage("perturbing");
     let deviations = match report_of {
@@ -354,6 +351,14 @@ fn method(request: &Request) -> Method {
             let eta = request.eta.unwrap_or(10.0 * request.input_size);
             Method::Smc { lambda: request.lambda, eta, phi: eta / request.rate }
         }
+    }
+}
+
+/// What the simulated loop follows.
+fn reference(request: &Request) -> Reference {
+    match &request.trajectory {
+        Some(trajectory) => Reference::Trajectory(trajectory.clone()),
+        None => Reference::square(request.to, request.hold, 4),
     }
 }
 

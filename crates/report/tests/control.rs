@@ -296,6 +296,6 @@ fn a_trajectory_has_its_errors() {
     assert!(!html.contains("What each step of") && !html.contains("Settling to 2"));
     (page.tracking, page.verdict) = (None, Verdict::Diverges);
     page.run.diverged = Some(0.3);
-    let html = page.to_html().unwrap();
+    let html = page.to_html().unwrap().replace('\u{a0}', " ");
     assert!(html.contains("<dd>not reached<small>") && html.contains("leaves every bound after 0.3 s"));
 }
