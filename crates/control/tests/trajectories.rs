@@ -69,7 +69,7 @@ fn move_of_a_second() -> Trajectory {
 fn methods() -> [Method; 3] {
     [
         Method::Lqr,
-        Method::Hjb { degree: 4, domain: vec![1.0, 8.0] },
+        Method::Hjb { degree: 4, domain: vec![1.0, 8.0], bounded: false },
         Method::Smc { lambda: 15.0, eta: 50.0, phi: 1.0 },
     ]
 }
