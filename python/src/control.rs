@@ -157,7 +157,8 @@ pub(crate) fn control<'py>(
         let channel = design::channel(&loaded.model, track.as_deref()).map(|c| vec![c]);
         let recording = raised(py, reference.read(&loading::Wanted::default().of_names(channel)))?;
         let path = PathBuf::from(&recording.name);
-        request.trajectory = Some(raised(py, design::trajectory(&loaded, track.as_deref(), &recording, &path))?);
+        request.trajectory =
+            Some(raised(py, design::trajectory(&loaded, track.as_deref(), &recording, &path))?);
     }
     let results = watched(py, progress, move |watch| {
         let report = report.as_ref().map(|(path, text)| (path.as_path(), text.as_str()));

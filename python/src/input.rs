@@ -216,9 +216,9 @@ impl Sources {
         for place in all {
             let one = match place {
                 Place::Memory(mut recording) => self.wanted.apply(&mut recording).map(|()| recording),
-                Place::File(_) => files.next().unwrap_or_else(|| {
-                    Err(Failure::internal("a recording was named, but not read"))
-                }),
+                Place::File(_) => files
+                    .next()
+                    .unwrap_or_else(|| Err(Failure::internal("a recording was named, but not read"))),
             };
             if let Ok(recording) = &one
                 && !names.insert(recording.name.clone())
