@@ -1,5 +1,6 @@
 //! Recordings and models from Python.
 
+use std::collections::HashSet;
 use std::path::{Path, PathBuf};
 
 use greybox_commands::Failure;
