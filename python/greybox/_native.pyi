@@ -119,7 +119,11 @@ def check(
     channels: Sequence[str],
 ) -> tuple[str, str]: ...
 def control(
-    model: Model, wanted: dict[str, Any], report: tuple[str, str] | None, progress: _Progress
+    model: Model,
+    wanted: dict[str, Any],
+    reference: _Source | None,
+    report: tuple[str, str] | None,
+    progress: _Progress,
 ) -> tuple[
     str, str, list[tuple[str, bytes]], tuple[_Floats, _Floats, _Floats, list[tuple[str, _Floats]]]
 ]: ...

@@ -313,12 +313,12 @@ def control(
     if isinstance(model, Diagnosis):
         report = model if report is None else report
         model = model.model
-    told = None
+    reported = None
     if isinstance(report, (Diagnosis, Calibration)):
-        told = ("report.json", report.to_json())
+        reported = ("report.json", report.to_json())
     elif report is not None:
         with open(report, encoding="utf-8") as file:
-            told = (os.fspath(report), file.read())
+            reported = (os.fspath(report), file.read())
     wanted = {
         "method": method,
         "input": input,
@@ -349,4 +349,4 @@ def control(
         "seed": seed,
     }
     followed = None if reference is None else recordings([reference], "reference", None)[0]
-    return Control(_native.control(native(model), wanted, followed, told, progress))
+    return Control(_native.control(native(model), wanted, followed, reported, progress))
