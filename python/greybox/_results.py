@@ -279,7 +279,10 @@ class Control(_Result):
 
 
 class Health(_Result):
-    """Whether recordings are good enough: ``recordings``, each with its ``findings``."""
+    """Whether recordings are good enough: ``recordings``, each with its ``findings``.
+
+    ``failures`` has the errors of those that could not be checked.
+    """
 
     def __repr__(self) -> str:
         return f"Health({', '.join(one.file for one in self.recordings)})"

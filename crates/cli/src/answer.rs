@@ -70,6 +70,7 @@ impl Answer {
         let said: String = self.failures.iter().map(Failure::to_string).chain(met).collect();
         // With standard error closed there is nobody left to tell.
         let _ = std::io::stderr().lock().write_all(said.as_bytes());
+        // (A fault of greybox, 1, outweighs bad input, 2.)
         let failed = self.failures.iter().map(Failure::code).min();
         let met = (!self.met.is_empty()).then_some(FAILED);
         Ok(failed.or(met).map_or(ExitCode::SUCCESS, ExitCode::from))

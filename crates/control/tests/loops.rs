@@ -298,7 +298,7 @@ fn units_play_no_part() {
 }
 
 /// A pole balanced on a cart, angle from upright.
-const CART_POLE: &str = r#"
+pub(crate) const CART_POLE: &str = r#"
 [inputs]
 u = { unit = "N" }
 [states]

@@ -1,6 +1,7 @@
 //! Loops that follow a trajectory.
 
 use crate::common::load;
+use crate::loops::CART_POLE;
 use greybox_control::{
     ClosedLoop, ControlError, Controller, DesignOptions, FamilyOptions, Feedback, LoopOptions, Method,
     ObserverMethod, OutputFeedback, OutputOptions, Plant, PlantOptions, Reference, Run, Sensor, Tracking,
@@ -106,6 +107,33 @@ fn derivatives_take_out_the_lag() {
     }
 }
 
+/// A law within limits follows as one without does, where what the motion takes is well within them, and never goes beyond.
+#[test]
+fn a_bounded_law_follows_within_its_limits() {
+    let (model, reference) = (arm(0.0, 0.0), sine());
+    let method = Method::Hjb { degree: 4, domain: vec![1.0, 8.0], bounded: true };
+    let options = PlantOptions {
+        sizes: vec![("theta".to_string(), 0.2), ("theta'".to_string(), 4.0)],
+        input_size: 5.0,
+        ..PlantOptions::default()
+    };
+    let plant = Plant::of(&model, "v", &options).unwrap();
+    let error = |limit: f64, trajectories: bool| {
+        let wanted = DesignOptions {
+            trajectories,
+            limit: Some(limit),
+            ..DesignOptions::new("theta", &[-0.5, 0.5], 2e-3)
+        };
+        let law = design(&plant, &method, &wanted).unwrap();
+        assert!(law.command_along(&[-9.0, -90.0], &[0.5, 9.0, 99.0]) <= limit);
+        followed(&model, &law, &reference).later_error.largest
+    };
+    let [wide, narrow] = [40.0, 8.0].map(|limit| error(limit, true));
+    let lag = error(8.0, false);
+    println!("{wide:.2e} {narrow:.2e} {lag:.2e}");
+    assert!(wide.max(narrow) < 2e-3 * lag, "{wide} {narrow} {lag}");
+}
+
 /// At rest both are one law: what the derivatives add is zero with them, and the gains are those of the set points.
 #[test]
 fn a_set_point_is_a_trajectory_at_rest() {
@@ -141,24 +169,7 @@ fn the_feed_forward_of_an_arm_is_its_inverse_dynamics() {
 /// equations does. What is left falls with the third derivative, by eight where the move takes twice the time.
 #[test]
 fn an_output_with_unstable_zeros_is_followed_slowly() {
-    let model = load(
-        r#"
-[inputs]
-u = { unit = "N" }
-[states]
-x = { unit = "m" }
-th = { unit = "rad" }
-[parameters]
-M = { value = 1.0, unit = "kg" }
-m = { value = 0.2, unit = "kg" }
-l = { value = 0.5, unit = "m" }
-g = { value = 9.81, unit = "m/s^2" }
-b = { value = 0.1, unit = "N s/m" }
-[equations]
-cart = "(M + m)*x'' + m*l*cos(th)*th'' - m*l*sin(th)*th'^2 + b*x' = u"
-pole = "cos(th)*x'' + l*th'' - g*sin(th) = 0"
-"#,
-    );
+    let model = load(CART_POLE);
     let sizes = [("x", 0.3), ("x'", 1.0), ("th", 0.2), ("th'", 1.0)].map(|(n, s)| (n.to_owned(), s));
     let options = PlantOptions { sizes: sizes.to_vec(), input_size: 10.0, ..PlantOptions::default() };
     let plant = Plant::of(&model, "u", &options).unwrap();
