@@ -260,6 +260,7 @@ def control(
     disturbance: float | None = None,
     bandwidth: float | None = None,
     integral: bool = True,
+    integral_at_rest: bool = False,
     delay: float = 0.0,
     report: str | os.PathLike[str] | Diagnosis | Calibration | None = None,
     members: int = 200,
@@ -286,6 +287,7 @@ def control(
         feedback: what the law is given, ``state`` (all of it) or ``output`` (the estimate of an ``observer``).
         observer: ``kalman`` (``disturbance``: its change in one second, in units of the command) or ``eso``
             (``bandwidth``, 1/s); the law takes the disturbance that it estimates off the command, its ``integral`` action.
+        integral_at_rest: the integral action is the error at rest instead, for a machine that sticks and hunts.
         noise, resolution: standard deviations and steps of the measured states' sensors.
         delay: of the simulated loop, s.
         report: how sure the model's parameters are, for the perturbed plants (``members``, ``seed``); the report has
@@ -344,6 +346,7 @@ def control(
         "disturbance": disturbance,
         "bandwidth": bandwidth,
         "integral": integral,
+        "integral_at_rest": integral_at_rest,
         "delay": delay,
         "members": members,
         "seed": seed,

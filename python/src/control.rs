@@ -2,7 +2,7 @@
 
 use std::path::PathBuf;
 
-use greybox_commands::control::{self as design, ObserverKind, ObserverRequest, Request, Way};
+use greybox_commands::control::{self as design, IntegralKind, ObserverKind, ObserverRequest, Request, Way};
 use greybox_commands::{Failure, loading};
 use numpy::PyArray1;
 use pyo3::prelude::*;
@@ -41,6 +41,7 @@ pub(crate) struct Wanted {
     disturbance: Option<f64>,
     bandwidth: Option<f64>,
     integral: bool,
+    integral_at_rest: bool,
     delay: f64,
     members: usize,
     seed: u64,
@@ -70,7 +71,15 @@ impl Wanted {
                 resolution: self.resolution.clone(),
                 disturbance: self.disturbance,
                 bandwidth: self.bandwidth,
-                no_integral: !self.integral,
+                integral: match (self.integral, self.integral_at_rest) {
+                    (false, false) => IntegralKind::Off,
+                    (true, false) => IntegralKind::Disturbance,
+                    (true, true) => IntegralKind::AtRest,
+                    (false, true) => {
+                        return Err(Failure::input("`integral_at_rest` is an integral action, and `integral` is false")
+                            .help("leave out one of them"));
+                    }
+                },
             })),
             other => Err(Failure::input(format!("`{other}` is nothing to feed back"))
                 .help("choose `state` or `output`")),

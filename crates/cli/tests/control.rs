@@ -300,6 +300,47 @@ fn output_feedback_gives_code_that_repeats_the_loop() {
     assert!(code == Some(2) && err.contains("--feedback output"), "{err}");
 }
 
+/// The code of an integral action at rest repeats the loop too: its memory is that of the simulated law.
+#[test]
+fn integral_action_at_rest_is_in_the_code() {
+    let folder = tempfile::tempdir().unwrap();
+    let sticky = MODEL.replace("value = 0.005", "value = 0.05");
+    let late = sticky.replace("= kt*v", "= kt*delay(v, tau)");
+    let late = late.replace("\n[eq", "tau = { value = 0.005, unit = \"s\" }\n\n[eq");
+    for (name, text) in [("arm", sticky), ("late", late)] {
+        std::fs::write(folder.path().join(format!("{name}.toml")), text).unwrap();
+    }
+    for (model, observer) in [("arm", "kalman"), ("arm", "eso"), ("late", "kalman")] {
+        let place = format!("{model}-{observer}");
+        let settings = "--to 0.8 --size theta=0.4 --size theta'=4 --input-size 5 --limit 10 --dt 0.002 --members 0 --hold 3 \
+                        --json --feedback output --resolution theta=0.0015 --integral-at-rest";
+        let file = format!("{model}.toml");
+        let own = ["--observer", observer, "--out", &place];
+        let all: Vec<&str> =
+            ["control", &file].into_iter().chain(settings.split_whitespace()).chain(own).collect();
+        let (code, out, err) = greybox(folder.path(), &all);
+        assert_eq!(code, Some(0), "{place}: {err}");
+        let report: serde_json::Value = serde_json::from_str(&out).unwrap();
+        let rest = &report["observer"]["rest"];
+        assert_eq!((&report["observer"]["integral"], rest["step"].as_f64()), (&true.into(), Some(0.0015)));
+        let velocity = rest["velocity"].as_f64().unwrap() * rest["time"].as_f64().unwrap();
+        assert!((velocity - 0.0015).abs() < 1e-12 && rest["integral_time"].as_f64().unwrap() > 0.0, "{rest}");
+        for point in report["closed_loop"]["set_points"].as_array().unwrap() {
+            assert!(point["final_error"].as_f64().unwrap().abs() < 2.0 * 0.0015, "{place}: {point}");
+        }
+        let read = |name: &str| std::fs::read_to_string(folder.path().join(&place).join(name)).unwrap();
+        let html = read("report.html");
+        assert!(html.contains("its integral action is the error of a machine at rest"), "{place}");
+        assert!(read("observer.c").contains("memory->offset"));
+        repeats(&folder.path().join(&place), &read("observer_vectors.csv"));
+    }
+    for other in [&["--feedback", "output", "--no-integral"][..], &[]] {
+        let all = [&["control", "arm.toml", "--integral-at-rest", "--out", "o"], other].concat();
+        let (code, _, err) = greybox(folder.path(), &all);
+        assert!(code == Some(2) && err.contains("--integral-at-rest"), "{err}");
+    }
+}
+
 /// Runs the observer's code over the measurements, in C and in Rust.
 fn repeats(folder: &Path, vectors: &str) {
     let rows: Vec<Vec<f64>> =

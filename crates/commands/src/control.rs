@@ -8,9 +8,9 @@ mod trajectory;
 use std::path::Path;
 
 use greybox_control::{
-    ClosedLoop, Controller, DesignOptions, FamilyOptions, Feedback, LoopOptions, Method, ObserverMethod,
-    OutputFeedback, OutputOptions, Plant, PlantOptions, Reference, Run, Sensor, Trajectory, UNSTATED_NOISE,
-    design, equilibrium,
+    ClosedLoop, Controller, DesignOptions, FamilyOptions, Feedback, Integral, LoopOptions, Method,
+    ObserverMethod, OutputFeedback, OutputOptions, Plant, PlantOptions, Reference, Run, Sensor, Trajectory,
+    UNSTATED_NOISE, design, equilibrium,
 };
 use greybox_export::Language;
 use greybox_model::Model;
@@ -109,8 +109,20 @@ pub struct ObserverRequest {
     pub disturbance: Option<f64>,
     /// Bandwidth, 1/s; four times the fastest pole of the loop where none is given (ESO).
     pub bandwidth: Option<f64>,
-    /// The law does not take the estimated disturbance off the command: no integral action.
-    pub no_integral: bool,
+    /// The integral action of the law.
+    pub integral: IntegralKind,
+}
+
+/// The integral action of a law behind an observer.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
+pub enum IntegralKind {
+    /// The law takes the estimated disturbance off the command.
+    #[default]
+    Disturbance,
+    /// The error at rest, for a machine that sticks ([`greybox_control::Rest`]).
+    AtRest,
+    /// None.
+    Off,
 }
 
 /// The observers.
@@ -414,5 +426,10 @@ fn output_feedback(
         let unstated = if resolution > 0.0 { 0.0 } else { UNSTATED_NOISE * size };
         sensors.push((name.clone(), Sensor { noise: of(&wanted.noise).unwrap_or(unstated), resolution }));
     }
-    OutputFeedback::new(controller, &OutputOptions { method, sensors, integral: !wanted.no_integral })
+    let integral = match wanted.integral {
+        IntegralKind::Disturbance => Integral::Disturbance,
+        IntegralKind::AtRest => Integral::AtRest { time: None },
+        IntegralKind::Off => Integral::Off,
+    };
+    OutputFeedback::new(controller, &OutputOptions { method, sensors, integral })
 }

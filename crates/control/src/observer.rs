@@ -181,6 +181,10 @@ impl Observer {
         &self.measured
     }
 
+    pub(crate) fn order(&self) -> usize {
+        self.plant.order()
+    }
+
     /// Steps of a prediction over one sample.
     #[must_use]
     pub fn substeps(&self) -> usize {

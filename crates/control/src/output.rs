@@ -11,6 +11,7 @@ use crate::error::{ControlError, listed};
 use crate::margins::{Margins, OpenLoop};
 use crate::observer::{InputDelay, Memory, Observer, ObserverMethod, Prediction, Sensor, Tangent};
 use crate::plant::Plant;
+use crate::rest::{Integral, Rest, RestMemory};
 use crate::stability;
 
 /// Noise of a sensor of which nothing is stated, over the size of its state.
@@ -23,9 +24,8 @@ pub struct OutputOptions {
     pub method: ObserverMethod,
     /// Sensors by the name of the measured state; those not named have noise of [`UNSTATED_NOISE`] of the state's size.
     pub sensors: Vec<(String, Sensor)>,
-    /// Whether the law takes d̂ off the command: its integral action. Where friction is coupled into a coordinate that the
-    /// command does not reach, integral action hunts, and the loop without it rests, an error off.
-    pub integral: bool,
+    /// The integral action of the law.
+    pub integral: Integral,
 }
 
 /// The loop with the observer at a set point, friction dropped.
@@ -46,9 +46,10 @@ pub struct OutputCheck {
 /// u = κ(x̂, r) − d̂          within the limits
 /// ```
 ///
-/// with the law κ of the [`Controller`]; without integral action d̂ stays out of it. The estimated disturbance d̂ is its integral action: friction, loads and wrong
+/// with the law κ of the [`Controller`]. The estimated disturbance d̂ is its integral action: friction, loads and wrong
 /// parameters leave no error where the loop comes to rest. The observer is given the command as it is after the limits,
-/// so that nothing winds up.
+/// so that nothing winds up. For a machine that sticks, integral action at rest ([`Rest`]) stands in its place; without
+/// integral action d̂ stays out of the command.
 ///
 /// Where the command acts late ([`PlantOptions::predict_input_delay`](crate::PlantOptions)), x̂ is predicted over the delay by the
 /// commands that were given, and the law acts on the state that its command will meet (O. J. M. Smith, *Chem. Eng.
@@ -56,7 +57,7 @@ pub struct OutputCheck {
 ///
 /// ```
 /// use greybox_control::{
-///     ClosedLoop, DesignOptions, Feedback, LoopOptions, Method, ObserverMethod, OutputFeedback, OutputOptions, Plant,
+///     ClosedLoop, DesignOptions, Feedback, Integral, LoopOptions, Method, ObserverMethod, OutputFeedback, OutputOptions, Plant,
 ///     PlantOptions, Reference, Sensor, design,
 /// };
 /// # let model = greybox_model::Model::from_toml(r#"
@@ -79,7 +80,7 @@ pub struct OutputCheck {
 /// let observer = OutputFeedback::new(&law, &OutputOptions {
 ///     method: ObserverMethod::Kalman { disturbance: 1.0 },
 ///     sensors: vec![("theta".into(), encoder)],
-///     integral: true,
+///     integral: Integral::Disturbance,
 /// })?;
 /// let options = LoopOptions { feedback: Feedback::Output(Box::new(observer)), ..LoopOptions::default() };
 /// let run = ClosedLoop::new(&model, &law, &options)?.run(&Reference::square(0.5, 5.0, 2))?;
@@ -96,7 +97,8 @@ pub struct OutputFeedback {
     limits: (f64, f64),
     dead_zone: f64,
     method: ObserverMethod,
-    integral: bool,
+    integral: Integral,
+    rest: Option<Rest>,
     checks: Vec<OutputCheck>,
 }
 
@@ -104,6 +106,7 @@ pub struct OutputFeedback {
 #[derive(Debug, Clone)]
 pub struct OutputMemory {
     observer: Memory,
+    rest: RestMemory,
     /// The last command.
     command: f64,
 }
@@ -119,6 +122,12 @@ impl OutputMemory {
     #[must_use]
     pub fn disturbance(&self) -> f64 {
         self.observer.estimate[self.observer.estimate.len() - 1]
+    }
+
+    /// o of the integral action at rest ([`Rest`]), in units of the command; zero with another one.
+    #[must_use]
+    pub fn offset(&self) -> f64 {
+        self.rest.offset
     }
 }
 
@@ -170,8 +179,14 @@ impl OutputFeedback {
         let disturbance = free_name(plant, "d", &[controller.reference()]);
         let (low, high) = controller.limits();
         let law = match options.integral {
-            true => controller.unlimited().clone() - Expr::var(&disturbance),
-            false => controller.unlimited().clone(),
+            Integral::Off => controller.unlimited().clone(),
+            Integral::Disturbance | Integral::AtRest { .. } => {
+                controller.unlimited().clone() - Expr::var(&disturbance)
+            }
+        };
+        let rest = match options.integral {
+            Integral::AtRest { time } => Some(Rest::new(controller, time, &measured, &sensors)?),
+            Integral::Off | Integral::Disturbance => None,
         };
         let law = limited(&law, plant, low, high);
         let mut variables = plant.symbols().to_vec();
@@ -188,6 +203,7 @@ impl OutputFeedback {
             dead_zone: plant.dead_zone(),
             method: options.method,
             integral: options.integral,
+            rest,
             checks: Vec::new(),
         };
         for check in controller.checks() {
@@ -209,10 +225,16 @@ impl OutputFeedback {
         &self.method
     }
 
-    /// Whether the law takes the disturbance off the command.
+    /// The integral action.
     #[must_use]
-    pub fn integral(&self) -> bool {
+    pub fn integral(&self) -> Integral {
         self.integral
+    }
+
+    /// The numbers of the integral action at rest.
+    #[must_use]
+    pub fn rest(&self) -> Option<&Rest> {
+        self.rest.as_ref()
     }
 
     /// The sensors, in the order of [`Observer::measured`].
@@ -222,7 +244,8 @@ impl OutputFeedback {
     }
 
     /// The command, within the limits, as an expression of the states, the disturbance
-    /// ([`disturbance`](Self::disturbance)), the set point and the plant's parameters.
+    /// ([`disturbance`](Self::disturbance)), which is the offset of an integral action at rest, the set point and the
+    /// plant's parameters.
     #[must_use]
     pub fn law(&self) -> &Expr {
         &self.law
@@ -243,7 +266,7 @@ impl OutputFeedback {
     /// What there is to remember before the first sample.
     #[must_use]
     pub fn start(&self) -> OutputMemory {
-        OutputMemory { observer: self.observer.start(), command: 0.0 }
+        OutputMemory { observer: self.observer.start(), rest: Rest::start(), command: 0.0 }
     }
 
     /// The command at a sample, from its measurements (in the order of [`Observer::measured`]) and the set point. A
@@ -259,15 +282,29 @@ impl OutputFeedback {
         let u = memory.command;
         let behind = if u.is_finite() { u - u.clamp(-self.dead_zone, self.dead_zone) } else { 0.0 };
         self.observer.update(&mut memory.observer, y, behind);
-        let mut at = self.observer.ahead(&memory.observer);
+        let estimate = self.observer.ahead(&memory.observer);
+        let (x, d) = estimate.split_at(self.observer.order());
+        memory.command = match &self.rest {
+            Some(rest) => {
+                let law = |x: &[f64], offset: f64| self.law_at(x, offset, reference);
+                rest.command(&mut memory.rest, (x, y, reference[0]), law)
+            }
+            None => self.law_at(x, d[0], reference),
+        };
+        memory.command
+    }
+
+    /// The law, within the limits; not a number where it is none.
+    fn law_at(&self, x: &[f64], disturbance: f64, reference: &[f64; 3]) -> f64 {
+        let mut at = x.to_vec();
+        at.push(disturbance);
         at.extend(reference);
         let mut u = [f64::NAN];
         if at.iter().all(|v| v.is_finite()) {
             self.compiled.eval(&at, 0, &mut u);
         }
         // The comparisons of a limit would make a number of what is none.
-        memory.command = if u[0].is_nan() { f64::NAN } else { u[0].max(self.limits.0).min(self.limits.1) };
-        memory.command
+        if u[0].is_nan() { f64::NAN } else { u[0].max(self.limits.0).min(self.limits.1) }
     }
 
     fn check(
@@ -313,7 +350,8 @@ impl OutputFeedback {
         ahead: &Prediction,
     ) -> (DMatrix<f64>, Vec<f64>) {
         let n = gain.ncols();
-        let taken_off = f64::from(u8::from(self.integral));
+        // An integral action at rest is none in motion.
+        let taken_off = f64::from(u8::from(self.integral == Integral::Disturbance));
         let state = gain * &ahead.state;
         let disturbance = (gain * &ahead.disturbance)[0] - taken_off;
         let of_estimate = DMatrix::from_fn(1, n + 1, |_, j| if j < n { state[j] } else { disturbance });

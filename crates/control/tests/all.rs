@@ -8,4 +8,5 @@ mod link;
 mod loops;
 mod output;
 mod plants;
+mod rest;
 mod trajectories;

@@ -3,8 +3,9 @@
 use std::f64::consts::TAU;
 
 use greybox_control::{
-    ClosedLoop, ControlError, Controller, DesignOptions, FamilyOptions, Feedback, LoopOptions, Method,
-    ObserverMethod, OutputFeedback, OutputOptions, Plant, PlantOptions, Reference, Run, Sensor, design,
+    ClosedLoop, ControlError, Controller, DesignOptions, FamilyOptions, Feedback, Integral, LoopOptions,
+    Method, ObserverMethod, OutputFeedback, OutputOptions, Plant, PlantOptions, Reference, Run, Sensor,
+    design,
 };
 use greybox_model::Model;
 
@@ -47,7 +48,8 @@ fn law(model: &Model) -> Controller {
 }
 
 fn with(law: &Controller, method: ObserverMethod, sensor: Sensor) -> LoopOptions {
-    let options = OutputOptions { method, sensors: vec![("theta".into(), sensor)], integral: true };
+    let options =
+        OutputOptions { method, sensors: vec![("theta".into(), sensor)], integral: Integral::Disturbance };
     let output = OutputFeedback::new(law, &options).unwrap();
     LoopOptions { feedback: Feedback::Output(Box::new(output)), ..LoopOptions::default() }
 }
@@ -205,8 +207,9 @@ fn noise_is_that_of_its_seed() {
 fn what_cannot_be_observed_is_refused() {
     let model = arm(0.0);
     let law = law(&model);
-    let make =
-        |method, sensors| OutputFeedback::new(&law, &OutputOptions { method, sensors, integral: true });
+    let make = |method, sensors| {
+        OutputFeedback::new(&law, &OutputOptions { method, sensors, integral: Integral::Disturbance })
+    };
     let sensor = |noise, resolution| vec![("theta".to_string(), Sensor { noise, resolution })];
     assert!(matches!(make(KALMAN, sensor(-1.0, 0.0)), Err(ControlError::Option { .. })));
     assert!(matches!(make(KALMAN, sensor(0.0, 0.0)), Err(ControlError::Option { .. })));
@@ -298,8 +301,10 @@ fn a_late_command_is_predicted_over() {
     assert!(matches!(Plant::of(&other, "v", &options), Err(ControlError::SeveralDelays { .. })));
     let long = Plant::of(&late(0.5), "v", &options).unwrap();
     let law = design(&long, &Method::Lqr, &set_points).unwrap();
-    let made =
-        OutputFeedback::new(&law, &OutputOptions { method: KALMAN, sensors: Vec::new(), integral: true });
+    let made = OutputFeedback::new(
+        &law,
+        &OutputOptions { method: KALMAN, sensors: Vec::new(), integral: Integral::Disturbance },
+    );
     assert!(matches!(made, Err(ControlError::LongDelay { samples: 250, .. })));
 }
 
@@ -349,7 +354,10 @@ coil = "L*i' + R*i + ke*theta' = v"
     println!("current {far:.1e} of {largest:.1}");
     assert!(far < 8e-3 * largest, "{far}");
     let made = |law: &Controller, method| {
-        OutputFeedback::new(law, &OutputOptions { method, sensors: Vec::new(), integral: true })
+        OutputFeedback::new(
+            law,
+            &OutputOptions { method, sensors: Vec::new(), integral: Integral::Disturbance },
+        )
     };
     let refused = made(&law_of_angle, ESO).unwrap_err();
     assert!(matches!(&refused, ControlError::EsoUnmeasured { name } if name == "i"), "{refused}");
@@ -384,7 +392,7 @@ arm = "J*theta'' + b*theta' + mgl*sin(theta) = kt*delay(v, tau)"
     let law = design(&plant, &Method::Lqr, &DesignOptions::new("theta", &[-1.0, 0.5], dt)).unwrap();
     let with = |kt: f64, tau: f64| plant.with_parameters(&[0.02, 0.15, 0.5, kt, tau]).unwrap();
     for method in [KALMAN, ESO] {
-        let wanted = OutputOptions { method, sensors: Vec::new(), integral: true };
+        let wanted = OutputOptions { method, sensors: Vec::new(), integral: Integral::Disturbance };
         let output = OutputFeedback::new(&law, &wanted).unwrap();
         let on = |plant: &Plant| -> Vec<_> {
             output.margins_with(&law, plant).into_iter().map(Option::unwrap).collect()

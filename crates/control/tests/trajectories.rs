@@ -3,9 +3,9 @@
 use crate::common::load;
 use crate::loops::CART_POLE;
 use greybox_control::{
-    ClosedLoop, ControlError, Controller, DesignOptions, FamilyOptions, Feedback, LoopOptions, Method,
-    ObserverMethod, OutputFeedback, OutputOptions, Plant, PlantOptions, Reference, Run, Sensor, Tracking,
-    Trajectory, Verdict, design,
+    ClosedLoop, ControlError, Controller, DesignOptions, FamilyOptions, Feedback, Integral, LoopOptions,
+    Method, ObserverMethod, OutputFeedback, OutputOptions, Plant, PlantOptions, Reference, Run, Sensor,
+    Tracking, Trajectory, Verdict, design,
 };
 use greybox_model::Model;
 
@@ -198,7 +198,7 @@ fn an_observer_follows_with_a_late_command() {
             &OutputOptions {
                 method: ObserverMethod::Kalman { disturbance: 1.0 },
                 sensors: vec![("theta".into(), Sensor { noise: 0.0, resolution: 0.0015 })],
-                integral: true,
+                integral: Integral::Disturbance,
             },
         )
         .unwrap();

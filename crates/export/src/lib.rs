@@ -17,5 +17,5 @@ pub use function::{Constant, Function, Group, Member, Vector};
 pub use language::Language;
 pub use latex::{latex, latex_document};
 pub use modelica::modelica;
-pub use observer::{ChainForm, ObserverCode, ObserverForm};
+pub use observer::{ChainForm, ObserverCode, ObserverForm, RestForm};
 pub use python::python;

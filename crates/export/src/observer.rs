@@ -32,6 +32,7 @@ use crate::language::{Language, number};
 ///     substeps: 1,
 ///     input_delay: (0, 0.0),
 ///     form: ObserverForm::Kalman { gain: vec![vec![0.4], vec![3.0]] },
+///     rest: None,
 /// };
 /// assert!(code.code(Language::C99)?.contains("double observer_step(observer_memory *memory, const double measured[1]"));
 /// assert!(code.code(Language::Rust)?.contains("pub struct Observer"));
@@ -58,6 +59,27 @@ pub struct ObserverCode {
     pub input_delay: (usize, f64),
     /// The observer's equations.
     pub form: ObserverForm,
+    /// Integral action at rest, whose offset is the law's `disturbance` in place of the estimated one.
+    pub rest: Option<RestForm>,
+}
+
+/// Integral action of a law for a machine that sticks. At rest the law is given the reading of the tracked state and
+/// otherwise the estimate of the moment at which the machine came to rest; the offset moves while the reading stays and
+/// is more than a step off.
+#[derive(Debug, Clone, PartialEq)]
+pub struct RestForm {
+    /// Step of the reading: rest while it stays within half of it, no error while it is within it of the set point.
+    pub step: f64,
+    /// Samples for which the reading stays before the machine is at rest.
+    pub samples: usize,
+    /// The state that is the rate of the tracked one and the speed below which the machine is at rest too.
+    pub slow: Option<(usize, f64)>,
+    /// Index of the tracked state.
+    pub tracked: usize,
+    /// Its index among the measurements.
+    pub measurement: usize,
+    /// Integral time, s.
+    pub integral_time: f64,
 }
 
 /// The equations of an observer.
@@ -176,6 +198,30 @@ impl ObserverCode {
         }
         let share = number(remainder / self.dt);
         format!("{share} * {past}[{}] + (1.0 - {share}) * {past}[{samples}]", samples + 1)
+    }
+}
+
+impl RestForm {
+    /// `text`, of a language, with the gaps filled; `x` is the estimate that the law is given.
+    fn write(&self, text: &str, slow: &str, x: &str, code: &ObserverCode) -> String {
+        let slow = self.slow.map_or_else(String::new, |(rate, velocity)| {
+            fill(slow, &[("RATE", &rate), ("VELOCITY", &number(velocity)), ("X", &x)])
+        });
+        fill(
+            text,
+            &[
+                ("STEP", &number(self.step)),
+                ("AT", &self.measurement),
+                ("SAMPLES", &self.samples),
+                ("SLOW", &slow),
+                ("X", &x),
+                ("N", &code.states()),
+                ("TRACKED", &self.tracked),
+                ("DT", &number(code.dt)),
+                ("TIME", &number(self.integral_time)),
+                ("LAW", &code.law.name),
+            ],
+        )
     }
 }
 

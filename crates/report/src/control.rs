@@ -67,10 +67,28 @@ pub struct ObserverPage {
     pub kind: &'static str,
     /// The name of the estimated disturbance in the law.
     pub disturbance: String,
-    /// Whether the law takes it off the command.
-    pub integral: bool,
+    /// The integral action of the law.
+    pub integral: IntegralAction,
     /// What is measured.
     pub sensors: Vec<SensorPage>,
+}
+
+/// The integral action of a law behind an observer.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub enum IntegralAction {
+    /// None.
+    Off,
+    /// The law takes the estimated disturbance off the command.
+    Disturbance,
+    /// The error of a machine at rest.
+    AtRest {
+        /// How long the tracked state's reading stays before the machine is at rest, s.
+        time: f64,
+        /// Error that is left, SI.
+        step: f64,
+        /// Integral time, s.
+        integral_time: f64,
+    },
 }
 
 /// A sensor.

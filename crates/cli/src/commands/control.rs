@@ -3,7 +3,7 @@
 use std::path::PathBuf;
 
 use clap::{Args, ValueEnum};
-use greybox_commands::control::{self as commands, ObserverKind, ObserverRequest, Request};
+use greybox_commands::control::{self as commands, IntegralKind, ObserverKind, ObserverRequest, Request};
 
 use crate::answer::Answer;
 use crate::failure::Failure;
@@ -142,6 +142,10 @@ pub(crate) struct Arguments {
     #[arg(long)]
     no_integral: bool,
 
+    /// Integral action of the error at rest in place of the estimated disturbance, for a machine that sticks and hunts (output)
+    #[arg(long, conflicts_with = "no_integral")]
+    integral_at_rest: bool,
+
     /// Delay of the simulated loop, s: sensors, network and computing together
     #[arg(long, value_name = "SECONDS", default_value_t = 0.0, allow_negative_numbers = true)]
     delay: f64,
@@ -272,7 +276,11 @@ fn request(arguments: &Arguments) -> Result<Request, Failure> {
             resolution: named("resolution", "step", &arguments.resolution)?,
             disturbance: arguments.disturbance,
             bandwidth: arguments.bandwidth,
-            no_integral: arguments.no_integral,
+            integral: match (arguments.no_integral, arguments.integral_at_rest) {
+                (true, _) => IntegralKind::Off,
+                (false, true) => IntegralKind::AtRest,
+                (false, false) => IntegralKind::Disturbance,
+            },
         }),
     };
     let unused = [
@@ -281,6 +289,7 @@ fn request(arguments: &Arguments) -> Result<Request, Failure> {
         ("--disturbance", arguments.disturbance.is_some()),
         ("--bandwidth", arguments.bandwidth.is_some()),
         ("--no-integral", arguments.no_integral),
+        ("--integral-at-rest", arguments.integral_at_rest),
     ];
     if observer.is_none()
         && let Some((option, _)) = unused.iter().find(|(_, given)| *given)

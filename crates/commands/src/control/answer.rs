@@ -3,8 +3,8 @@
 use std::fmt::Write as _;
 
 use greybox_control::{
-    Controller, Margins, Method, Metrics, ObserverMethod, OutputFeedback, Plant, Pole, Run, Tracking,
-    TrackingError, observer,
+    Controller, Integral, Margins, Method, Metrics, ObserverMethod, OutputFeedback, Plant, Pole, Run,
+    Tracking, TrackingError, observer,
 };
 use greybox_report::{ControlPage, format, sentence};
 use serde_json::{Value, json};
@@ -110,7 +110,10 @@ fn observer_report(plant: &Plant, output: &OutputFeedback) -> Value {
         observer::Form::Eso(_) => Value::Null,
     };
     json!({
-        "kind": kind, "setting": setting, "integral": output.integral(), "gain": gain,
+        "kind": kind, "setting": setting, "integral": output.integral() != Integral::Off, "gain": gain,
+        "rest": output.rest().map(|rest| json!({
+            "time": rest.time, "step": rest.step, "velocity": rest.velocity(), "integral_time": rest.integral_time,
+        })),
         "sensors": sensors.map(|(&i, s)| json!({
             "state": names[i], "noise": s.noise, "resolution": s.resolution,
         })).collect::<Vec<_>>(),
@@ -206,7 +209,11 @@ pub(super) fn in_words(designed: &Designed<'_>) -> String {
                 format::number(plant.input_delay())
             );
         }
-        let integral = if output.integral() { "" } else { "; no integral action" };
+        let integral = match output.integral() {
+            Integral::Disturbance => "",
+            Integral::AtRest { .. } => "; integral action at rest",
+            Integral::Off => "; no integral action",
+        };
         let _ = writeln!(text, "  {}; measured: {}{integral}", observer_in_words(output), sensors.join(", "));
     }
     if let Some(m) = worst_margins(controller, output) {

@@ -3,7 +3,7 @@
 use std::fmt::Write as _;
 
 use greybox_control::{Controller, OutputFeedback, Plant, Run, observer};
-use greybox_export::{ChainForm, Constant, Function, Group, Member, ObserverCode, ObserverForm};
+use greybox_export::{ChainForm, Constant, Function, Group, Member, ObserverCode, ObserverForm, RestForm};
 use greybox_model::Model;
 use greybox_recording::write_csv;
 
@@ -101,6 +101,14 @@ pub(super) fn observer_code(
         substeps: output.observer().substeps(),
         input_delay: (delay.samples, delay.remainder),
         form,
+        rest: output.rest().map(|rest| RestForm {
+            step: rest.step,
+            samples: rest.samples(),
+            slow: rest.rate().map(|rate| (rate, rest.velocity())),
+            tracked: controller.tracked(),
+            measurement: rest.measurement(),
+            integral_time: rest.integral_time,
+        }),
     }
 }
 

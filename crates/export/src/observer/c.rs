@@ -12,7 +12,7 @@ typedef struct {
     double command;
     double past[@PAST@]; /* behind the dead zone, the latest first */
     int started;
-@CHAINS@} observer_memory;
+@CHAINS@@REST@} observer_memory;
 
 void observer_start(observer_memory *memory);
 double observer_step(observer_memory *memory, const double measured[@M@], const double set_point[@R@]);
@@ -25,7 +25,7 @@ void observer_start(observer_memory *memory)
     for (i = 0; i < @PAST@; i++) memory->past[i] = 0.0;
     memory->command = 0.0;
     memory->started = 0;
-@START@}
+@START@@UNMOVED@}
 
 ";
 
@@ -138,7 +138,58 @@ const AHEAD: &str = "    /* The law acts on the states that its command will mee
     {
         double ahead[@N1@];
         for (i = 0; i < @N1@; i++) ahead[i] = x[i];
-@PREDICTIONS@        @LAW@(ahead, ahead + @N@, set_point, out);
+@PREDICTIONS@@CALL@    }
+";
+
+const RESTING: &str = "    double offset; /* the integral action at rest */
+    double reading, reference, held[@N@];
+    int stayed, holds;
+";
+
+const UNMOVED: &str = "    memory->offset = memory->reading = memory->reference = 0.0;
+    for (i = 0; i < @N@; i++) memory->held[i] = 0.0;
+    memory->stayed = -1;
+    memory->holds = 0;
+";
+
+const SLOW: &str = " || (@X@[@RATE@] < @VELOCITY@ && @X@[@RATE@] > -@VELOCITY@)";
+
+const REST: &str = "    /* At rest the law is given the reading, and of the other states the estimate as it was; the offset moves while the
+       reading stays. */
+    {
+        const double step = @STEP@, y = measured[@AT@], r = set_point[0];
+        const double moved = y - memory->reading, error = r - y;
+        const int is_new = memory->stayed < 0 || memory->reference != r;
+        double *held = memory->held, change;
+        int stays;
+        memory->reference = r;
+        if (is_new || !(moved <= 0.5 * step && moved >= -0.5 * step)) {
+            memory->reading = y;
+            memory->stayed = 0;
+        } else if (memory->stayed < @SAMPLES@) {
+            memory->stayed++;
+        }
+        stays = memory->stayed == @SAMPLES@;
+        if (is_new || y - y != 0.0 || !(stays@SLOW@)) {
+            memory->holds = 0;
+            @LAW@(@X@, &memory->offset, set_point, out);
+        } else {
+            if (!memory->holds) {
+                for (i = 0; i < @N@; i++) held[i] = @X@[i];
+            }
+            memory->holds = 1;
+            held[@TRACKED@] = y;
+            @LAW@(held, &memory->offset, set_point, out);
+            if (stays && (error > step || error < -step)) {
+                change = out[0];
+                held[@TRACKED@] = error > 0.0 ? r - step : r + step;
+                @LAW@(held, &memory->offset, set_point, out);
+                change -= out[0];
+                held[@TRACKED@] = y;
+                if (change - change == 0.0) memory->offset -= change * @DT@ / @TIME@;
+                @LAW@(held, &memory->offset, set_point, out);
+            }
+        }
     }
 ";
 
@@ -152,6 +203,7 @@ pub(super) fn write(code: &ObserverCode) -> String {
         0 => String::new(),
         k => fill(text, &[("SIZE", &size), ("K", &k)]),
     };
+    let resting = |text: &str| code.rest.as_ref().map_or_else(String::new, |_| fill(text, &[("N", &n)]));
     let mut out: String =
         code.summary.iter().map(|l| format!("/* {} */\n", crate::language::comment(l))).collect();
     out.push_str(&fill(
@@ -165,6 +217,8 @@ pub(super) fn write(code: &ObserverCode) -> String {
             ("PAST", &past),
             ("CHAINS", &chained(CHAINS)),
             ("START", &chained(START)),
+            ("REST", &resting(RESTING)),
+            ("UNMOVED", &resting(UNMOVED)),
         ],
     ));
     if code.predicts() {
@@ -189,9 +243,10 @@ pub(super) fn write(code: &ObserverCode) -> String {
         let predictions = code.over_the_delay(&predict("ahead"), "i - 1", &|call| {
             format!("        for (i = {delay}; i > 0; i--) {}", call.trim_start())
         });
-        fill(AHEAD, &[("N", &n), ("N1", &n1), ("LAW", law), ("PREDICTIONS", &predictions)])
+        let call: String = command(code, "ahead").lines().map(|line| format!("    {line}\n")).collect();
+        fill(AHEAD, &[("N1", &n1), ("PREDICTIONS", &predictions), ("CALL", &call)])
     } else {
-        format!("    {law}(x, x + {n}, set_point, out);\n")
+        command(code, "x")
     };
     out.push_str(&fill(
         STEP,
@@ -207,6 +262,14 @@ pub(super) fn write(code: &ObserverCode) -> String {
         ],
     ));
     out
+}
+
+/// The command of the estimate `x`.
+fn command(code: &ObserverCode, x: &str) -> String {
+    match &code.rest {
+        Some(rest) => rest.write(REST, SLOW, x, code),
+        None => format!("    {}({x}, {x} + {}, set_point, out);\n", code.law.name, code.states()),
+    }
 }
 
 /// A call that predicts `x` over a time under a command of the past.

@@ -34,7 +34,7 @@ pub struct Observer {
     /// Behind the dead zone, the latest first.
     past: [f64; @PAST@],
     started: bool,
-@FIELDS@}
+@FIELDS@@RESTING@}
 
 #[allow(clippy::all)]
 impl Observer {
@@ -46,7 +46,7 @@ impl Observer {
             command: 0.0,
             past: [0.0; @PAST@],
             started: false,
-@ZEROS@        }
+@ZEROS@@UNMOVED@        }
     }
 
     /// Once a sample, every @DT@ s: the command from the measurements and the set point. A measurement that is not a
@@ -69,8 +69,7 @@ impl Observer {
         }@ESTIMATE@        self.started = true;
 @AHEAD@        let mut x = [0.0; @N@];
         x.copy_from_slice(&ahead[..@N@]);
-        self.command = law(&x, &[ahead[@N@]], set_point)[0];
-        self.command
+@COMMAND@        self.command
     }
 }
 
@@ -158,6 +157,65 @@ const AHEAD: &str = "        // The law acts on the states that its command will
         let mut ahead = self.estimate;
 ";
 
+const RESTING: &str = "    /// The integral action at rest.
+    pub offset: f64,
+    reading: f64,
+    reference: f64,
+    held: [f64; @N@],
+    stayed: Option<u32>,
+    holds: bool,
+";
+
+const UNMOVED: &str = "            offset: 0.0,
+            reading: 0.0,
+            reference: 0.0,
+            held: [0.0; @N@],
+            stayed: None,
+            holds: false,
+";
+
+const SLOW: &str = " || (@X@[@RATE@] < @VELOCITY@ && @X@[@RATE@] > -@VELOCITY@)";
+
+const REST: &str = "        // At rest the law is given the reading, and of the other states the estimate as it was; the offset moves while
+        // the reading stays.
+        const STEP: f64 = @STEP@;
+        let (y, r) = (measured[@AT@], set_point[0]);
+        let (moved, error) = (y - self.reading, r - y);
+        let is_new = self.stayed.is_none() || self.reference != r;
+        self.reference = r;
+        let stayed = match self.stayed {
+            Some(stayed) if !is_new && moved <= 0.5 * STEP && moved >= -0.5 * STEP => {
+                if stayed < @SAMPLES@ { stayed + 1 } else { stayed }
+            }
+            _ => {
+                self.reading = y;
+                0
+            }
+        };
+        self.stayed = Some(stayed);
+        let stays = stayed == @SAMPLES@;
+        if is_new || !y.is_finite() || !(stays@SLOW@) {
+            self.holds = false;
+            self.command = law(&@X@, &[self.offset], set_point)[0];
+        } else {
+            if !self.holds {
+                self.held = @X@;
+            }
+            self.holds = true;
+            self.held[@TRACKED@] = y;
+            self.command = law(&self.held, &[self.offset], set_point)[0];
+            if stays && (error > STEP || error < -STEP) {
+                let mut edge = self.held;
+                edge[@TRACKED@] = if error > 0.0 { r - STEP } else { r + STEP };
+                let change = self.command - law(&edge, &[self.offset], set_point)[0];
+                if change.is_finite() {
+                    self.offset -= change * @DT@ / @TIME@;
+                }
+                self.command = law(&self.held, &[self.offset], set_point)[0];
+            }
+        }
+";
+
 /// What follows the machine's equations in the observer's file.
 pub(super) fn write(code: &ObserverCode) -> String {
     let (n, m, delay) = (code.states(), code.measured.len(), code.input_delay.0);
@@ -188,6 +246,11 @@ pub(super) fn write(code: &ObserverCode) -> String {
                 .write(code, chains)
         }
     };
+    let resting = |text: &str| code.rest.as_ref().map_or_else(String::new, |_| fill(text, &[("N", &n)]));
+    let command = match &code.rest {
+        Some(rest) => rest.write(REST, SLOW, "x", code),
+        None => format!("        self.command = law(&x, &[ahead[{n}]], set_point)[0];\n"),
+    };
     let ahead = if code.is_delayed() {
         let predictions = code.over_the_delay(&predict("        ", "ahead"), "i", &|call| {
             format!("        for i in (0..{delay}).rev() {{\n    {call}        }}\n")
@@ -203,6 +266,9 @@ pub(super) fn write(code: &ObserverCode) -> String {
             ("N1", &n1),
             ("M", &m),
             ("PAST", &(delay + 2)),
+            ("COMMAND", &command),
+            ("RESTING", &resting(RESTING)),
+            ("UNMOVED", &resting(UNMOVED)),
             ("FIELDS", &chained(FIELDS)),
             ("ZEROS", &chained(ZEROS)),
             ("R", &code.references()),

@@ -1,16 +1,16 @@
 //! From a controller and its simulated loops to the page.
 
 use greybox_control::{
-    Controller, Family, Margins, Method, Metrics, ObserverMethod, OutputFeedback, Run, Spread, Tracking,
-    TrackingSpread,
+    Controller, Family, Integral, Margins, Method, Metrics, ObserverMethod, OutputFeedback, Run, Spread,
+    Tracking, TrackingSpread,
 };
 use greybox_model::{Expr, Model};
 
 use super::coherent;
 use crate::contract::{ModelId, Producer};
 use crate::control::{
-    ControlPage, Figure, LawKind, LawState, LoopRun, ObserverPage, Perturbed, PerturbedMargins, Quantity,
-    SensorPage, SetPoint,
+    ControlPage, Figure, IntegralAction, LawKind, LawState, LoopRun, ObserverPage, Perturbed,
+    PerturbedMargins, Quantity, SensorPage, SetPoint,
 };
 use crate::format;
 
@@ -115,7 +115,15 @@ pub fn page(sources: &ControlSources<'_>) -> ControlPage {
         },
         observer: sources.output.map(|output| ObserverPage {
             disturbance: output.disturbance().to_owned(),
-            integral: output.integral(),
+            integral: match (output.integral(), output.rest()) {
+                (_, Some(rest)) => IntegralAction::AtRest {
+                    time: rest.time,
+                    step: rest.step,
+                    integral_time: rest.integral_time,
+                },
+                (Integral::Off, None) => IntegralAction::Off,
+                _ => IntegralAction::Disturbance,
+            },
             kind: match output.method() {
                 ObserverMethod::Kalman { .. } => "steady-state Kalman filter",
                 ObserverMethod::Eso { .. } => "extended-state observer",

@@ -4,7 +4,7 @@ use askama::Template;
 use greybox_control::{Margins, Metrics, Tracking, Verdict};
 
 use super::{Assets, Common, Island, PlotData, PlotView, SeriesData, extent, quantity_html, series, span};
-use crate::control::{ControlPage, LawKind, Quantity};
+use crate::control::{ControlPage, IntegralAction, LawKind, Quantity};
 use crate::convert::control::squared;
 use crate::decimate::{Buckets, MAX_POINTS};
 use crate::{ReportError, expression, format, sentence, svg};
@@ -70,6 +70,7 @@ struct ObserverView {
     kind: &'static str,
     disturbance_html: String,
     integral: bool,
+    at_rest: Option<[String; 3]>,
     sensors: Vec<[String; 3]>,
 }
 
@@ -194,11 +195,19 @@ impl View {
             is_trajectory: page.is_trajectory,
             reads_derivatives: page.reads_derivatives,
             fed_back: fed_back(page),
-            is_integral: page.observer.as_ref().is_some_and(|o| o.integral),
+            is_integral: page.observer.as_ref().is_some_and(|o| o.integral != IntegralAction::Off),
             observer: page.observer.as_ref().map(|o| ObserverView {
                 kind: o.kind,
                 disturbance_html: expression::html(&o.disturbance),
-                integral: o.integral,
+                integral: o.integral != IntegralAction::Off,
+                at_rest: match o.integral {
+                    IntegralAction::AtRest { time, step, integral_time } => Some([
+                        format::with_unit(&format::number(time), "s"),
+                        format::with_unit(&format::number(step), &tracked.unit),
+                        format::with_unit(&format::number(integral_time), "s"),
+                    ]),
+                    IntegralAction::Off | IntegralAction::Disturbance => None,
+                },
                 sensors: o
                     .sensors
                     .iter()
