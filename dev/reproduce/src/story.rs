@@ -5,8 +5,8 @@ use std::path::Path;
 
 use anyhow::{Context, Result};
 use greybox_control::{
-    ControlError, Controller, DesignOptions, Method, Metrics, ObserverMethod, OutputFeedback, OutputOptions,
-    Plant, PlantOptions, Sensor, design,
+    ControlError, Controller, DesignOptions, Integral, Method, Metrics, ObserverMethod, OutputFeedback,
+    OutputOptions, Plant, PlantOptions, Sensor, design,
 };
 use greybox_model::Model;
 use greybox_report::Report;
@@ -112,8 +112,8 @@ struct Way {
     name: &'static str,
     method: Method,
     compensated: bool,
-    /// The observer between the encoders and the law, which else is given the true state; whether it has integral action.
-    observer: Option<(ObserverMethod, bool)>,
+    /// The observer between the encoders and the law, which else is given the true state; its integral action.
+    observer: Option<(ObserverMethod, Integral)>,
 }
 
 impl Way {
@@ -123,7 +123,7 @@ impl Way {
     }
 }
 
-fn ways() -> [Way; 6] {
+fn ways() -> [Way; 7] {
     let eta = 10.0 * VOLTS;
     let regulator = || Way { name: "regulator", method: Method::Lqr, compensated: false, observer: None };
     let kalman = ObserverMethod::Kalman { disturbance: 0.2 * VOLTS };
@@ -138,11 +138,20 @@ fn ways() -> [Way; 6] {
             compensated: true,
             observer: None,
         },
-        Way { name: "regulator, Kalman filter", observer: Some((kalman, false)), ..regulator() },
-        Way { name: "regulator, extended-state observer", observer: Some((eso, false)), ..regulator() },
+        Way { name: "regulator, Kalman filter", observer: Some((kalman, Integral::Off)), ..regulator() },
+        Way {
+            name: "regulator, extended-state observer",
+            observer: Some((eso, Integral::Off)),
+            ..regulator()
+        },
         Way {
             name: "regulator, Kalman filter, integral action",
-            observer: Some((kalman, true)),
+            observer: Some((kalman, Integral::Disturbance)),
+            ..regulator()
+        },
+        Way {
+            name: "regulator, Kalman filter, integral action at rest",
+            observer: Some((kalman, Integral::AtRest { time: None })),
             ..regulator()
         },
     ]
@@ -165,7 +174,7 @@ fn law(model: &Model, way: &Way, amplitude: f64) -> Result<Option<Controller>> {
 }
 
 /// An observer behind encoders of both angles.
-fn observer(law: &Controller, method: ObserverMethod, integral: bool) -> Result<OutputFeedback> {
+fn observer(law: &Controller, method: ObserverMethod, integral: Integral) -> Result<OutputFeedback> {
     let encoder = Sensor { noise: 0.0, resolution: COUNT };
     let sensors = ["theta", "alpha"].map(|name| (name.to_owned(), encoder)).to_vec();
     Ok(OutputFeedback::new(law, &OutputOptions { method, sensors, integral })?)
@@ -283,7 +292,9 @@ fn hunting(piece: &mut Piece, improved: &Model) -> Result<()> {
         link: VoltageBalance { coulomb: -hub * RIG.link.acceleration, ..RIG.link },
         ..RIG
     };
-    let way = ways().into_iter().find(|w| w.observer.is_some_and(|(_, integral)| integral));
+    let way = ways()
+        .into_iter()
+        .find(|w| w.observer.is_some_and(|(_, integral)| integral == Integral::Disturbance));
     let way = way.context("no way has integral action")?;
     let mut rows = Vec::new();
     for degrees in AMPLITUDES {
@@ -430,8 +441,8 @@ fn judge(piece: &mut Piece, way: &Way, degrees: f64, reached: &[Reached]) {
     if way.observer.is_some() {
         check("error left in degrees, improved", improved.left);
         check("peak to peak at rest in degrees, improved", improved.moves);
-        // With integral action it hunts, and does not settle.
-        if degrees > SMALL && way.observer.is_some_and(|(_, integral)| !integral) {
+        // With the disturbance as integral action it hunts, and does not settle.
+        if degrees > SMALL && way.observer.is_some_and(|(_, integral)| integral != Integral::Disturbance) {
             check("settling in s, improved", improved.settling);
         }
         return;
