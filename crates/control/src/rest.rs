@@ -152,11 +152,13 @@ impl Rest {
         let y = y.get(self.measurement).copied().unwrap_or(f64::NAN);
         let is_new = memory.reference != r;
         memory.reference = r;
-        if is_new || !((y - memory.reading).abs() <= 0.5 * self.step) {
+        // Not so where either is not a number.
+        let is_same = (y - memory.reading).abs() <= 0.5 * self.step;
+        if is_same && !is_new {
+            memory.stayed = (memory.stayed + 1).min(self.samples);
+        } else {
             memory.reading = y;
             memory.stayed = 0;
-        } else {
-            memory.stayed = (memory.stayed + 1).min(self.samples);
         }
         let stays = memory.stayed == self.samples;
         let is_slow = self.rate.is_some_and(|rate| x[rate].abs() < self.velocity());
@@ -178,5 +180,45 @@ impl Rest {
             memory.offset -= change * self.dt / self.integral_time;
         }
         law(held, memory.offset)
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    /// u = 2 (r − y) − o about r = 0, ten samples to rest.
+    #[test]
+    fn the_offset_moves_while_the_reading_stays() {
+        let rest = Rest {
+            time: 0.1,
+            step: 0.1,
+            integral_time: 0.5,
+            samples: 10,
+            dt: 0.01,
+            tracked: 0,
+            measurement: 0,
+            rate: Some(1),
+        };
+        let law = |x: &[f64], offset: f64| -2.0 * x[0] + 7.0 * x[2] - offset;
+        let run = |y: &dyn Fn(usize) -> f64, velocity: f64| {
+            let mut memory = Rest::start();
+            let u: Vec<f64> = (0..20)
+                .map(|k| rest.command(&mut memory, (&[0.0, velocity, k as f64], &[y(k)], 0.0), law))
+                .collect();
+            (memory.offset, u)
+        };
+        // Slow from the second sample on: what is not read is held. Ten integrations of 2 (0.5 − 0.1).
+        let (offset, u) = run(&|_| 0.5, 0.1);
+        assert!((offset - 10.0 * 0.8 * 0.01 / 0.5).abs() < 1e-12, "{offset}");
+        assert_eq!((u[0], u[1], u[5]), (0.0, 7.0 - 1.0, 7.0 - 1.0));
+        assert!((u[19] - (7.0 - 1.0 - offset)).abs() < 1e-12, "{u:?}");
+        // Fast by the estimate, at rest by the reading.
+        assert!(run(&|_| 0.5, 9.0).0 > 0.0);
+        // A reading that creeps, one that is a step off, and one that is none.
+        assert_eq!(run(&|k| 0.5 + 0.2 * k as f64, 0.1).0, 0.0);
+        assert_eq!(run(&|_| 0.1, 0.1).0, 0.0);
+        let (offset, u) = run(&|_| f64::NAN, 0.1);
+        assert_eq!((offset, u[5]), (0.0, 35.0));
     }
 }
