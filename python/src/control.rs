@@ -76,8 +76,10 @@ impl Wanted {
                     (true, false) => IntegralKind::Disturbance,
                     (true, true) => IntegralKind::AtRest,
                     (false, true) => {
-                        return Err(Failure::input("`integral_at_rest` is an integral action, and `integral` is false")
-                            .help("leave out one of them"));
+                        return Err(Failure::input(
+                            "`integral_at_rest` is an integral action, and `integral` is false",
+                        )
+                        .help("leave out one of them"));
                     }
                 },
             })),
