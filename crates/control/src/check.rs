@@ -23,12 +23,18 @@ pub struct Check {
     pub held_poles: Vec<Pole>,
     /// Largest magnitude of these.
     pub spectral_radius: f64,
+    /// Poles of the continuous loop while friction holds the tracked state, 1/s, the rightmost first: those of the other
+    /// states. Empty where friction does not hold it, or no other state is left. Where one is in the right half plane, the
+    /// machine cannot stay at rest: the loop hunts.
+    pub stuck_poles: Vec<Pole>,
 }
 
 /// A law under examination.
 pub(crate) struct Examined<'a> {
     pub(crate) plant: &'a Plant,
     pub(crate) names: &'a str,
+    /// Index of the tracked state.
+    pub(crate) tracked: usize,
     pub(crate) dt: f64,
     pub(crate) limits: (f64, f64),
     pub(crate) frictionless: Compiled,
@@ -60,7 +66,35 @@ impl Examined<'_> {
         let gain = self.gain(&self.frictionless, &at.state, set_point);
         let (poles, held_poles) = self.stable(&plant, &gain, set_point)?;
         let spectral_radius = largest(&held_poles);
-        Ok(Check { set_point, equilibrium: at, poles, held_poles, spectral_radius })
+        let stuck_poles = self.stuck_poles(&at, &stability::closed(&plant, &gain)).unwrap_or_default();
+        Ok(Check { set_point, equilibrium: at, poles, held_poles, spectral_radius, stuck_poles })
+    }
+
+    /// Poles of the loop A while friction holds the tracked state. A friction force λ enters by f and holds the velocity
+    /// v = ẋᵢ, so that
+    ///
+    /// ```text
+    /// ẋ = A x + f λ,   v̇ = 0:     ẋ = (I − f eᵀ / fᵥ) A x
+    /// ```
+    ///
+    /// without the tracked state and v. f is what smoothed friction adds to the tangent's column of v.
+    fn stuck_poles(&self, at: &Equilibrium, closed: &DMatrix<f64>) -> Option<Vec<Pole>> {
+        let symbols = self.plant.symbols();
+        let (name, primes) = symbols.get(self.tracked)?;
+        let rate = symbols.iter().position(|(n, p)| n == name && *p == primes + 1)?;
+        let smooth = self.plant.tangent(&at.state, at.input).a;
+        let free = self.plant.frictionless_tangent(&at.state, at.input).a;
+        let f: Vec<f64> = (0..free.nrows()).map(|i| smooth[(i, rate)] - free[(i, rate)]).collect();
+        // (Friction brakes.)
+        if !(f[rate] < 0.0 && f.iter().all(|f| f.is_finite())) {
+            return None;
+        }
+        let left: Vec<usize> = (0..f.len()).filter(|i| *i != self.tracked && *i != rate).collect();
+        let a = DMatrix::from_fn(left.len(), left.len(), |i, j| {
+            closed[(left[i], left[j])] - f[left[i]] / f[rate] * closed[(rate, left[j])]
+        });
+        let sizes: Vec<f64> = left.iter().map(|i| self.plant.sizes()[*i]).collect();
+        if left.is_empty() { None } else { stability::poles(&a, &sizes) }
     }
 
     /// The poles, continuous and in z, if stable.

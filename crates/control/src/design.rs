@@ -106,6 +106,7 @@ pub fn design(plant: &Plant, method: &Method, options: &DesignOptions) -> Result
     let examined = Examined {
         plant,
         names: &options.tracked,
+        tracked,
         dt: options.dt,
         limits: (low, high),
         frictionless: compile(&made.frictionless)?,

@@ -148,31 +148,38 @@ arm = "J*theta'' + b*theta' + fc*(1 + more*exp(-(theta'/vs)^2))*sign(theta') + m
 fn the_law_of_the_moving_link_is_unstable_where_the_hub_sticks() {
     for (name, model) in links() {
         let law = regulator(&model, 20f64.to_radians());
+        let check = law.design_point();
+        assert_eq!(check.stuck_poles.len(), 2, "{name}");
+        // With the hub held: α″ = (a₃ⱼ − s a₁ⱼ) xⱼ + …, where s is the share of the friction of θ″ that α″ has.
         let plant = law.plant();
         let value = |name: &str| plant.parameters().iter().find(|(n, _)| n == name).unwrap().1;
         assert_eq!(plant.state_names(), ["theta", "theta'", "alpha", "alpha'"]);
-        let at = &law.design_point().equilibrium;
-        let tangent = plant.frictionless_tangent(&at.state, at.input);
-        // θ″ = 0 determines friction, of which α″ has `share`.
+        let tangent = plant.frictionless_tangent(&check.equilibrium.state, check.equilibrium.input);
         let share = (value("fl") / value("al")) / (value("fh") / value("ah"));
         let row = |j: usize| tangent.a[(3, j)] - share * tangent.a[(1, j)];
         let gain = tangent.b[3] - share * tangent.b[1];
-        // α″ = − stiffness α − damping α′ in the loop.
         let (stiffness, damping) = (gain * law.gains()[2] - row(2), gain * law.gains()[3] - row(3));
-        let root = (0.25 * damping * damping - stiffness).max(0.0).sqrt();
-        let fastest = -0.5 * damping + root;
-        println!(
-            "{name}: {stiffness:.0} {damping:.1}: {fastest:.1} 1/s, held: {:.0} {:.1}",
-            -row(2),
-            -row(3)
-        );
+        let by_hand = -0.5 * damping + (0.25 * damping * damping - stiffness).max(0.0).sqrt();
+        let fastest = check.stuck_poles[0].re;
+        println!("{name}: {fastest:.1} 1/s, open {:.0} {:.1}", -row(2), -row(3));
+        assert!((fastest - by_hand).abs() < 1e-6 * by_hand.abs(), "{name}: {fastest} {by_hand}");
         // Open it is stable in both.
         assert!(row(2) < 0.0 && row(3) < 0.0);
         match name {
             "thesis" => assert!((20.0..35.0).contains(&fastest), "{fastest}"),
-            _ => assert!(stiffness > 0.0 && fastest < -5.0, "{fastest}"),
+            _ => assert!(fastest < -5.0, "{fastest}"),
         }
     }
+    // Nothing is held without friction.
+    let frictionless = {
+        let mut model = link(1.0);
+        for name in ["fh", "fl"] {
+            let at = model.parameter(name).unwrap();
+            model.parameters[at].value = 0.0;
+        }
+        model
+    };
+    assert_eq!(regulator(&frictionless, 0.3).design_point().stuck_poles, []);
 }
 
 #[test]

@@ -146,6 +146,8 @@ pub struct SetPoint {
     pub poles: Vec<[f64; 2]>,
     /// Poles in z with the command held over the sample time.
     pub held_poles: Vec<[f64; 2]>,
+    /// Poles of the continuous loop while friction holds the tracked state, 1/s; empty where it does not.
+    pub stuck_poles: Vec<[f64; 2]>,
     /// Margins of the loop as it is fed back, cut at the command.
     pub margins: Option<Margins>,
 }

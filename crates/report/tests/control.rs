@@ -42,6 +42,7 @@ fn page() -> ControlPage {
         command: 0.6 * value,
         poles: vec![[-6.0, 8.0], [-6.0, -8.0]],
         held_poles: vec![[0.99, 0.008], [0.99, -0.008]],
+        stuck_poles: Vec::new(),
         margins: None,
     };
     let widened = |by: f64| theta.iter().map(|v| v + by).collect::<Vec<f64>>();

@@ -44,7 +44,7 @@ pub(super) fn report(page: &ControlPage, designed: &Designed<'_>) -> Value {
             json!({
                 "set_point": c.set_point, "state": c.equilibrium.state, "command": c.equilibrium.input,
                 "poles": poles(&c.poles), "held_poles": poles(&c.held_poles), "spectral_radius": c.spectral_radius,
-                "margins": full.get(k).and_then(Option::as_ref).map(margins),
+                "stuck_poles": poles(&c.stuck_poles), "margins": full.get(k).and_then(Option::as_ref).map(margins),
                 "with_observer": output.and_then(|o| o.checks().get(k)).map(|c| json!({
                     "spectral_radius": c.spectral_radius, "margins": margins(&c.margins),
                 })),
@@ -218,6 +218,12 @@ pub(super) fn in_words(designed: &Designed<'_>) -> String {
     }
     if let Some(m) = worst_margins(controller, output) {
         let _ = writeln!(text, "  margins: {}", margins_in_words(&m));
+    }
+    let stuck = controller.checks().iter().flat_map(|c| &c.stuck_poles).map(|p| p.re);
+    if output.is_none_or(|output| output.rest().is_none())
+        && let Some(warning) = sentence::control::hunts(&tracked, stuck)
+    {
+        let _ = writeln!(text, "  {warning}");
     }
     for dropped in plant.dropped() {
         let _ = writeln!(text, "  left out of {}: {}", dropped.equation, dropped.term);

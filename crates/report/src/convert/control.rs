@@ -78,6 +78,7 @@ pub fn page(sources: &ControlSources<'_>) -> ControlPage {
         command: rounded(c.equilibrium.input, plant.input_size()),
         poles: c.poles.iter().map(pole).collect(),
         held_poles: c.held_poles.iter().map(pole).collect(),
+        stuck_poles: c.stuck_poles.iter().map(pole).collect(),
     });
     let set_points: Vec<SetPoint> = set_points.collect();
     let symbols = model

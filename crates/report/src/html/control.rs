@@ -61,6 +61,7 @@ struct View {
     reads_derivatives: bool,
     fed_back: String,
     is_integral: bool,
+    is_integral_at_rest: bool,
     observer: Option<ObserverView>,
     margins: Vec<[String; 6]>,
     files: Vec<(&'static str, &'static str)>,
@@ -195,7 +196,11 @@ impl View {
             is_trajectory: page.is_trajectory,
             reads_derivatives: page.reads_derivatives,
             fed_back: fed_back(page),
-            is_integral: page.observer.as_ref().is_some_and(|o| o.integral != IntegralAction::Off),
+            is_integral: page.observer.as_ref().is_some_and(|o| o.integral == IntegralAction::Disturbance),
+            is_integral_at_rest: page
+                .observer
+                .as_ref()
+                .is_some_and(|o| matches!(o.integral, IntegralAction::AtRest { .. })),
             observer: page.observer.as_ref().map(|o| ObserverView {
                 kind: o.kind,
                 disturbance_html: expression::html(&o.disturbance),

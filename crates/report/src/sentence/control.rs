@@ -2,7 +2,7 @@
 
 use greybox_control::{Metrics, Tracking, Verdict};
 
-use crate::control::{ControlPage, PerturbedMargins};
+use crate::control::{ControlPage, IntegralAction, PerturbedMargins};
 use crate::{expression, format};
 
 /// The conclusion, most important first: how the loop settles, then what holds on perturbed plants, then the command.
@@ -29,8 +29,24 @@ pub fn summary(page: &ControlPage) -> Vec<String> {
         }
     });
     out.extend(page.family.as_ref().and_then(|f| f.margins).map(|m| margins(&m)));
+    let is_held = page.observer.as_ref().is_some_and(|o| matches!(o.integral, IntegralAction::AtRest { .. }));
+    if !is_held {
+        out.extend(hunts(&name, page.set_points.iter().flat_map(|s| &s.stuck_poles).map(|p| p[0])));
+    }
     out.push(command(page));
     out
+}
+
+/// That a loop cannot stay at rest, by the real parts of its poles while friction holds the tracked state, 1/s.
+pub fn hunts(tracked: &str, stuck: impl Iterator<Item = f64>) -> Option<String> {
+    let rightmost = stuck.fold(f64::NEG_INFINITY, f64::max);
+    (rightmost > 0.0).then(|| {
+        format!(
+            "While friction holds {tracked}, the loop has a pole at +{} 1/s: it cannot stay at rest, and hunts \
+             (`--feedback output --integral-at-rest` holds the command there).",
+            format::number(rightmost)
+        )
+    })
 }
 
 /// What the loop has to spare on the worst of the perturbed plants.
