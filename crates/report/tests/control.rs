@@ -5,7 +5,8 @@ use greybox_control::{Margins, Metrics, Tracking, TrackingError, Verdict};
 use greybox_report::ControlPage;
 use greybox_report::contract::{ModelId, Producer};
 use greybox_report::control::{
-    Figure, LawKind, LawState, LoopRun, Perturbed, PerturbedMargins, Quantity, SetPoint,
+    Figure, IntegralAction, LawKind, LawState, LoopRun, ObserverPage, Perturbed, PerturbedMargins, Quantity,
+    SetPoint,
 };
 
 #[path = "common/browser.rs"]
@@ -266,6 +267,32 @@ fn an_unstable_plant_is_told() {
     assert!(!html.contains("On all of them"));
     page.family.as_mut().unwrap().margins = None;
     assert!(!page.to_html().unwrap().contains("Median plant</th><td"));
+}
+
+/// A loop that cannot stay at rest is said to hunt, unless its law holds the command there.
+#[test]
+fn a_loop_that_hunts_is_told() {
+    let mut page = page();
+    let hunts =
+        "While friction holds θ, the loop has a pole at +27.5 1/s: it cannot stay at rest, and hunts.";
+    assert!(!page.to_html().unwrap().contains("While friction holds"));
+    page.set_points[1].stuck_poles = vec![[27.5, 0.0], [-30.0, 0.0]];
+    assert!(page.to_html().unwrap().contains(hunts));
+    let at_rest = IntegralAction::AtRest { time: 0.003, step: 0.0015, integral_time: 0.2 };
+    let said = [
+        (IntegralAction::Off, "There is no integral action", true),
+        (IntegralAction::Disturbance, "The disturbance takes out what acts like a constant command", true),
+        (at_rest, "In motion there is no integral action", false),
+    ];
+    for (integral, promise, is_said) in said {
+        let (kind, disturbance) = ("steady-state Kalman filter", "d".to_owned());
+        page.observer = Some(ObserverPage { kind, disturbance, integral, sensors: Vec::new() });
+        let html = page.to_html().unwrap();
+        assert!(html.contains(promise), "{integral:?}");
+        assert_eq!(html.contains(hunts), is_said, "{integral:?}");
+        let others = said.iter().filter(|other| other.1 != promise);
+        others.for_each(|other| assert!(!html.contains(other.1), "{integral:?}: {}", other.1));
+    }
 }
 
 /// Along a trajectory the page has errors in the place of steps, and says what the law is given.

@@ -42,8 +42,8 @@ pub fn hunts(tracked: &str, stuck: impl Iterator<Item = f64>) -> Option<String> 
     let rightmost = stuck.fold(f64::NEG_INFINITY, f64::max);
     (rightmost > 0.0).then(|| {
         format!(
-            "While friction holds {tracked}, the loop has a pole at +{} 1/s: it cannot stay at rest, and hunts \
-             (`--feedback output --integral-at-rest` holds the command there).",
+            "While friction holds {tracked}, the loop has a pole at +{} 1/s: it cannot stay at rest, and hunts. Integral action \
+             at rest, of a law with an observer, holds the command there.",
             format::number(rightmost)
         )
     })
