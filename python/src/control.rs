@@ -48,6 +48,19 @@ pub(crate) struct Wanted {
 }
 
 impl Wanted {
+    /// The first argument that is given and that an observer alone has.
+    fn of_observer(&self) -> Option<&'static str> {
+        let given = [
+            ("noise", !self.noise.is_empty()),
+            ("resolution", !self.resolution.is_empty()),
+            ("disturbance", self.disturbance.is_some()),
+            ("bandwidth", self.bandwidth.is_some()),
+            ("integral", !self.integral),
+            ("integral_at_rest", self.integral_at_rest),
+        ];
+        given.into_iter().find(|(_, given)| *given).map(|(name, _)| name)
+    }
+
     /// The observer between the sensors and the law, where the law is not given the full state.
     fn observer(&self) -> Result<Option<ObserverRequest>, Failure> {
         let kind = match self.observer.as_str() {
@@ -60,11 +73,13 @@ impl Wanted {
             }
         };
         match self.feedback.as_str() {
-            "state" if self.noise.is_empty() && self.resolution.is_empty() => Ok(None),
-            "state" => {
-                Err(Failure::input("sensors belong to an observer, and the law is given the full state")
-                    .help("add `feedback=\"output\"`"))
-            }
+            "state" => match self.of_observer() {
+                None => Ok(None),
+                Some(name) => Err(Failure::input(format!(
+                    "`{name}` belongs to an observer, and the law is given the full state"
+                ))
+                .help("add `feedback=\"output\"`")),
+            },
             "output" => Ok(Some(ObserverRequest {
                 kind,
                 noise: self.noise.clone(),

@@ -80,8 +80,22 @@ def test_an_observer_is_the_command_s(cart, command, tmp_path):
     assert law.to_json() == (tmp_path / "report.json").read_text()
     assert law.observer_c == (tmp_path / "observer.c").read_text()
     assert law.observer_rust == (tmp_path / "observer.rs").read_text()
-    with pytest.raises(greybox.InputError, match="feedback"):
-        greybox.control(cart["model"], resolution={"x": 0.001})
+    for alone in [{"resolution": {"x": 0.001}}, {"bandwidth": 50.0}, {"integral": False}, {"integral_at_rest": True}]:
+        with pytest.raises(greybox.InputError, match="full state") as refused:
+            greybox.control(cart["model"], track="x", **alone)
+        assert next(iter(alone)) in str(refused.value) and "feedback" in refused.value.help
+
+
+def test_integral_action_at_rest_is_the_command_s(cart, command, tmp_path):
+    flags = ["--track", "x", "--to", "0.2", "--size", "x=0.2", "--limit", "8", "--hold", "3", "--feedback", "output"]
+    command("control", cart["model"], *flags, "--resolution", "x=0.001", "--integral-at-rest", "--out", tmp_path)
+    options = dict(track="x", to=0.2, size={"x": 0.2}, limit=8, hold=3, feedback="output", resolution={"x": 0.001})
+    law = greybox.control(cart["model"], integral_at_rest=True, **options)
+    assert law.to_json() == (tmp_path / "report.json").read_text()
+    assert law.observer_c == (tmp_path / "observer.c").read_text()
+    assert law.report["observer"]["rest"]["step"] == 0.001
+    with pytest.raises(greybox.InputError, match="integral"):
+        greybox.control(cart["model"], integral=False, integral_at_rest=True, **options)
 
 
 def test_a_trajectory_is_the_command_s(cart, command, tmp_path):
