@@ -10,22 +10,28 @@ import pytest
 from conftest import write_csv
 
 
-def test_a_diagnosis_of_files_is_the_command_s_to_the_byte(cart, command, tmp_path):
+@pytest.fixture(scope="module")
+def diagnosed(cart, command, tmp_path_factory):
+    """What the command leaves of a diagnosis, and what it says."""
+    folder = tmp_path_factory.mktemp("diagnosed")
     first, second = cart["files"]
-    done = command("diagnose", cart["model"], first, "--holdout", second, "--out", tmp_path, "--seed", "3")
-    found = greybox.diagnose(cart["model"], first, second, seed=3)
-    assert found.to_json() == (tmp_path / "report.json").read_text()
-    assert found.improved == (tmp_path / "improved.toml").read_text()
-    assert found.report_html() == (tmp_path / "report.html").read_text()
-    assert found.summary == done.stdout.split("\nWritten:")[0].rstrip("\n") + "\n"
+    done = command("diagnose", cart["model"], first, "--holdout", second, "--out", folder, "--seed", "3")
+    return folder, done.stdout
 
 
-def test_a_diagnosis_of_arrays_is_the_command_s(cart, command, tmp_path):
-    first, second = cart["files"]
-    command("diagnose", cart["model"], first, "--holdout", second, "--out", tmp_path)
+def test_a_diagnosis_of_files_is_the_command_s_to_the_byte(cart, diagnosed):
+    folder, said = diagnosed
+    found = greybox.diagnose(cart["model"], *cart["files"], seed=3)
+    assert found.to_json() == (folder / "report.json").read_text()
+    assert found.improved == (folder / "improved.toml").read_text()
+    assert found.report_html() == (folder / "report.html").read_text()
+    assert found.summary == said.split("\nWritten:")[0].rstrip("\n") + "\n"
+
+
+def test_a_diagnosis_of_arrays_is_the_command_s(cart, diagnosed):
     named = [greybox.Recording(c, f.name) for c, f in zip(cart["columns"], cart["files"])]
-    found = greybox.diagnose(cart["model"], named[0], named[1])
-    assert found.report == json.loads((tmp_path / "report.json").read_text())
+    found = greybox.diagnose(cart["model"], *named, seed=3)
+    assert found.report == json.loads((diagnosed[0] / "report.json").read_text())
 
 
 def test_a_calibration_is_the_command_s(cart, command, tmp_path):
