@@ -2,7 +2,7 @@
 
 use std::path::PathBuf;
 
-use greybox_commands::control::{self as design, IntegralKind, ObserverKind, ObserverRequest, Request, Way};
+use greybox_commands::control::{self as design, Integral, ObserverKind, ObserverRequest, Request, Way};
 use greybox_commands::{Failure, loading};
 use numpy::PyArray1;
 use pyo3::prelude::*;
@@ -87,9 +87,9 @@ impl Wanted {
                 disturbance: self.disturbance,
                 bandwidth: self.bandwidth,
                 integral: match (self.integral, self.integral_at_rest) {
-                    (false, false) => IntegralKind::Off,
-                    (true, false) => IntegralKind::Disturbance,
-                    (true, true) => IntegralKind::AtRest,
+                    (false, false) => Integral::Off,
+                    (true, false) => Integral::Disturbance,
+                    (true, true) => Integral::AtRest { time: None },
                     (false, true) => {
                         return Err(Failure::input(
                             "`integral_at_rest` is an integral action, and `integral` is false",

@@ -7,10 +7,11 @@ mod trajectory;
 
 use std::path::Path;
 
+pub use greybox_control::Integral;
 use greybox_control::{
-    ClosedLoop, Controller, DesignOptions, FamilyOptions, Feedback, Integral, LoopOptions, Method,
-    ObserverMethod, OutputFeedback, OutputOptions, Plant, PlantOptions, Reference, Run, Sensor, Trajectory,
-    UNSTATED_NOISE, design, equilibrium,
+    ClosedLoop, Controller, DesignOptions, FamilyOptions, Feedback, LoopOptions, Method, ObserverMethod,
+    OutputFeedback, OutputOptions, Plant, PlantOptions, Reference, Run, Sensor, Trajectory, UNSTATED_NOISE,
+    design, equilibrium,
 };
 use greybox_export::Language;
 use greybox_model::Model;
@@ -110,19 +111,7 @@ pub struct ObserverRequest {
     /// Bandwidth, 1/s; four times the fastest pole of the loop where none is given (ESO).
     pub bandwidth: Option<f64>,
     /// The integral action of the law.
-    pub integral: IntegralKind,
-}
-
-/// The integral action of a law behind an observer.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
-pub enum IntegralKind {
-    /// The law takes the estimated disturbance off the command.
-    #[default]
-    Disturbance,
-    /// The error at rest, for a machine that sticks ([`greybox_control::Rest`]).
-    AtRest,
-    /// None.
-    Off,
+    pub integral: Integral,
 }
 
 /// The observers.
@@ -292,7 +281,7 @@ pub fn control(
         texts.push(code::observed(&designed, output)?);
     }
     let contents = files.iter().map(|(name, _)| *name).zip(texts).collect();
-    let story = answer::in_words(&designed);
+    let story = answer::in_words(&page, &designed);
     Ok(Results { contents, story, json, run })
 }
 
@@ -426,10 +415,5 @@ fn output_feedback(
         let unstated = if resolution > 0.0 { 0.0 } else { UNSTATED_NOISE * size };
         sensors.push((name.clone(), Sensor { noise: of(&wanted.noise).unwrap_or(unstated), resolution }));
     }
-    let integral = match wanted.integral {
-        IntegralKind::Disturbance => Integral::Disturbance,
-        IntegralKind::AtRest => Integral::AtRest { time: None },
-        IntegralKind::Off => Integral::Off,
-    };
-    OutputFeedback::new(controller, &OutputOptions { method, sensors, integral })
+    OutputFeedback::new(controller, &OutputOptions { method, sensors, integral: wanted.integral })
 }

@@ -66,7 +66,7 @@ impl Examined<'_> {
         let gain = self.gain(&self.frictionless, &at.state, set_point);
         let (poles, held_poles) = self.stable(&plant, &gain, set_point)?;
         let spectral_radius = largest(&held_poles);
-        let stuck_poles = self.stuck_poles(&at, &stability::closed(&plant, &gain)).unwrap_or_default();
+        let stuck_poles = self.stuck_poles(set_point, &at, (&plant, &gain))?;
         Ok(Check { set_point, equilibrium: at, poles, held_poles, spectral_radius, stuck_poles })
     }
 
@@ -78,23 +78,30 @@ impl Examined<'_> {
     /// ```
     ///
     /// without the tracked state and v. f is what smoothed friction adds to the tangent's column of v.
-    fn stuck_poles(&self, at: &Equilibrium, closed: &DMatrix<f64>) -> Option<Vec<Pole>> {
+    fn stuck_poles(
+        &self,
+        set_point: f64,
+        at: &Equilibrium,
+        (free, gain): (&Linear, &DMatrix<f64>),
+    ) -> Result<Vec<Pole>, ControlError> {
         let symbols = self.plant.symbols();
-        let (name, primes) = symbols.get(self.tracked)?;
-        let rate = symbols.iter().position(|(n, p)| n == name && *p == primes + 1)?;
+        let (name, primes) = &symbols[self.tracked];
+        let Some(rate) = symbols.iter().position(|(n, p)| n == name && *p == primes + 1) else {
+            return Ok(Vec::new());
+        };
         let smooth = self.plant.tangent(&at.state, at.input).a;
-        let free = self.plant.frictionless_tangent(&at.state, at.input).a;
-        let f: Vec<f64> = (0..free.nrows()).map(|i| smooth[(i, rate)] - free[(i, rate)]).collect();
-        // (Friction brakes.)
-        if !(f[rate] < 0.0 && f.iter().all(|f| f.is_finite())) {
-            return None;
-        }
+        let f: Vec<f64> = (0..symbols.len()).map(|i| smooth[(i, rate)] - free.a[(i, rate)]).collect();
         let left: Vec<usize> = (0..f.len()).filter(|i| *i != self.tracked && *i != rate).collect();
+        // (Friction brakes.)
+        if left.is_empty() || !(f[rate] < 0.0 && f.iter().all(|f| f.is_finite())) {
+            return Ok(Vec::new());
+        }
+        let closed = stability::closed(free, gain);
         let a = DMatrix::from_fn(left.len(), left.len(), |i, j| {
             closed[(left[i], left[j])] - f[left[i]] / f[rate] * closed[(rate, left[j])]
         });
         let sizes: Vec<f64> = left.iter().map(|i| self.plant.sizes()[*i]).collect();
-        if left.is_empty() { None } else { stability::poles(&a, &sizes) }
+        stability::poles(&a, &sizes).ok_or(ControlError::NoPoles { set_point })
     }
 
     /// The poles, continuous and in z, if stable.

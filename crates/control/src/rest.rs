@@ -8,11 +8,12 @@ use crate::observer::Sensor;
 const SHARE: f64 = 0.25;
 
 /// The integral action of a law behind an observer.
-#[derive(Debug, Clone, Copy, PartialEq)]
+#[derive(Debug, Clone, Copy, PartialEq, Default)]
 pub enum Integral {
     /// None: u = κ(x̂, r).
     Off,
     /// The estimated disturbance: u = κ(x̂, r) − d̂.
+    #[default]
     Disturbance,
     /// The error at rest, for a machine that sticks: [`Rest`].
     AtRest {

@@ -2,6 +2,7 @@
 
 use std::f64::consts::TAU;
 
+use crate::common::sticky_arm;
 use greybox_control::{
     ClosedLoop, ControlError, Controller, DesignOptions, FamilyOptions, Feedback, Integral, LoopOptions,
     Method, ObserverMethod, OutputFeedback, OutputOptions, Plant, PlantOptions, Reference, Run, Sensor,
@@ -13,31 +14,7 @@ const KALMAN: ObserverMethod = ObserverMethod::Kalman { disturbance: 1.0 };
 const ESO: ObserverMethod = ObserverMethod::Eso { bandwidth: 80.0 };
 
 fn arm(friction: f64) -> Model {
-    sticky_arm(friction, 0.0)
-}
-
-/// `fs_excess`: how much larger friction is at rest than in motion, as a share of it.
-fn sticky_arm(friction: f64, fs_excess: f64) -> Model {
-    let text = format!(
-        r#"
-[inputs]
-v = {{ unit = "V" }}
-[states]
-theta = {{ unit = "rad" }}
-[parameters]
-J = {{ value = 0.02, unit = "kg m^2" }}
-b = {{ value = 0.15, unit = "N m s/rad" }}
-fc = {{ value = {friction}, unit = "N m" }}
-more = {{ value = {fs_excess}, unit = "1" }}
-vs = {{ value = 0.05, unit = "rad/s" }}
-mgl = {{ value = 0.5, unit = "N m" }}
-kt = {{ value = 0.4, unit = "N m/V" }}
-umax = {{ value = 10.0, unit = "V" }}
-[equations]
-arm = "J*theta'' + b*theta' + fc*(1 + more*exp(-(theta'/vs)^2))*sign(theta') + mgl*sin(theta) = kt*saturate(v, umax)"
-"#
-    );
-    Model::from_toml(&text, "arm.toml").unwrap()
+    sticky_arm(friction, 0.0, 0.5)
 }
 
 fn law(model: &Model) -> Controller {
@@ -85,7 +62,7 @@ fn friction_and_a_wrong_parameter_leave_no_error_and_no_limit_cycle() {
     let reference = Reference::square(0.5, 10.0, 4);
     let encoder = Sensor { noise: 0.0, resolution: TAU / 4096.0 };
     for excess in [0.0, 1.0] {
-        let mut machine = sticky_arm(0.05, excess);
+        let mut machine = sticky_arm(0.05, excess, 0.5);
         let at = machine.parameter("mgl").unwrap();
         machine.parameters[at].value = 0.6;
         let full = run(&machine, &law, &LoopOptions::default(), &reference);

@@ -2,7 +2,7 @@
 
 use std::f64::consts::TAU;
 
-use crate::common::link;
+use crate::common::{link, sticky_arm};
 use greybox_control::{
     ClosedLoop, ControlError, Controller, DesignOptions, Feedback, Integral, LoopOptions, Method, Metrics,
     ObserverMethod, OutputFeedback, OutputOptions, Plant, PlantOptions, Reference, Sensor, design,
@@ -98,37 +98,15 @@ fn a_flexible_link_that_sticks_comes_to_rest_within_two_counts() {
 /// An arm with a load and with friction that its law does not know, also where friction at rest is twice that in motion.
 #[test]
 fn an_arm_that_sticks_comes_to_rest() {
-    let arm = |friction: f64, excess: f64, mgl: f64| {
-        let text = format!(
-            r#"
-[inputs]
-v = {{ unit = "V" }}
-[states]
-theta = {{ unit = "rad" }}
-[parameters]
-J = {{ value = 0.02, unit = "kg m^2" }}
-b = {{ value = 0.15, unit = "N m s/rad" }}
-fc = {{ value = {friction}, unit = "N m" }}
-more = {{ value = {excess}, unit = "1" }}
-vs = {{ value = 0.05, unit = "rad/s" }}
-mgl = {{ value = {mgl}, unit = "N m" }}
-kt = {{ value = 0.4, unit = "N m/V" }}
-[equations]
-arm = "J*theta'' + b*theta' + fc*(1 + more*exp(-(theta'/vs)^2))*sign(theta') + mgl*sin(theta) = kt*v"
-"#
-        );
-        Model::from_toml(&text, "arm.toml").unwrap()
-    };
     let sizes = vec![("theta".to_owned(), 0.2), ("theta'".to_owned(), 4.0)];
     let options = PlantOptions { sizes, input_size: 5.0, ..PlantOptions::default() };
-    let plant = Plant::of(&arm(0.0, 0.0, 0.5), "v", &options).unwrap();
-    let wanted = DesignOptions { limit: Some(10.0), ..DesignOptions::new("theta", &[-1.0, 1.0], 2e-3) };
-    let law = design(&plant, &Method::Lqr, &wanted).unwrap();
+    let plant = Plant::of(&sticky_arm(0.0, 0.0, 0.5), "v", &options).unwrap();
+    let law = design(&plant, &Method::Lqr, &DesignOptions::new("theta", &[-1.0, 1.0], 2e-3)).unwrap();
     let reference = Reference::square(0.5, 5.0, 5);
     for method in [KALMAN, eso(&law)] {
         let ends = |friction: f64, excess: f64, integral| {
             let output = output(&law, method, integral).unwrap();
-            let reached = reached(&arm(friction, excess, 0.6), &law, output, &reference);
+            let reached = reached(&sticky_arm(friction, excess, 0.6), &law, output, &reference);
             let error = worst(&reached, |m| m.final_error.abs() / COUNT);
             (error, worst(&reached, |m| m.peak_to_peak / COUNT))
         };
@@ -183,7 +161,7 @@ fn the_law_of_the_moving_link_is_unstable_where_the_hub_sticks() {
 }
 
 #[test]
-fn what_cannot_be_told_to_rest_is_refused() {
+fn a_time_to_rest_that_is_not_positive_is_refused() {
     let law = regulator(&link(1.0), 0.3);
     for time in [0.0, -1.0, f64::NAN, f64::INFINITY] {
         let made = output(&law, KALMAN, Integral::AtRest { time: Some(time) });

@@ -3,7 +3,7 @@
 use std::path::PathBuf;
 
 use clap::{Args, ValueEnum};
-use greybox_commands::control::{self as commands, IntegralKind, ObserverKind, ObserverRequest, Request};
+use greybox_commands::control::{self as commands, Integral, ObserverKind, ObserverRequest, Request};
 
 use crate::answer::Answer;
 use crate::failure::Failure;
@@ -277,9 +277,9 @@ fn request(arguments: &Arguments) -> Result<Request, Failure> {
             disturbance: arguments.disturbance,
             bandwidth: arguments.bandwidth,
             integral: match (arguments.no_integral, arguments.integral_at_rest) {
-                (true, _) => IntegralKind::Off,
-                (false, true) => IntegralKind::AtRest,
-                (false, false) => IntegralKind::Disturbance,
+                (true, _) => Integral::Off,
+                (false, true) => Integral::AtRest { time: None },
+                (false, false) => Integral::Disturbance,
             },
         }),
     };

@@ -167,7 +167,7 @@ fn margins_in_words(m: &Margins) -> String {
     )
 }
 
-pub(super) fn in_words(designed: &Designed<'_>) -> String {
+pub(super) fn in_words(page: &ControlPage, designed: &Designed<'_>) -> String {
     let Designed { file, controller, output, run, family, .. } = *designed;
     let plant = controller.plant();
     let tracked = plant.state_names().get(controller.tracked()).cloned().unwrap_or_default();
@@ -219,10 +219,7 @@ pub(super) fn in_words(designed: &Designed<'_>) -> String {
     if let Some(m) = worst_margins(controller, output) {
         let _ = writeln!(text, "  margins: {}", margins_in_words(&m));
     }
-    let stuck = controller.checks().iter().flat_map(|c| &c.stuck_poles).map(|p| p.re);
-    if output.is_none_or(|output| output.rest().is_none())
-        && let Some(warning) = sentence::control::hunts(&tracked, stuck)
-    {
+    if let Some(warning) = sentence::control::hunts(page) {
         let _ = writeln!(text, "  {warning}");
     }
     for dropped in plant.dropped() {

@@ -42,6 +42,29 @@ pub fn link(coulomb: f64) -> Model {
     ))
 }
 
+/// An arm with friction, `excess` of it more at rest than in motion, and a gravity torque `mgl`.
+pub fn sticky_arm(friction: f64, excess: f64, mgl: f64) -> Model {
+    load(&format!(
+        r#"
+[inputs]
+v = {{ unit = "V" }}
+[states]
+theta = {{ unit = "rad" }}
+[parameters]
+J = {{ value = 0.02, unit = "kg m^2" }}
+b = {{ value = 0.15, unit = "N m s/rad" }}
+fc = {{ value = {friction}, unit = "N m" }}
+more = {{ value = {excess}, unit = "1" }}
+vs = {{ value = 0.05, unit = "rad/s" }}
+mgl = {{ value = {mgl}, unit = "N m" }}
+kt = {{ value = 0.4, unit = "N m/V" }}
+umax = {{ value = 10.0, unit = "V" }}
+[equations]
+arm = "J*theta'' + b*theta' + fc*(1 + more*exp(-(theta'/vs)^2))*sign(theta') + mgl*sin(theta) = kt*saturate(v, umax)"
+"#
+    ))
+}
+
 pub const PENDULUM: &str = r#"
 [inputs]
 tau = { unit = "N m" }

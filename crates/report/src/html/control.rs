@@ -60,8 +60,7 @@ struct View {
     is_trajectory: bool,
     reads_derivatives: bool,
     fed_back: String,
-    is_integral: bool,
-    is_integral_at_rest: bool,
+    integral_promise: &'static str,
     observer: Option<ObserverView>,
     margins: Vec<[String; 6]>,
     files: Vec<(&'static str, &'static str)>,
@@ -196,11 +195,7 @@ impl View {
             is_trajectory: page.is_trajectory,
             reads_derivatives: page.reads_derivatives,
             fed_back: fed_back(page),
-            is_integral: page.observer.as_ref().is_some_and(|o| o.integral == IntegralAction::Disturbance),
-            is_integral_at_rest: page
-                .observer
-                .as_ref()
-                .is_some_and(|o| matches!(o.integral, IntegralAction::AtRest { .. })),
+            integral_promise: integral_promise(page),
             observer: page.observer.as_ref().map(|o| ObserverView {
                 kind: o.kind,
                 disturbance_html: expression::html(&o.disturbance),
@@ -504,6 +499,23 @@ fn gains(page: &ControlPage) -> Vec<[String; 4]> {
         ]
     };
     page.states.iter().map(row).collect()
+}
+
+/// What the integral action does not do.
+fn integral_promise(page: &ControlPage) -> &'static str {
+    match page.observer.as_ref().map_or(IntegralAction::Off, |o| o.integral) {
+        IntegralAction::Off => {
+            "There is no integral action: a wrong parameter, a load or friction that holds leaves an error that stays."
+        }
+        IntegralAction::Disturbance => {
+            "The disturbance takes out what acts like a constant command. What acts elsewhere, or faster than the observer follows, \
+             leaves an error or a motion that does not end."
+        }
+        IntegralAction::AtRest { .. } => {
+            "In motion there is no integral action: a load that the law does not know acts until the machine stops, and is taken \
+             out then."
+        }
+    }
 }
 
 /// A row for each pole; of a pair, one.

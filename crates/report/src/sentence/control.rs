@@ -7,10 +7,8 @@ use crate::{expression, format};
 
 /// The conclusion, most important first: how the loop settles, then what holds on perturbed plants, then the command.
 pub fn summary(page: &ControlPage) -> Vec<String> {
-    let tracked = page.states.get(page.tracked).map(|s| &s.quantity);
-    let unit = tracked.map_or("", |q| q.unit.as_str());
-    let name = tracked.map_or_else(|| "The tracked state".to_owned(), |q| expression::text(&q.name));
-    let mut out = vec![reached(page, &name, unit)];
+    let unit = page.states.get(page.tracked).map_or("", |s| s.quantity.unit.as_str());
+    let mut out = vec![reached(page, &tracked(page), unit)];
     out.push(match &page.family {
         None => "No perturbed plants were tried: nothing is said about a plant that is not quite the model."
             .into(),
@@ -29,24 +27,31 @@ pub fn summary(page: &ControlPage) -> Vec<String> {
         }
     });
     out.extend(page.family.as_ref().and_then(|f| f.margins).map(|m| margins(&m)));
-    let is_held = page.observer.as_ref().is_some_and(|o| matches!(o.integral, IntegralAction::AtRest { .. }));
-    if !is_held {
-        out.extend(hunts(&name, page.set_points.iter().flat_map(|s| &s.stuck_poles).map(|p| p[0])));
-    }
+    out.extend(hunts(page));
     out.push(command(page));
     out
 }
 
-/// That a loop cannot stay at rest, by the real parts of its poles while friction holds the tracked state, 1/s.
-pub fn hunts(tracked: &str, stuck: impl Iterator<Item = f64>) -> Option<String> {
-    let rightmost = stuck.fold(f64::NEG_INFINITY, f64::max);
-    (rightmost > 0.0).then(|| {
+/// That a loop cannot stay at rest, by its poles while friction holds the tracked state; not of a law that holds the command
+/// there.
+pub fn hunts(page: &ControlPage) -> Option<String> {
+    let is_held = page.observer.as_ref().is_some_and(|o| matches!(o.integral, IntegralAction::AtRest { .. }));
+    let stuck = page.set_points.iter().flat_map(|s| &s.stuck_poles);
+    let rightmost = stuck.map(|[re, _]| *re).fold(f64::NEG_INFINITY, f64::max);
+    (rightmost > 0.0 && !is_held).then(|| {
         format!(
-            "While friction holds {tracked}, the loop has a pole at +{} 1/s: it cannot stay at rest, and hunts. Integral action \
-             at rest, of a law with an observer, holds the command there.",
+            "While friction holds {}, the loop has a pole at +{} 1/s: it cannot stay at rest, and hunts. Integral action at rest, of \
+             a law with an observer, holds the command there.",
+            tracked(page),
             format::number(rightmost)
         )
     })
+}
+
+/// The name of the tracked state.
+fn tracked(page: &ControlPage) -> String {
+    let state = page.states.get(page.tracked);
+    state.map_or_else(|| "The tracked state".to_owned(), |s| expression::text(&s.quantity.name))
 }
 
 /// What the loop has to spare on the worst of the perturbed plants.
