@@ -77,7 +77,13 @@ pub fn stage_text(stage: Stage) -> String {
         Stage::Fitting { candidates } => format!("fitting the best {candidates}"),
         Stage::Lengthening { segments } => format!("going on with {segments} longer segments"),
         Stage::Whitening => "searching again with coloured noise modelled".to_owned(),
-        Stage::Simulating => "simulating whole recordings".to_owned(),
+        Stage::Simulating => "fitting whole recordings".to_owned(),
+        Stage::Closing { length, terms } => {
+            format!("choosing terms of a formula on {length} samples at a time ({terms} so far)")
+        }
+        Stage::Validating => "predicting recordings that are left out".to_owned(),
+        Stage::Exploring => "weighing laws beside an error of the model".to_owned(),
+        Stage::Concluding => "estimating intervals and shares".to_owned(),
     }
 }
 

@@ -20,6 +20,7 @@ use std::sync::Arc;
 use greybox_calibrate::{Point, Setup, Work};
 use rayon::prelude::*;
 
+use crate::Stage;
 use crate::candidate::Candidate;
 use crate::evidence::{Evidence, least_effective_sample_ratio, price};
 use crate::fitted::{FittedModel, Found, Law, MechanismTerm, SelectedTerm, WHITE, is_same, laws, next_scale};
@@ -104,6 +105,7 @@ impl Search<'_> {
             current = FittedModel { level, fit, ..current };
             let mut seen: Vec<Vec<Candidate>> = Vec::new();
             loop {
+                self.listener.stage(Stage::Closing { length, terms: current.parts.len() });
                 scale = next_scale(&current.fit, &scale, &nominal.data.sigma);
                 self.method(&mut current, &scale);
                 current = self.refit(&current, &scale, 10);

@@ -43,6 +43,7 @@ pub(crate) fn conclude(
     let judge = Judge::of(&found.improved, &residual_scale(&found.improved, &found.scale));
     let Answer { found, polished, baseline, judged, believed, rejected, limited } =
         Answer::of(nominal, search, found, options, &judge);
+    search.listener.stage(Stage::Concluding);
     let WholeRecordFit { fitted: improved, origin } = &polished;
     let scale = residual_scale(improved, &found.scale);
     let Baseline { polished: WholeRecordFit { fitted: calibrated, origin: own }, .. } = &baseline;

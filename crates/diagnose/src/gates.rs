@@ -2,6 +2,7 @@
 
 use rayon::prelude::*;
 
+use crate::Stage;
 use crate::baseline::{Baseline, Judge, WholeRecordFit, leaves_noise, polish, residual_scale};
 use crate::fitted::{FittedModel, Found};
 use crate::plausibility::Deviation;
@@ -140,6 +141,7 @@ impl<'a> Gates<'a> {
             return Failure::at(Gate::Parameters, Vec::new());
         }
         let predicts = || {
+            search.listener.stage(Stage::Validating);
             Gain::of(self.baseline.errors(self.judge), &self.judge.errors(polished, &own)).is_beyond_chance()
         };
         if likely || predicts() { None } else { Failure::at(Gate::CrossValidation, Vec::new()) }

@@ -75,8 +75,21 @@ pub enum Stage {
     },
     /// Searching again with a model of the coloured noise.
     Whitening,
-    /// Simulating whole recordings.
+    /// Fitting the model that was found, and the equations alone, to whole recordings.
     Simulating,
+    /// Choosing the terms of a formula for what no name explains.
+    Closing {
+        /// Samples of the segments.
+        length: usize,
+        /// Terms so far.
+        terms: usize,
+    },
+    /// Fitting to parts of the recordings, and simulating the others.
+    Validating,
+    /// Weighing laws beside an error of the model itself.
+    Exploring,
+    /// Estimates and intervals, and what each mechanism explains.
+    Concluding,
 }
 
 /// What was weighed, and how.

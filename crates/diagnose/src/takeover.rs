@@ -3,6 +3,7 @@
 
 use greybox_calibrate::{Point, Setup};
 
+use crate::Stage;
 use crate::baseline::{Baseline, Judge, WholeRecordFit, leaves_noise, polish, residual_scale};
 use crate::candidate::Candidate;
 use crate::closure::Visited;
@@ -72,6 +73,7 @@ impl Closed {
     ) -> Result<Closed, Rejected> {
         let mut found = found;
         loop {
+            search.listener.stage(Stage::Simulating);
             let polished = polish(&found.improved, &found.scale, judge);
             let Some(failure) = gates.failure(&polished, &found.scale) else {
                 return Ok(Closed::new(found, polished, judge));
@@ -140,6 +142,7 @@ pub(crate) fn explored(
     baseline: &Baseline,
     judge: &Judge,
 ) -> Option<Explored> {
+    search.listener.stage(Stage::Exploring);
     let calibrated = &found.calibrated;
     let explorer = Explorer::new(search, &calibrated.setup);
     let posterior = explorer.explore(&calibrated.fit.point.parameters, &[&found.improved])?;
