@@ -1,5 +1,7 @@
 //! Expressions of states compiled for fast evaluation, with exact derivatives.
 
+use std::sync::Arc;
+
 use greybox_model::Expr;
 use greybox_model::tape::{LeafKind, Tangents, Tape, UnknownName};
 use nalgebra::DMatrix;
@@ -12,7 +14,7 @@ pub(crate) struct Compiled {
     registers: Vec<f64>,
     modes: Vec<i8>,
     variables: usize,
-    tangents: Tangents,
+    tangents: Arc<Tangents>,
 }
 
 impl Compiled {
@@ -39,7 +41,7 @@ impl Compiled {
         }
         tape.prepare(&mut registers, &mut modes);
         let leaves: Vec<bool> = (0..tape.leaves()).map(|i| i < n).collect();
-        let tangents = tape.tangents(&leaves);
+        let tangents = tape.compiled_tangents(&leaves, n);
         Ok(Compiled { tape, registers, modes, variables: n, tangents })
     }
 

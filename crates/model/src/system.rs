@@ -70,6 +70,12 @@ pub enum CompileError {
 }
 
 impl System {
+    /// The same system, whose equations are interpreted and never compiled to machine code: the oracle of what is.
+    #[must_use]
+    pub fn interpreted(&self) -> System {
+        System { rhs: self.rhs.interpreted(), output: self.output.interpreted(), ..self.clone() }
+    }
+
     /// Compiles a model.
     ///
     /// # Errors

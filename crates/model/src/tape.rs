@@ -14,14 +14,18 @@
 //! Registers: the leaves first (in the caller's layout), then constants, then one per operation.
 
 use std::collections::HashMap;
+use std::sync::Arc;
 
 use code::Code;
+use compiled::Compiled;
+use greybox_jit::{Operations, Rules};
 pub use tangents::Tangents;
 
 use crate::expr::{BinOp, Expr, Func};
 use crate::table::Table;
 
 mod code;
+mod compiled;
 mod tangents;
 
 /// A register number.
@@ -283,6 +287,8 @@ pub struct Tape {
     code: Vec<Code>,
     /// By sign: what depends on its value.
     after: Vec<Vec<(Reg, Op)>>,
+    /// Machine code for it; `None`: it is only interpreted.
+    compiled: Option<Arc<Compiled>>,
     /// Registers of the compiled expressions, in the order they were given.
     pub outputs: Vec<Reg>,
     /// Non-smooth nodes in the order they are evaluated.
@@ -584,6 +590,7 @@ impl<'a> Compiler<'a> {
             code: code::compile(&ops[prologue..], first_op + prologue),
             ops,
             prologue,
+            compiled: Some(Arc::default()),
             outputs: outputs.iter().map(|&r| at(r)).collect(),
             switches,
             delays: self
@@ -652,6 +659,9 @@ impl Tape {
     /// Evaluates the body with fixed modes; `lambda[k]` is the value of a sticking `sign` `k`.
     #[inline]
     pub fn eval(&self, regs: &mut [f64], modes: &mut [i8], lambda: &[f64]) {
+        if let Some(values) = self.values() {
+            return values.run(0, regs, modes, lambda, &mut []);
+        }
         code::run::<false>(&self.code, self.first_op() + self.prologue, &self.switches, regs, modes, lambda);
     }
 
@@ -660,6 +670,9 @@ impl Tape {
     /// kind changes nothing.
     #[inline]
     pub fn eval_after(&self, k: usize, regs: &mut [f64], modes: &mut [i8], lambda: &[f64]) {
+        if let Some(values) = self.values() {
+            return values.run(1 + k, regs, modes, lambda, &mut []);
+        }
         code::again(&self.after[k], &self.switches, regs, modes, lambda);
     }
 
@@ -675,6 +688,67 @@ impl Tape {
         Tangents::new(&self.ops, self.prologue, self.first_op(), &self.switches, leaf_active)
     }
 
+    /// [`tangents`](Self::tangents) for `lanes` directions, compiled where the machine can; made once for all copies of the tape.
+    pub fn compiled_tangents(&self, leaf_active: &[bool], lanes: usize) -> Arc<Tangents> {
+        match &self.compiled {
+            Some(compiled) => compiled.tangents(leaf_active, lanes, || {
+                let mut tangents = self.tangents(leaf_active);
+                tangents.code = tangents::compile(&tangents.body, &self.switches, lanes);
+                tangents
+            }),
+            None => Arc::new(self.tangents(leaf_active)),
+        }
+    }
+
+    /// Programs made of the rules of [`tangents`](Self::tangents), in the frame of whoever simulates: each of
+    /// the `frames` gets the rules and gives those of its program. Made once for all copies of the tape and one `purpose`; `None`
+    /// where nothing is compiled.
+    pub fn compiled_programs(
+        &self,
+        (leaf_active, lanes, purpose): (&[bool], usize, usize),
+        frames: &[&dyn Fn(&Rules) -> Rules],
+    ) -> Option<Arc<Vec<greybox_jit::Tangents>>> {
+        self.compiled.as_ref()?.programs((leaf_active, lanes, purpose), || {
+            let tangents = self.tangents(leaf_active);
+            let (before, rules) = tangents::rules(&tangents.body, &self.switches);
+            let compile = |frame: &&dyn Fn(&Rules) -> Rules| {
+                greybox_jit::Tangents::compile(&before, &frame(&rules), lanes)
+            };
+            frames.iter().map(compile).collect()
+        })
+    }
+
+    /// Programs made of the body, in the frame of whoever simulates: each of the `frames` gets the operations of
+    /// [`eval`](Self::eval) and gives those of its program. Made once for all copies of the tape and one `purpose`; `None` where
+    /// nothing is compiled.
+    pub fn compiled_values(
+        &self,
+        purpose: usize,
+        frames: &[&dyn Fn(&Operations) -> Operations],
+    ) -> Option<Arc<greybox_jit::Values>> {
+        self.compiled.as_ref()?.framed(purpose, || {
+            let first = self.first_op() + self.prologue;
+            let body = compiled::body(&self.ops[self.prologue..], first, &self.switches);
+            let programs: Vec<_> = frames.iter().map(|frame| frame(&body)).collect();
+            let programs: Vec<_> = programs.iter().map(Vec::as_slice).collect();
+            greybox_jit::Values::compile(&programs)
+        })
+    }
+
+    /// The same tape, never compiled: the oracle of what is.
+    #[must_use]
+    pub fn interpreted(&self) -> Tape {
+        Tape { compiled: None, ..self.clone() }
+    }
+
+    #[inline]
+    fn values(&self) -> Option<&greybox_jit::Values> {
+        self.compiled.as_ref()?.values(|| {
+            let first = self.first_op() + self.prologue;
+            compiled::values(&self.ops[self.prologue..], first, &self.after, &self.switches)
+        })
+    }
+
     /// Directional derivatives of every register for `lanes` directions at the point whose values
     /// stand in `regs`. `d` is `registers × lanes`, row major; the leaves' rows (and, for the body,
     /// the prologue's) must be set, rows that are not active zero.
@@ -682,6 +756,9 @@ impl Tape {
     /// Inlined, so that a caller's literal `lanes` and instruction set are those of its loops.
     #[inline(always)]
     pub fn tangent(&self, tangents: &Tangents, regs: &[f64], modes: &[i8], lanes: usize, d: &mut [f64]) {
+        if let Some(code) = tangents.code.as_ref().filter(|code| code.lanes() == lanes) {
+            return code.run(regs, modes, d);
+        }
         let at = tangents::Place { regs, modes, switches: &self.switches };
         tangents::run(&tangents.body, at, lanes, d);
     }

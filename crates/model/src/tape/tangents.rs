@@ -1,14 +1,19 @@
 //! Directional derivatives of the registers: which have any, and the rule of each.
 
+use greybox_jit::{Operand, Operation, Operations, Row as Lanes, Rule as Code, Rules};
+
+use super::compiled::{Program, register};
 use super::{Op, Reg, Smooth, Switch, SwitchKind, powi};
 
 /// Which registers can have a non-zero derivative, and what computes it. Made once by
 /// [`Tape::tangents`](super::Tape::tangents), for the leaves that have one.
-#[derive(Debug, Clone)]
+#[derive(Debug)]
 pub struct Tangents {
     active: Vec<bool>,
     pub(super) prologue: Vec<Row>,
     pub(super) body: Vec<Row>,
+    /// The body for one number of lanes.
+    pub(super) code: Option<greybox_jit::Tangents>,
 }
 
 impl Tangents {
@@ -37,7 +42,7 @@ impl Tangents {
             }
         }
         let [prologue, body] = rows;
-        Tangents { active, prologue, body }
+        Tangents { active, prologue, body, code: None }
     }
 }
 
@@ -105,6 +110,100 @@ impl Rule {
                 let flat = matches!(s.kind, SwitchKind::Sign | SwitchKind::Step);
                 (!flat && (a || b)).then_some(Rule::Switch(k, a, b))
             }
+        }
+    }
+}
+
+/// The rules as machine code for `lanes` directions: what they multiply by first, then the rows. To the last bit what [`run`] gives.
+pub(super) fn compile(rows: &[Row], switches: &[Switch], lanes: usize) -> Option<greybox_jit::Tangents> {
+    let (before, rules) = rules(rows, switches);
+    greybox_jit::Tangents::compile(&before, &rules, lanes)
+}
+
+/// What the rules multiply by, and the rows.
+pub(super) fn rules(rows: &[Row], switches: &[Switch]) -> (Operations, Rules) {
+    let mut before = Program::default();
+    let rules = rows.iter().map(|row| (row.out, row.rule.compile(row.out, switches, &mut before))).collect();
+    (before.operations, rules)
+}
+
+impl Rule {
+    fn compile(self, out: Reg, switches: &[Switch], before: &mut Program) -> Code {
+        let one = Operand::Constant(1.0);
+        // −a / b².
+        let under = |before: &mut Program, a: Reg, b: Reg| {
+            let negative = before.local(Operation::Negative(register(a)));
+            let square = before.local(Operation::Product(register(b), register(b)));
+            before.local(Operation::Quotient(negative, square))
+        };
+        // b a^(b − 1).
+        let by_base = |before: &mut Program, a: Reg, b: Reg| {
+            let less = before.local(Operation::Difference(register(b), one));
+            let power = before.local(Program::real_power(register(a), less));
+            before.local(Operation::Product(register(b), power))
+        };
+        // a^b ln a.
+        let by_exponent = |before: &mut Program, a: Reg, b: Reg| {
+            let power = before.local(Program::real_power(register(a), register(b)));
+            let logarithm = before.local(Program::logarithm(register(a)));
+            before.local(Operation::Product(power, logarithm))
+        };
+        Code::Always(match self {
+            Rule::Same(a) => Lanes::Copy(a),
+            Rule::Sum(a, b) => Lanes::Sum(a, b),
+            Rule::Difference(a, b) => Lanes::Difference(a, b),
+            Rule::Scaled(a, b) => Lanes::Scale(register(b), a),
+            Rule::Product(a, b) => Lanes::Blend(register(b), a, register(a), b),
+            Rule::Over(a, b) => Lanes::Scale(before.local(Operation::Quotient(one, register(b))), a),
+            Rule::Under(a, b) => Lanes::Scale(under(before, a, b), b),
+            Rule::Quotient(a, b) => {
+                let inverse = before.local(Operation::Quotient(one, register(b)));
+                Lanes::Blend(inverse, a, under(before, a, b), b)
+            }
+            Rule::Of(f, a) => Lanes::Scale(before.slope(f, register(a), register(out)), a),
+            Rule::Powi(a, n) => {
+                let power = before.power(register(a), n - 1);
+                let power = before.local(power);
+                Lanes::Scale(before.local(Operation::Product(Operand::Constant(n as f64), power)), a)
+            }
+            Rule::Base(a, b) => Lanes::Scale(by_base(before, a, b), a),
+            Rule::Exponent(a, b) => Lanes::Scale(by_exponent(before, a, b), b),
+            Rule::Pow(a, b) => {
+                let base = by_base(before, a, b);
+                Lanes::Blend(base, a, by_exponent(before, a, b), b)
+            }
+            Rule::Switch(k, live_a, live_b) => {
+                return compile_switch(k, &switches[k as usize], (live_a, live_b), before);
+            }
+        })
+    }
+}
+
+/// [`switch`] as machine code.
+fn compile_switch(k: u32, switch: &Switch, live: (bool, bool), before: &mut Program) -> Code {
+    use SwitchKind::*;
+    let Switch { kind, a, b, .. } = *switch;
+    let mode = |before: &mut Program| before.local(Operation::Mode(k));
+    let negative = |before: &mut Program| {
+        let mode = mode(before);
+        before.local(Operation::Negative(mode))
+    };
+    match kind {
+        Sign | Step => Code::Always(Lanes::Zero),
+        Abs => Code::Always(Lanes::Scale(mode(before), a)),
+        Max => Code::Select(k, [Lanes::Copy(b), Lanes::Copy(b), Lanes::Copy(a)]),
+        Min => Code::Select(k, [Lanes::Copy(a), Lanes::Copy(a), Lanes::Copy(b)]),
+        Deadzone => {
+            let beyond = match live {
+                (true, false) => Lanes::Copy(a),
+                (false, true) => Lanes::Scale(negative(before), b),
+                _ => Lanes::Blend(Operand::Constant(1.0), a, negative(before), b),
+            };
+            Code::Select(k, [beyond, Lanes::Zero, beyond])
+        }
+        Saturate => {
+            let bound = Lanes::Scale(mode(before), b);
+            Code::Select(k, [bound, Lanes::Copy(a), bound])
         }
     }
 }
