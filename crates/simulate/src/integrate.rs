@@ -29,6 +29,7 @@
 //! the trajectory stays a smooth function of the delay (a jump would pass the stages of the method
 //! one by one as the delay changes).
 
+mod compiled;
 mod event;
 mod history;
 mod record;
@@ -38,11 +39,14 @@ mod stride;
 mod tableau;
 mod tangent;
 
+use std::sync::Arc;
+
 use greybox_model::Hold;
 use greybox_model::system::System;
 use greybox_model::tape::Tangents;
 use pulp::Arch;
 
+use self::compiled::Tail;
 use self::event::MOST_EVENTS;
 pub use self::history::{Carry, delayed_states, has_history};
 use self::history::{History, LaneMap};
@@ -154,7 +158,7 @@ pub struct Seeds {
     /// Indices into the state vector.
     pub initial: Vec<usize>,
     /// Exogenous directions.
-    pub signals: std::sync::Arc<SignalLanes>,
+    pub signals: Arc<SignalLanes>,
 }
 
 /// Directions that are signals: each adds a force, or a change of an input, to the trajectory.
@@ -377,15 +381,24 @@ struct Core<'a> {
     x: Vec<f64>,
     x1: Vec<f64>,
     reach: Vec<f64>,
-    dx: Aligned,
-    dk: Aligned,
+    /// Rows of tangents: of all registers, and behind them those of the state, of its rates at all stages, and of what the
+    /// mass matrix is solved for.
     d: Aligned,
-    tangents: Tangents,
-    b: Aligned,
+    at_dx: usize,
+    at_dk: usize,
+    at_b: usize,
+    /// The step of the tangents as machine code, where that is all there is to it.
+    step: Option<Arc<Vec<greybox_jit::Tangents>>>,
+    /// The trial step as machine code.
+    values: Option<Arc<greybox_jit::Values>>,
+    /// Whether that solves the equations too.
+    solves: bool,
+    tail: Tail,
+    tangents: Arc<Tangents>,
     /// Tangents of what holds the sticking switches.
     dl: Vec<f64>,
     gd: Vec<f64>,
-    along: Tangents,
+    along: Arc<Tangents>,
     h_next: f64,
     fresh: bool,
     /// Whether the delayed expressions remember this stretch's start.
@@ -400,7 +413,7 @@ struct Core<'a> {
     out_regs: Vec<f64>,
     out_modes: Vec<i8>,
     out_d: Aligned,
-    out_tangents: Tangents,
+    out_tangents: Arc<Tangents>,
     out_history: Vec<History>,
     result: Trajectory,
 }
@@ -419,8 +432,9 @@ impl<'a> Core<'a> {
             Method::Adaptive { rtol, atol } => (&DP5, 1, Some((rtol, atol))),
         };
         let tape = &system.rhs;
-        let mut modes = vec![1i8; tape.switches.len()];
-        let mut regs = vec![0.0; tape.registers()];
+        let tail = Tail::of(system, tableau);
+        let mut modes = vec![1i8; tail.modes()];
+        let mut regs = vec![0.0; tail.registers()];
         regs[system.parameters()..][..system.np].copy_from_slice(parameters);
         tape.prepare(&mut regs, &mut modes);
         let stage = |regs: &Vec<f64>| Stage {
@@ -441,6 +455,7 @@ impl<'a> Core<'a> {
                     *m = regs[r as usize];
                 }
                 small::factor(&mut st.lu, &mut st.pivots, nz);
+                tail.set_factors(st, &mut modes);
             }
         }
         // Which registers have tangents.
@@ -456,8 +471,11 @@ impl<'a> Core<'a> {
         for leaf in &mut leaf_active[system.delayed()..] {
             *leaf = seeded_states;
         }
-        let tangents = tape.tangents(&leaf_active);
-        let mut d = Aligned::zeros(tape.registers() * width);
+        let tangents = tape.compiled_tangents(&leaf_active, width);
+        let at_dx = tape.registers() * width;
+        let at_dk = at_dx + nx * width;
+        let at_b = at_dk + tableau.b.len() * nx * width;
+        let mut d = Aligned::zeros(at_b + 2 * nz * width);
         for (l, &p) in seeds.parameters.iter().enumerate() {
             d[(system.parameters() + p) * width + l] = 1.0;
         }
@@ -466,7 +484,7 @@ impl<'a> Core<'a> {
         }
         let mut gleaf = vec![true; tape.leaves()];
         gleaf[system.parameters()..system.parameters() + system.np].fill(false);
-        let along = tape.tangents(&gleaf);
+        let along = tape.compiled_tangents(&gleaf, 1);
 
         let out = &system.output;
         let mut out_regs = vec![0.0; out.registers()];
@@ -475,7 +493,7 @@ impl<'a> Core<'a> {
         out.prepare(&mut out_regs, &mut out_modes);
         let mut out_leaf_active = vec![seeded_states; out.leaves()];
         out_leaf_active[System::TIME] = false;
-        let out_tangents = out.tangents(&out_leaf_active);
+        let out_tangents = out.compiled_tangents(&out_leaf_active, width);
         let mut out_d = Aligned::zeros(out.registers() * width);
         for (l, &p) in seeds.parameters.iter().enumerate() {
             out_d[(system.parameters() + p) * width + l] = 1.0;
@@ -483,9 +501,8 @@ impl<'a> Core<'a> {
         if lanes > 0 {
             out.prepare_tangent(&out_tangents, &out_regs, &out_modes, width, &mut out_d);
         }
-        let mut dx = Aligned::zeros(nx * width);
         for (l, &i) in seeds.initial.iter().enumerate() {
-            dx[i * width + seeds.parameters.len() + l] = 1.0;
+            d[at_dx + i * width + seeds.parameters.len() + l] = 1.0;
         }
         // A state delay shorter than the step would read the future: shorten the steps.
         let mut substeps = substeps;
@@ -504,6 +521,13 @@ impl<'a> Core<'a> {
         for j in 0..nz {
             source[system.offsets[j] + system.orders[j] - 1] = system.highest() + j;
         }
+        let solves = tail.solves(system) && env.forces.is_empty();
+        let values = tail.values(system, tableau, &source, solves);
+        let moves = !seeds.signals.inputs.is_empty() || !seeds.signals.force.is_empty();
+        let step = match lanes > 0 && !moves {
+            true => tail.step(system, (&leaf_active, width), tableau, &tangents, &source),
+            false => None,
+        };
         Core {
             arch: Arch::new(),
             system,
@@ -514,7 +538,7 @@ impl<'a> Core<'a> {
             tolerance,
             lanes,
             width,
-            rates: Rates::new(nx, stages.len()),
+            rates: Rates::new(nx, stages.len(), tail.shared()),
             pieces: env.inputs.iter().map(|u| u.piece(s)).collect(),
             mid: s,
             long: Long::new(if can_stride(system) { method.stride() } else { 1 }),
@@ -528,11 +552,15 @@ impl<'a> Core<'a> {
             x: x0.to_vec(),
             x1: vec![0.0; nx],
             reach: x0.iter().map(|v| v.abs()).collect(),
-            dx,
-            dk: Aligned::zeros(tableau.b.len() * nx * width),
             d,
+            at_dx,
+            at_dk,
+            at_b,
+            step,
+            values,
+            solves,
+            tail,
             tangents,
-            b: Aligned::zeros(nz * width),
             dl: Vec::new(),
             gd: Vec::new(),
             along,
@@ -559,7 +587,7 @@ impl<'a> Core<'a> {
         let map = LaneMap::new(before, self.seeds);
         for &i in carried {
             let row = map.apply(&before.dx[i * map.from..(i + 1) * map.from], 1);
-            self.dx[i * self.width..][..self.lanes].copy_from_slice(&row);
+            self.d[self.at_dx..][i * self.width..][..self.lanes].copy_from_slice(&row);
         }
         for (reach, old) in self.reach.iter_mut().zip(&before.reach) {
             *reach = reach.max(*old);
@@ -576,7 +604,8 @@ impl<'a> Core<'a> {
         let (x, dx) = if (self.lost || trajectory.diverged.is_some()) && n > 0 {
             ((0..nx).map(|i| trajectory.x[i * n + n - 1]).collect(), vec![0.0; nx * lanes])
         } else {
-            let rows = self.dx.chunks_exact(self.width.max(1)).flat_map(|row| &row[..lanes]);
+            let rows =
+                self.d[self.at_dx..self.at_dk].chunks_exact(self.width.max(1)).flat_map(|row| &row[..lanes]);
             (self.x, rows.copied().collect())
         };
         let keep = |histories: &[History], taus: Vec<f64>| {
@@ -725,7 +754,7 @@ impl<'a> Core<'a> {
             let jump = before[i] - self.rates.at(0, i);
             if jump != 0.0 {
                 for l in 0..self.width {
-                    self.dx[i * self.width + l] += jump * self.d[tau * self.width + l];
+                    self.d[self.at_dx + i * self.width + l] += jump * self.d[tau * self.width + l];
                 }
             }
         }
@@ -734,6 +763,13 @@ impl<'a> Core<'a> {
 
     /// One trial step of length `h` from (s, x), stage 0 evaluated there; the result in `x1`, and with `end` evaluated there.
     fn trial(&mut self, h: f64, end: bool) {
+        if self.sticking.is_empty()
+            && let Some(values) = self.values.take()
+        {
+            self.compiled_trial(&values, h, end);
+            self.values = Some(values);
+            return;
+        }
         let nx = self.system.nx;
         let tableau = self.tableau;
         let mid = self.s + 0.5 * h;

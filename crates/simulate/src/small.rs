@@ -89,31 +89,23 @@ fn solve_one_of(a: &[f64], pivots: &[usize], n: usize, b: &mut [f64]) {
     }
     for k in 0..n {
         for i in k + 1..n {
-            let m = a[i * n + k];
-            if m != 0.0 {
-                b[i] -= m * b[k];
-            }
+            b[i] -= a[i * n + k] * b[k];
         }
     }
     for k in (0..n).rev() {
         b[k] *= a[k * n + k];
         for i in 0..k {
-            let m = a[i * n + k];
-            if m != 0.0 {
-                b[i] -= m * b[k];
-            }
+            b[i] -= a[i * n + k] * b[k];
         }
     }
 }
 
-/// row − m·known, where m is not zero.
+/// row − m·known.
 #[inline(always)]
 fn less(row: &mut [f64], m: f64, known: &[f64]) {
-    if m != 0.0 {
-        let known = &known[..row.len()];
-        for l in 0..row.len() {
-            row[l] -= m * known[l];
-        }
+    let known = &known[..row.len()];
+    for l in 0..row.len() {
+        row[l] -= m * known[l];
     }
 }
 

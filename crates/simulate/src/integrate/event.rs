@@ -232,7 +232,7 @@ impl Core<'_> {
                 let jump = before[i] - self.rates.at(0, i);
                 if jump != 0.0 {
                     for l in 0..lanes {
-                        self.dx[i * width + l] += jump * dte[l];
+                        self.d[self.at_dx + i * width + l] += jump * dte[l];
                     }
                 }
             }

@@ -54,7 +54,8 @@ impl Core<'_> {
             if lanes > 0 {
                 self.rate_here();
                 for (r, &to) in self.source.iter().enumerate().filter(|s| highest.contains(s.1)) {
-                    self.out_d[to * width..][..width].copy_from_slice(&self.dk[r * width..][..width]);
+                    self.out_d[to * width..][..width]
+                        .copy_from_slice(&self.d[self.at_dk + r * width..][..width]);
                 }
             }
         }
@@ -65,7 +66,8 @@ impl Core<'_> {
             self.out_regs[system.inputs() + i] = u.at(self.s, inside).0;
         }
         if lanes > 0 {
-            self.out_d[System::STATES * width..][..nx * width].copy_from_slice(&self.dx);
+            self.out_d[System::STATES * width..][..nx * width]
+                .copy_from_slice(&self.d[self.at_dx..self.at_dk]);
             let first = self.seeds.parameters.len() + self.seeds.initial.len();
             let count = self.seeds.signals.lanes;
             for (i, change) in &self.seeds.signals.inputs {
@@ -118,7 +120,7 @@ impl Core<'_> {
             let slope = match state_leaf(system, delay.arg_leaf) {
                 Some(x) => {
                     if first {
-                        history.rate = self.dk[x * width..][..lanes].to_vec();
+                        history.rate = self.d[self.at_dk + x * width..][..lanes].to_vec();
                     }
                     self.rates.at(0, x)
                 }

@@ -48,14 +48,15 @@ impl Held {
 
 /// ẋ of every stage.
 pub(super) struct Rates {
-    /// Entry by entry, the stages of one side by side.
+    /// Entry by entry, the stages of one side by side; behind them what the programs of a step share ([`super::compiled`]).
     pub(super) f: Vec<f64>,
     pub(super) stages: usize,
+    entries: usize,
 }
 
 impl Rates {
-    pub(super) fn new(entries: usize, stages: usize) -> Rates {
-        Rates { f: vec![0.0; entries * stages], stages }
+    pub(super) fn new(entries: usize, stages: usize, shared: usize) -> Rates {
+        Rates { f: vec![0.0; shared], stages, entries }
     }
 
     pub(super) fn at(&self, stage: usize, entry: usize) -> f64 {
@@ -67,18 +68,20 @@ impl Rates {
     }
 
     pub(super) fn stage(&self, stage: usize) -> impl Iterator<Item = f64> {
-        self.f.iter().skip(stage).step_by(self.stages).copied()
+        self.f[..self.entries * self.stages].iter().skip(stage).step_by(self.stages).copied()
     }
 
     pub(super) fn swap(&mut self, a: usize, b: usize) {
-        self.f.chunks_exact_mut(self.stages).for_each(|entry| entry.swap(a, b));
+        self.f[..self.entries * self.stages].chunks_exact_mut(self.stages).for_each(|entry| entry.swap(a, b));
     }
 
-    /// out = x + h Σ weight · f over the stages that have a weight.
+    /// out = x + h Σ weight · f over the stages that have a weight, in their order.
     #[inline(always)]
     pub(super) fn along(&self, out: &mut [f64], x: &[f64], weights: &[f64], h: f64) {
         for ((out, x), f) in out.iter_mut().zip(x).zip(self.f.chunks_exact(self.stages)) {
-            *out = x + h * dot(weights, f);
+            let mut terms = weights.iter().zip(f).filter(|(w, _)| **w != 0.0).map(|(w, f)| w * f);
+            let first = terms.next().unwrap_or(0.0);
+            *out = x + h * terms.fold(first, |sum, term| sum + term);
         }
     }
 }
@@ -105,6 +108,25 @@ impl Core<'_> {
     /// Evaluates the right-hand side at the state that stands in the registers of stage `b`.
     #[inline]
     pub(super) fn eval_stage(&mut self, b: usize, s: f64, mid: f64) {
+        self.set_instant(b, s, mid);
+        if !self.system.rhs.delays.is_empty() {
+            self.eval_delays(b, s, mid);
+        }
+        if !self.sticking.is_empty() {
+            self.eval_sticking(b);
+        } else if b == 0
+            && let Some(values) = self.values.take()
+        {
+            self.compiled_start(&values);
+            self.values = Some(values);
+        } else {
+            self.eval_free(b);
+        }
+    }
+
+    /// Time and inputs of stage `b`.
+    #[inline(always)]
+    pub(super) fn set_instant(&mut self, b: usize, s: f64, mid: f64) {
         let system = self.system;
         if mid != self.mid && !self.long.active {
             self.mid = mid;
@@ -120,14 +142,6 @@ impl Core<'_> {
             let (v, slope) = piece.at(s);
             st.regs[system.inputs() + i] = v;
             st.slopes[i] = slope;
-        }
-        if !system.rhs.delays.is_empty() {
-            self.eval_delays(b, s, mid);
-        }
-        if self.sticking.is_empty() {
-            self.eval_free(b);
-        } else {
-            self.eval_sticking(b);
         }
     }
 
@@ -167,7 +181,7 @@ impl Core<'_> {
 
     /// Highest derivatives (into their registers) and ẋ of stage `b`, whose equations are evaluated.
     #[inline(always)]
-    fn solve(&mut self, b: usize) {
+    pub(super) fn solve(&mut self, b: usize) {
         let system = self.system;
         let nz = system.nz;
         let st = &mut self.stages[b];

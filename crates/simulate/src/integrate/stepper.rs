@@ -87,13 +87,13 @@ impl Stepper<'_> {
 
     /// The tangents of an entry of the state along all lanes.
     pub fn tangents(&self, entry: usize) -> &[f64] {
-        &self.core.dx[entry * self.core.width..][..self.core.lanes]
+        &self.core.d[self.core.at_dx..][entry * self.core.width..][..self.core.lanes]
     }
 
     /// The tangents of an entry of the state, to be changed.
     pub fn tangents_mut(&mut self, entry: usize) -> &mut [f64] {
         self.moved = true;
-        &mut self.core.dx[entry * self.core.width..][..self.core.lanes]
+        &mut self.core.d[self.core.at_dx..][entry * self.core.width..][..self.core.lanes]
     }
 
     /// The lanes of the initial states begin anew: each is the derivative by its entry of the state as it is now. What was
@@ -103,7 +103,7 @@ impl Stepper<'_> {
         let (lanes, width) = (self.core.lanes, self.core.width);
         for i in 0..self.core.system.nx {
             for (l, entry) in entries.iter().enumerate() {
-                self.core.dx[i * width + first + l] = f64::from(u8::from(i == *entry));
+                self.core.d[self.core.at_dx + i * width + first + l] = f64::from(u8::from(i == *entry));
             }
         }
         for (history, known) in self.core.rhs_history.iter_mut().zip(&mut self.known) {

@@ -221,7 +221,7 @@ impl Core<'_> {
     pub(super) fn keep_start(&mut self) {
         if self.long.active && self.lanes > 0 {
             self.long.start.clear();
-            self.long.start.extend_from_slice(&self.dx);
+            self.long.start.extend_from_slice(&self.d[self.at_dx..self.at_dk]);
         }
     }
 
@@ -234,14 +234,14 @@ impl Core<'_> {
         let (end, dt) = (self.s, self.env.dt);
         let mut at = std::mem::take(&mut self.long.at);
         at.x.resize(self.x.len(), 0.0);
-        at.dx.resize(self.dx.len(), 0.0);
+        at.dx.resize(self.at_dk - self.at_dx, 0.0);
         // (The sample at the end is recorded by what follows the step.)
         while self.long.next < self.long.last && self.long.next as f64 * dt <= end {
             let s = self.long.next as f64 * dt;
             let b = weights(((s - (end - h)) / h).clamp(0.0, 1.0));
             self.rates.along(&mut at.x, &self.x1, &b, h);
             if self.lanes > 0 {
-                tangents_along(&mut at.dx, &self.long.start, &self.dk, &b, h);
+                tangents_along(&mut at.dx, &self.long.start, &self.d[self.at_dk..], &b, h);
             }
             self.exchange(&mut at);
             self.s = s;
@@ -255,7 +255,7 @@ impl Core<'_> {
 
     fn exchange(&mut self, at: &mut State) {
         std::mem::swap(&mut self.x, &mut at.x);
-        self.dx.swap_with_slice(&mut at.dx);
+        self.d[self.at_dx..self.at_dk].swap_with_slice(&mut at.dx);
     }
 }
 

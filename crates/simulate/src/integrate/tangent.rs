@@ -81,7 +81,7 @@ impl Core<'_> {
     /// Tangents of all registers at stage `b` for the tangents of the state at the step's start.
     pub(super) fn tangent_here(&mut self, b: usize) {
         let width = self.width;
-        self.d[System::STATES * width..][..self.dx.len()].copy_from_slice(&self.dx);
+        self.d.copy_within(self.at_dx..self.at_dk, System::STATES * width);
         self.tangent_at(b, width);
     }
 
@@ -136,7 +136,7 @@ impl Core<'_> {
         }
     }
 
-    /// Derivative of stage `b`'s ẋ along the lanes into `self.dk[b]`, for the state tangents that stand in `self.d`.
+    /// Derivative of stage `b`'s ẋ along the lanes into its rows, for the state tangents that stand in `self.d`.
     #[inline(always)]
     fn tangent_stage(&mut self, b: usize, width: usize) {
         self.tangent_at(b, width);
@@ -144,9 +144,11 @@ impl Core<'_> {
         let (nx, nz) = (system.nx, system.nz);
         let outputs = &system.rhs.outputs;
         let st = &self.stages[b];
+        let (d, rest) = self.d.split_at_mut(self.at_dx);
+        let rows = &mut rest[self.at_b - self.at_dx..];
         for i in 0..nz {
-            let row = &mut self.b[i * width..][..width];
-            let h = &self.d[outputs[nz * nz + i] as usize * width..][..width];
+            let row = &mut rows[i * width..][..width];
+            let h = &d[outputs[nz * nz + i] as usize * width..][..width];
             for (r, h) in row.iter_mut().zip(h) {
                 *r = -h;
             }
@@ -154,7 +156,7 @@ impl Core<'_> {
                 let reg = outputs[i * nz + j];
                 if self.tangents.is_active(reg) {
                     let z = st.regs[system.highest() + j];
-                    for (r, m) in row.iter_mut().zip(&self.d[reg as usize * width..][..width]) {
+                    for (r, m) in row.iter_mut().zip(&d[reg as usize * width..][..width]) {
                         *r -= m * z;
                     }
                 }
@@ -164,12 +166,14 @@ impl Core<'_> {
             self.tangent_forces(b);
         }
         let st = &self.stages[b];
-        small::solve_rows(&st.lu, &st.pivots, nz, &mut self.b, width);
-        let dk = &mut self.dk[b * nx * width..][..nx * width];
+        small::solve_rows(&st.lu, &st.pivots, nz, &mut self.d[self.at_b..], width);
+        let (known, solved) = self.d.split_at_mut(self.at_b);
+        let (d, rest) = known.split_at_mut(self.at_dx);
+        let dk = &mut rest[self.at_dk - self.at_dx..][b * nx * width..][..nx * width];
         for (dk, &source) in dk.chunks_exact_mut(width).zip(&self.source) {
             let from = match source.checked_sub(system.highest()) {
-                Some(j) => &self.b[j * width..][..width],
-                None => &self.d[source * width..][..width],
+                Some(j) => &solved[j * width..][..width],
+                None => &d[source * width..][..width],
             };
             dk.copy_from_slice(from);
         }
@@ -187,7 +191,7 @@ impl Core<'_> {
         if self.long.active {
             for i in 0..self.system.nz {
                 let weights = &signals.weights[i * count..][..count];
-                let row = &mut self.b[i * self.width + first..][..count];
+                let row = &mut self.d[self.at_b + i * self.width + first..][..count];
                 self.long.take_lane_forces(weights, st.s, self.env.dt, row);
             }
             return;
@@ -197,7 +201,7 @@ impl Core<'_> {
         let c = &signals.force[(k + 1).min(self.env.len - 1) * count..][..count];
         for i in 0..self.system.nz {
             let weights = &signals.weights[i * count..][..count];
-            let row = &mut self.b[i * self.width + first..][..count];
+            let row = &mut self.d[self.at_b + i * self.width + first..][..count];
             for l in 0..count {
                 row[l] -= weights[l] * (a[l] + w * (c[l] - a[l]));
             }
@@ -205,10 +209,10 @@ impl Core<'_> {
     }
 
     /// dλ keeps the derivative of ġ zero: ∇g·(dẋ + Σ pull dλ) = 0.
-    fn tangent_sticking(&mut self, b: usize) {
+    pub(super) fn tangent_sticking(&mut self, b: usize) {
         let (nx, width) = (self.system.nx, self.width);
         let held = &self.stages[b].held;
-        let dk = &mut self.dk[b * nx * width..][..nx * width];
+        let dk = &mut self.d[self.at_dk..][b * nx * width..][..nx * width];
         let m = self.sticking.len();
         let dl = &mut self.dl;
         dl.clear();
@@ -236,15 +240,20 @@ impl Core<'_> {
         }
     }
 
-    /// Derivatives along the lanes of ẋ at the step's start, stage 0, into `self.dk[0]`.
+    /// Derivatives along the lanes of ẋ at the step's start, stage 0, into its rows.
     pub(super) fn rate_here(&mut self) {
         let width = self.width;
-        self.d[System::STATES * width..][..self.dx.len()].copy_from_slice(&self.dx);
+        self.d.copy_within(self.at_dx..self.at_dk, System::STATES * width);
         self.tangent_stage(0, width);
     }
 
     /// The sensitivities' step that belongs to the trial step of length `h`.
     pub(super) fn tangent_step(&mut self, h: f64) {
+        if let Some(step) = self.step.take() {
+            self.compiled_step(&step, h);
+            self.step = Some(step);
+            return;
+        }
         self.arch.dispatch(TangentStep { core: self, h });
     }
 
@@ -253,12 +262,15 @@ impl Core<'_> {
         let n = self.system.nx * width;
         let tableau = self.tableau;
         for i in 0..tableau.b.len() {
-            let rows = &mut self.d[System::STATES * width..][..n];
-            tangents_along(rows, &self.dx[..n], &self.dk, tableau.a[i], h);
+            let (d, rest) = self.d.split_at_mut(self.at_dx);
+            let (dx, dk) = rest.split_at(n);
+            tangents_along(&mut d[System::STATES * width..][..n], dx, dk, tableau.a[i], h);
             self.tangent_stage(i, width);
         }
-        let rows = &mut self.d[System::STATES * width..][..n];
-        tangents_along(rows, &self.dx[..n], &self.dk, tableau.b, h);
-        self.dx.copy_from_slice(rows);
+        let (d, rest) = self.d.split_at_mut(self.at_dx);
+        let (dx, dk) = rest.split_at_mut(n);
+        let rows = &mut d[System::STATES * width..][..n];
+        tangents_along(rows, dx, dk, tableau.b, h);
+        dx.copy_from_slice(rows);
     }
 }

@@ -1,0 +1,364 @@
+//! A step as machine code: one program for each stage, and one for the step's end; for the state, and for its sensitivities.
+//!
+//! A program does what [`stage`](super::stage) and [`tangent`](super::tangent) do, to the last bit: the state at the stage, all registers,
+//! the equations, solved for the highest derivatives. It finds the numbers that are no registers of the tape behind them, and what
+//! the stages share behind the rates.
+
+use std::sync::Arc;
+
+use greybox_jit::{Operand, Operation, Operations, Row, Rule, Rules, Tangents as Program, Values};
+use greybox_model::system::System;
+use greybox_model::tape::{Reg, Tangents};
+
+use super::Core;
+use super::stage::Stage;
+use super::tableau::Tableau;
+
+/// Most equations whose mass matrix a program solves.
+const MOST_EQUATIONS: usize = 2;
+
+/// What stands behind the registers of the tape, their modes and their rows.
+#[derive(Debug, Clone, Copy)]
+pub(super) struct Tail {
+    registers: usize,
+    switches: usize,
+    nx: usize,
+    nz: usize,
+    stages: usize,
+}
+
+impl Tail {
+    pub(super) fn of(system: &System, tableau: &Tableau) -> Tail {
+        Tail {
+            registers: system.rhs.registers(),
+            switches: system.rhs.switches.len(),
+            nx: system.nx,
+            nz: system.nz,
+            stages: tableau.b.len(),
+        }
+    }
+
+    /// Registers of a stage: the factors of the mass matrix and the weights of the stages, times the step.
+    pub(super) fn registers(&self) -> usize {
+        self.weight(self.stages)
+    }
+
+    /// Modes: whether the rows of the mass matrix change places.
+    pub(super) fn modes(&self) -> usize {
+        self.switches + 1
+    }
+
+    fn factor(&self, i: usize) -> usize {
+        self.registers + i
+    }
+
+    fn weight(&self, j: usize) -> usize {
+        self.registers + self.nz * self.nz + j
+    }
+
+    /// The row of an entry of the state, of its rate at a stage, of an equation, of what is solved.
+    fn dx(&self, r: usize) -> Reg {
+        (self.registers + r) as Reg
+    }
+
+    fn dk(&self, stage: usize, r: usize) -> Reg {
+        (self.registers + (1 + stage) * self.nx + r) as Reg
+    }
+
+    fn equation(&self, i: usize) -> Reg {
+        (self.registers + (1 + self.stages) * self.nx + i) as Reg
+    }
+
+    fn solved(&self, i: usize) -> Reg {
+        self.equation(self.nz + i)
+    }
+
+    /// What the stages share: the rates of all of them and of the step's end, the state at both ends, the length of the step.
+    pub(super) fn shared(&self) -> usize {
+        self.length() + 1
+    }
+
+    fn rate(&self, stage: usize, r: usize) -> usize {
+        r * (self.stages + 1) + stage
+    }
+
+    pub(super) fn x(&self) -> usize {
+        self.nx * (self.stages + 1)
+    }
+
+    pub(super) fn x1(&self) -> usize {
+        self.x() + self.nx
+    }
+
+    fn length(&self) -> usize {
+        self.x1() + self.nx
+    }
+
+    /// Whether programs can solve the equations.
+    pub(super) fn solves(&self, system: &System) -> bool {
+        system.mass_is_fixed && self.nz <= MOST_EQUATIONS
+    }
+
+    /// The factors of the mass matrix to where programs find them.
+    pub(super) fn set_factors(&self, stage: &mut Stage, modes: &mut [i8]) {
+        stage.regs[self.factor(0)..self.weight(0)].copy_from_slice(&stage.lu);
+        modes[self.switches] = i8::from(self.nz > 1 && stage.pivots[0] != 0);
+    }
+
+    /// The programs of a trial step: the stages behind the first, the state at the end, and the rates there and at the start. `None` where
+    /// expressions are delayed, or nothing is compiled.
+    pub(super) fn values(
+        &self,
+        system: &System,
+        tableau: &Tableau,
+        source: &[usize],
+        solves: bool,
+    ) -> Option<Arc<Values>> {
+        if !system.rhs.delays.is_empty() {
+            return None;
+        }
+        let end = self.stages;
+        let rates = |program: &mut Operations, stage: usize| {
+            if solves {
+                self.highest(program, system);
+                let to = |r: usize| Operand::Shared(self.rate(stage, r) as Reg);
+                program.extend(source.iter().enumerate().map(|(r, &from)| (to(r), same(from))));
+            }
+        };
+        let stage = |i: usize| {
+            move |body: &Operations| {
+                let mut program =
+                    self.state(tableau.a[i], |r| Operand::Register((System::STATES + r) as Reg));
+                program.extend(body);
+                rates(&mut program, i);
+                program
+            }
+        };
+        let stages: Vec<_> = (1..self.stages).map(stage).collect();
+        let state = |_: &Operations| self.state(tableau.b, |r| Operand::Shared((self.x1() + r) as Reg));
+        let at = |stage: usize| {
+            move |body: &Operations| {
+                let mut program = body.clone();
+                rates(&mut program, stage);
+                program
+            }
+        };
+        let (last, first) = (at(end), at(0));
+        let mut frames: Vec<&dyn Fn(&Operations) -> Operations> = Vec::new();
+        frames.extend(stages.iter().map(|stage| stage as &dyn Fn(&Operations) -> Operations));
+        frames.push(&state);
+        frames.push(&last);
+        frames.push(&first);
+        // (Methods differ by their number of stages.)
+        system.rhs.compiled_values(2 * self.stages + usize::from(solves), &frames)
+    }
+
+    /// x + h Σ wⱼ fⱼ over the stages that have a weight, in their order.
+    fn state(&self, weights: &[f64], to: impl Fn(usize) -> Operand) -> Operations {
+        let (sum, term) = (Operand::Local(0), Operand::Local(1));
+        let mut program = Vec::new();
+        for r in 0..self.nx {
+            let mut so_far = None;
+            for (j, weight) in weights.iter().enumerate().filter(|w| *w.1 != 0.0) {
+                let rate = Operand::Shared(self.rate(j, r) as Reg);
+                let product = Operation::Product(Operand::Constant(*weight), rate);
+                match so_far {
+                    None => program.push((sum, product)),
+                    Some(so_far) => {
+                        program.push((term, product));
+                        program.push((sum, Operation::Sum(so_far, term)));
+                    }
+                }
+                so_far = Some(sum);
+            }
+            let length = Operand::Shared(self.length() as Reg);
+            let so_far = so_far.unwrap_or(Operand::Constant(0.0));
+            program.push((term, Operation::Product(length, so_far)));
+            program.push((to(r), Operation::Sum(Operand::Shared((self.x() + r) as Reg), term)));
+        }
+        program
+    }
+
+    /// The highest derivatives: M z = −h, by the factors of M.
+    fn highest(&self, program: &mut Operations, system: &System) {
+        let nz = self.nz;
+        let register = |r: usize| Operand::Register(r as Reg);
+        let z = |i: usize| register(system.highest() + i);
+        let factor = |i: usize| register(self.factor(i));
+        let side = |i: usize| Operation::Negative(register(system.rhs.outputs[nz * nz + i] as usize));
+        if nz == 1 {
+            program.push((z(0), side(0)));
+            program.push((z(0), Operation::Product(z(0), factor(0))));
+            return;
+        }
+        let [first, second, term] = [0, 1, 2].map(Operand::Local);
+        let change = self.switches as u32;
+        program.push((first, side(0)));
+        program.push((second, side(1)));
+        program.push((z(0), Operation::Select(change, [first, first, second])));
+        program.push((z(1), Operation::Select(change, [second, second, first])));
+        program.push((term, Operation::Product(factor(2), z(0))));
+        program.push((z(1), Operation::Difference(z(1), term)));
+        program.push((z(1), Operation::Product(z(1), factor(3))));
+        program.push((term, Operation::Product(factor(1), z(1))));
+        program.push((z(0), Operation::Difference(z(0), term)));
+        program.push((z(0), Operation::Product(z(0), factor(0))));
+    }
+
+    /// The programs for these leaves; `None` where something else is to be done too, or nothing is compiled.
+    pub(super) fn step(
+        &self,
+        system: &System,
+        (leaves, lanes): (&[bool], usize),
+        tableau: &Tableau,
+        tangents: &Tangents,
+        source: &[usize],
+    ) -> Option<Arc<Vec<Program>>> {
+        if !system.rhs.delays.is_empty() || self.nz > MOST_EQUATIONS {
+            return None;
+        }
+        let stage = |i: usize| {
+            move |rules: &Rules| {
+                let mut all = self.state_at(tableau.a[i], |r| (System::STATES + r) as Reg);
+                all.extend(rules);
+                all.extend(self.rates(i, system, tangents, source));
+                all
+            }
+        };
+        let stages: Vec<_> = (0..self.stages).map(stage).collect();
+        let end = |_: &Rules| self.state_at(tableau.b, |r| self.dx(r));
+        let mut frames: Vec<&dyn Fn(&Rules) -> Rules> = Vec::new();
+        frames.extend(stages.iter().map(|stage| stage as &dyn Fn(&Rules) -> Rules));
+        frames.push(&end);
+        // (Methods differ by their number of stages.)
+        system.rhs.compiled_programs((leaves, lanes, self.stages), &frames)
+    }
+
+    /// dx + Σ h wⱼ dkⱼ over the stages that have a weight.
+    fn state_at(&self, weights: &[f64], to: impl Fn(usize) -> Reg) -> Rules {
+        let mut rules = Vec::new();
+        for r in 0..self.nx {
+            let mut from = self.dx(r);
+            for (j, _) in weights.iter().enumerate().filter(|w| *w.1 != 0.0) {
+                let weight = Operand::Register(self.weight(j) as Reg);
+                rules.push((to(r), Rule::Always(Row::More(from, weight, self.dk(j, r)))));
+                from = to(r);
+            }
+            if from == self.dx(r) && from != to(r) {
+                rules.push((to(r), Rule::Always(Row::Copy(from))));
+            }
+        }
+        rules
+    }
+
+    /// The derivative of the stage's ẋ: of the equations M z + h = 0, solved for that of z.
+    fn rates(&self, stage: usize, system: &System, tangents: &Tangents, source: &[usize]) -> Rules {
+        let nz = self.nz;
+        let outputs = &system.rhs.outputs;
+        let mut rules = Vec::new();
+        let mut push = |to: Reg, row: Row| rules.push((to, Rule::Always(row)));
+        for i in 0..nz {
+            let row = self.equation(i);
+            push(row, Row::Scale(Operand::Constant(-1.0), outputs[nz * nz + i]));
+            for j in 0..nz {
+                let mass = outputs[i * nz + j];
+                if tangents.is_active(mass) {
+                    let z = Operand::Register((system.highest() + j) as Reg);
+                    push(row, Row::Less(row, z, mass));
+                }
+            }
+        }
+        let factor = |i: usize| Operand::Register(self.factor(i) as Reg);
+        // What is solved for highest derivative j is the rate of this entry.
+        let rate = |j: usize| source.iter().position(|s| *s == system.highest() + j);
+        let rate = |j: usize| rate(j).map_or(self.solved(j), |r| self.dk(stage, r));
+        match nz {
+            1 => push(rate(0), Row::Scale(factor(0), self.equation(0))),
+            _ => {
+                let (first, second) = (Row::Copy(self.equation(0)), Row::Copy(self.equation(1)));
+                let change = self.switches as u32;
+                let (top, below) = (self.solved(0), self.solved(1));
+                rules.push((top, Rule::Select(change, [first, first, second])));
+                rules.push((below, Rule::Select(change, [second, second, first])));
+                let mut push = |to: Reg, row: Row| rules.push((to, Rule::Always(row)));
+                push(below, Row::Less(below, factor(2), top));
+                push(rate(1), Row::Scale(factor(3), below));
+                push(top, Row::Less(top, factor(1), rate(1)));
+                push(rate(0), Row::Scale(factor(0), top));
+            }
+        }
+        for (r, &from) in source.iter().enumerate().filter(|s| *s.1 < system.highest()) {
+            rules.push((self.dk(stage, r), Rule::Always(Row::Copy(from as Reg))));
+        }
+        rules
+    }
+}
+
+/// A register, as it is.
+fn same(register: usize) -> Operation {
+    Operation::Product(Operand::Register(register as Reg), Operand::Constant(1.0))
+}
+
+impl Core<'_> {
+    /// A trial step of length `h` by its programs, where nothing sticks.
+    pub(super) fn compiled_trial(&mut self, values: &Values, h: f64, end: bool) {
+        let (tail, tableau, nx) = (self.tail, self.tableau, self.system.nx);
+        let mid = self.s + 0.5 * h;
+        self.rates.f[tail.x()..tail.x1()].copy_from_slice(&self.x);
+        self.rates.f[tail.length()] = h;
+        for i in 1..tail.stages {
+            self.set_instant(i, self.s + tableau.c[i] * h, mid);
+            self.compiled_stage(values, i - 1, i);
+        }
+        let last = tail.stages;
+        let st = &mut self.stages[last];
+        values.run(last - 1, &mut st.regs, &self.modes, &st.lambda, &mut self.rates.f);
+        self.x1.copy_from_slice(&self.rates.f[tail.x1()..][..nx]);
+        if end || !self.live.is_empty() {
+            st.regs[System::STATES..][..nx].copy_from_slice(&self.x1);
+        }
+        if end {
+            self.set_instant(last, self.s + h, mid);
+            self.compiled_stage(values, last, last);
+        }
+    }
+
+    /// The rates at the start of a step, at the state that stands in its registers.
+    #[inline]
+    pub(super) fn compiled_start(&mut self, values: &Values) {
+        self.compiled_stage(values, self.tail.stages + 1, 0);
+    }
+
+    /// Program `which` at stage `b`, and the equations solved.
+    #[inline(always)]
+    fn compiled_stage(&mut self, values: &Values, which: usize, b: usize) {
+        let st = &mut self.stages[b];
+        values.run(which, &mut st.regs, &self.modes, &st.lambda, &mut self.rates.f);
+        if self.solves {
+            self.result.evaluations += 1;
+        } else {
+            self.solve(b);
+        }
+    }
+
+    /// The sensitivities' step that belongs to the trial step of length `h`, by its programs.
+    pub(super) fn compiled_step(&mut self, step: &[Program], h: f64) {
+        let (tail, tableau) = (self.tail, self.tableau);
+        for i in 0..tail.stages {
+            let st = &mut self.stages[i];
+            tail.set_factors(st, &mut self.modes);
+            for (to, weight) in st.regs[tail.weight(0)..].iter_mut().zip(tableau.a[i]) {
+                *to = h * weight;
+            }
+            step[i].run(&st.regs, &self.modes, &mut self.d);
+            if !self.sticking.is_empty() && self.stages[i].held.ok {
+                self.tangent_sticking(i);
+            }
+        }
+        let st = &mut self.stages[0];
+        for (to, weight) in st.regs[tail.weight(0)..].iter_mut().zip(tableau.b) {
+            *to = h * weight;
+        }
+        step[tail.stages].run(&st.regs, &self.modes, &mut self.d);
+    }
+}
