@@ -90,7 +90,14 @@ pub(crate) fn rows() -> Vec<Row> {
             "4 000 samples with 8 sensitivities, one RK4 step each",
             "sample",
             Against::NOTHING,
-            sensitivities,
+            || sensitivities(false),
+        ),
+        Row::new(
+            "sensitivities_interpreted",
+            "4 000 samples with 8 sensitivities, one RK4 step each, interpreted",
+            "sample",
+            Against::NOTHING,
+            || sensitivities(true),
         ),
         Row::new(
             "calibration",
@@ -200,8 +207,10 @@ fn environment(force: &[f64]) -> Environment {
     Environment { start: 0.0, dt: 0.01, len: force.len(), inputs: vec![input], forces: vec![] }
 }
 
-fn sensitivities() -> Result<Case> {
+/// By machine code where there is a compiler, or by the interpreter.
+fn sensitivities(is_interpreted: bool) -> Result<Case> {
     let (_, system) = compiled(DRIVEN)?;
+    let system = if is_interpreted { system.interpreted() } else { system };
     let (force, _) = record()?;
     let environment = environment(&force);
     let seeds = Seeds { parameters: (0..6).collect(), initial: vec![0, 1], ..Seeds::default() };
