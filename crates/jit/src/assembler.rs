@@ -38,6 +38,10 @@ impl Width {
             Width::Eight => 8,
         }
     }
+
+    fn at_least_two(self) -> Width {
+        if self == Width::One { Width::Two } else { self }
+    }
 }
 
 /// The second source of an instruction.
@@ -100,11 +104,10 @@ struct Prefix {
     pp: u8,
     /// 1: 0F, 2: 0F38.
     map: u8,
-    w: u8,
 }
 
-const PACKED: Prefix = Prefix { pp: 1, map: 1, w: 0 };
-const SCALAR: Prefix = Prefix { pp: 3, map: 1, w: 0 };
+const PACKED: Prefix = Prefix { pp: 1, map: 1 };
+const SCALAR: Prefix = Prefix { pp: 3, map: 1 };
 
 impl Assembler {
     pub(crate) fn position(&self) -> usize {
@@ -188,7 +191,7 @@ impl Assembler {
             self.bytes(&[
                 0xC4,
                 r << 7 | 1 << 6 | b << 5 | prefix.map,
-                prefix.w << 7 | (!first & 15) << 3 | long << 2 | prefix.pp,
+                (!first & 15) << 3 | long << 2 | prefix.pp,
                 opcode,
             ]);
         }
@@ -238,7 +241,7 @@ impl Assembler {
     pub(crate) fn load(&mut self, width: Width, to: Vector, from: Source) {
         match from {
             // (vmovapd)
-            Source::Vector(_) => self.vector(PACKED, width.max_two(), 0x28, (to, 0, from), false),
+            Source::Vector(_) => self.vector(PACKED, width.at_least_two(), 0x28, (to, 0, from), false),
             _ => self.vector(Self::prefix(width), width, 0x10, (to, 0, from), false),
         }
     }
@@ -255,7 +258,7 @@ impl Assembler {
             Width::Two => self.vector(SCALAR, Width::Two, 0x12, (to, 0, from), false),
             // vbroadcastsd
             Width::Four | Width::Eight => {
-                self.vector(Prefix { pp: 1, map: 2, w: 0 }, width, 0x19, (to, 0, from), false);
+                self.vector(Prefix { pp: 1, map: 2 }, width, 0x19, (to, 0, from), false);
             }
         }
     }
@@ -339,11 +342,5 @@ impl Assembler {
     /// Returns, the upper halves of the vector registers cleared.
     pub(crate) fn end(&mut self) {
         self.bytes(&[0xC5, 0xF8, 0x77, 0xC3]);
-    }
-}
-
-impl Width {
-    fn max_two(self) -> Width {
-        if self == Width::One { Width::Two } else { self }
     }
 }

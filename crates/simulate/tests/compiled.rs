@@ -45,6 +45,16 @@ x = "saturate(x, a)"
 y = "y"
 "#;
 
+/// Two whose inertias are constants. (Here too rows change places.)
+const RIGID: &str = r#"
+[states]
+x = { unit = "m" }
+y = { unit = "m" }
+[equations]
+second = "m/5*x'' + m*y'' + c*y' + k*(y - x) + fc*sign(y') = 0"
+first = "m*x'' + m/5*y'' + drag*x'*abs(x') + k*x + k*(x - y) + fc*sign(x') = u"
+"#;
+
 /// Three, where a program does not solve the equations.
 const THREE: &str = r#"
 [states]
@@ -121,6 +131,7 @@ fn assert_same_simulation(machine: &str, fewest_events: usize) {
 fn machine_code_simulates_what_the_interpreter_does() {
     assert_same_simulation(ONE, 5);
     assert_same_simulation(TWO, 10);
+    assert_same_simulation(RIGID, 5);
     assert_same_simulation(THREE, 5);
     assert_same_simulation(DELAYED, 5);
 }

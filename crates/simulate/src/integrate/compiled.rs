@@ -14,8 +14,8 @@ use super::Core;
 use super::stage::Stage;
 use super::tableau::Tableau;
 
-/// Most equations whose mass matrix a program solves.
-const MOST_EQUATIONS: usize = 2;
+/// How many equations a program solves for the highest derivatives.
+const EQUATIONS: std::ops::RangeInclusive<usize> = 1..=2;
 
 /// What stands behind the registers of the tape, their modes and their rows.
 #[derive(Debug, Clone, Copy)]
@@ -56,19 +56,22 @@ impl Tail {
         self.registers + self.nz * self.nz + j
     }
 
-    /// The row of an entry of the state, of its rate at a stage, of an equation, of what is solved.
+    /// The row of an entry of the state.
     fn dx(&self, r: usize) -> Reg {
         (self.registers + r) as Reg
     }
 
+    /// The row of the rate of an entry of the state at a stage.
     fn dk(&self, stage: usize, r: usize) -> Reg {
         (self.registers + (1 + stage) * self.nx + r) as Reg
     }
 
+    /// The row of the right side of an equation M z = −h.
     fn equation(&self, i: usize) -> Reg {
         (self.registers + (1 + self.stages) * self.nx + i) as Reg
     }
 
+    /// The row in which it is solved.
     fn solved(&self, i: usize) -> Reg {
         self.equation(self.nz + i)
     }
@@ -78,6 +81,7 @@ impl Tail {
         self.length() + 1
     }
 
+    /// Where the rate of an entry at a stage stands among what is shared.
     fn rate(&self, stage: usize, r: usize) -> usize {
         r * (self.stages + 1) + stage
     }
@@ -96,7 +100,7 @@ impl Tail {
 
     /// Whether programs can solve the equations.
     pub(super) fn solves(&self, system: &System) -> bool {
-        system.mass_is_fixed && self.nz <= MOST_EQUATIONS
+        system.mass_is_fixed && EQUATIONS.contains(&self.nz)
     }
 
     /// The factors of the mass matrix to where programs find them.
@@ -214,7 +218,7 @@ impl Tail {
         tangents: &Tangents,
         source: &[usize],
     ) -> Option<Arc<Vec<Program>>> {
-        if !system.rhs.delays.is_empty() || self.nz > MOST_EQUATIONS {
+        if !system.rhs.delays.is_empty() || !EQUATIONS.contains(&self.nz) {
             return None;
         }
         let stage = |i: usize| {
@@ -255,16 +259,16 @@ impl Tail {
     fn rates(&self, stage: usize, system: &System, tangents: &Tangents, source: &[usize]) -> Rules {
         let nz = self.nz;
         let outputs = &system.rhs.outputs;
-        let mut rules = Vec::new();
-        let mut push = |to: Reg, row: Row| rules.push((to, Rule::Always(row)));
+        let mut rules = Rules::new();
+        let push = |rules: &mut Rules, to: Reg, row: Row| rules.push((to, Rule::Always(row)));
         for i in 0..nz {
             let row = self.equation(i);
-            push(row, Row::Scale(Operand::Constant(-1.0), outputs[nz * nz + i]));
+            push(&mut rules, row, Row::Scale(Operand::Constant(-1.0), outputs[nz * nz + i]));
             for j in 0..nz {
                 let mass = outputs[i * nz + j];
                 if tangents.is_active(mass) {
                     let z = Operand::Register((system.highest() + j) as Reg);
-                    push(row, Row::Less(row, z, mass));
+                    push(&mut rules, row, Row::Less(row, z, mass));
                 }
             }
         }
@@ -273,22 +277,21 @@ impl Tail {
         let rate = |j: usize| source.iter().position(|s| *s == system.highest() + j);
         let rate = |j: usize| rate(j).map_or(self.solved(j), |r| self.dk(stage, r));
         match nz {
-            1 => push(rate(0), Row::Scale(factor(0), self.equation(0))),
+            1 => push(&mut rules, rate(0), Row::Scale(factor(0), self.equation(0))),
             _ => {
                 let (first, second) = (Row::Copy(self.equation(0)), Row::Copy(self.equation(1)));
                 let change = self.switches as u32;
                 let (top, below) = (self.solved(0), self.solved(1));
                 rules.push((top, Rule::Select(change, [first, first, second])));
                 rules.push((below, Rule::Select(change, [second, second, first])));
-                let mut push = |to: Reg, row: Row| rules.push((to, Rule::Always(row)));
-                push(below, Row::Less(below, factor(2), top));
-                push(rate(1), Row::Scale(factor(3), below));
-                push(top, Row::Less(top, factor(1), rate(1)));
-                push(rate(0), Row::Scale(factor(0), top));
+                push(&mut rules, below, Row::Less(below, factor(2), top));
+                push(&mut rules, rate(1), Row::Scale(factor(3), below));
+                push(&mut rules, top, Row::Less(top, factor(1), rate(1)));
+                push(&mut rules, rate(0), Row::Scale(factor(0), top));
             }
         }
         for (r, &from) in source.iter().enumerate().filter(|s| *s.1 < system.highest()) {
-            rules.push((self.dk(stage, r), Rule::Always(Row::Copy(from as Reg))));
+            push(&mut rules, self.dk(stage, r), Row::Copy(from as Reg));
         }
         rules
     }
