@@ -34,6 +34,7 @@ pub(crate) fn defend(
             return baseline.polished.clone();
         }
         let Some(failure) = gates.failure(&polished, &found.scale) else { return polished };
+        search.listener.stage(Stage::Simulating);
         // Without the part that is missed least. (That would be one that is not determined, unless it is so only beside
         // another that does the same.)
         let open = match failure.gate {

@@ -60,11 +60,8 @@ struct Compiler<'a> {
 }
 
 /// A program that computes registers.
-pub(crate) fn values(assembler: &mut Assembler, operations: &[(Operand, Operation)]) {
-    let mut extent = Extent::default();
-    operations.iter().for_each(|(_, operation)| extent.operation(operation));
-    operations.iter().for_each(|(to, _)| extent.operand(*to));
-    let mut compiler = Compiler::new(assembler, &extent);
+pub(crate) fn values(assembler: &mut Assembler, extent: &Extent, operations: &[(Operand, Operation)]) {
+    let mut compiler = Compiler::new(assembler, extent);
     operations.iter().for_each(|(to, operation)| compiler.operation(*to, operation));
     compiler.leave();
 }
@@ -72,16 +69,13 @@ pub(crate) fn values(assembler: &mut Assembler, operations: &[(Operand, Operatio
 /// A program that computes rows of `lanes` tangents, after some numbers that they need.
 pub(crate) fn rows(
     assembler: &mut Assembler,
+    extent: &Extent,
     before: &[(Operand, Operation)],
     rules: &[(u32, Rule)],
     lanes: usize,
     widest: Width,
 ) {
-    let mut extent = Extent::default();
-    before.iter().for_each(|(_, operation)| extent.operation(operation));
-    before.iter().for_each(|(to, _)| extent.operand(*to));
-    rules.iter().for_each(|(out, rule)| extent.rule(*out, rule));
-    let mut compiler = Compiler::new(assembler, &extent);
+    let mut compiler = Compiler::new(assembler, extent);
     before.iter().for_each(|(to, operation)| compiler.operation(*to, operation));
     // The whole program for as many lanes as a vector has, then for the next: results stay in registers.
     let mut lane = 0;
@@ -356,8 +350,8 @@ impl<'a> Compiler<'a> {
             Row::Copy(a) | Row::Scale(_, a) => vec![self.row_source(a, lanes)],
             Row::Sum(a, b)
             | Row::Difference(a, b)
-            | Row::More(a, _, b)
-            | Row::Less(a, _, b)
+            | Row::PlusScaled(a, _, b)
+            | Row::MinusScaled(a, _, b)
             | Row::Blend(_, a, _, b) => {
                 vec![self.row_source(a, lanes), self.row_source(b, lanes)]
             }
@@ -386,12 +380,12 @@ impl<'a> Compiler<'a> {
                 let a = of(self, a);
                 self.scaled(out, k, a, width);
             }
-            Row::More(a, k, b) => {
+            Row::PlusScaled(a, k, b) => {
                 let (a, b) = (of(self, a), of(self, b));
                 self.scaled(SPARE, k, b, width);
                 self.assembler.arithmetic(width, Arithmetic::Add, out, SPARE, a);
             }
-            Row::Less(a, k, b) => {
+            Row::MinusScaled(a, k, b) => {
                 let (a, b) = (of(self, a), of(self, b));
                 self.scaled(SPARE, k, b, width);
                 self.two(Arithmetic::Subtract, out, a, Source::Vector(SPARE), width);

@@ -34,7 +34,7 @@ impl Rule {
     /// The numbers of the program's own that it reads.
     pub(crate) fn locals(&self) -> impl Iterator<Item = u32> {
         let of = |row: Row| match row {
-            Row::Scale(k, _) | Row::More(_, k, _) | Row::Less(_, k, _) => [Some(k), None],
+            Row::Scale(k, _) | Row::PlusScaled(_, k, _) | Row::MinusScaled(_, k, _) => [Some(k), None],
             Row::Blend(k, _, l, _) => [Some(k), Some(l)],
             Row::Zero | Row::Copy(_) | Row::Sum(..) | Row::Difference(..) => [None, None],
         };
@@ -123,7 +123,7 @@ impl Extent {
                 self.operand(k);
                 self.row(a);
             }
-            Row::More(a, k, b) | Row::Less(a, k, b) => {
+            Row::PlusScaled(a, k, b) | Row::MinusScaled(a, k, b) => {
                 self.operand(k);
                 [a, b].into_iter().for_each(|r| self.row(r));
             }

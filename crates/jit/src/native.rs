@@ -25,11 +25,11 @@ impl Values {
         let mut entries = Vec::with_capacity(programs.len());
         for program in programs {
             let extent = extent_of(program);
-            if !is_written_first(program) || !compile::fits(&extent, 0) {
+            if !compile::fits(&extent, 0) || written_first(program, extent.locals).is_none() {
                 return None;
             }
             entries.push((assembler.position(), extent));
-            compile::values(&mut assembler, program);
+            compile::values(&mut assembler, &extent, program);
         }
         Some(Values { code: Executable::new(&assembler.finish())?, entries })
     }
@@ -76,13 +76,15 @@ impl Tangents {
         rules.iter().for_each(|(out, rule)| extent.rule(*out, rule));
         let writes = before.iter().any(|(to, _)| matches!(to, Operand::Register(_))) || extent.shared > 0;
         let holds = before.iter().any(|(_, operation)| matches!(operation, Operation::HeldMode(_)));
-        let is_written = is_written_first(before)
-            && rules.iter().all(|(_, rule)| rule.locals().all(|l| is_written_by(before, l)));
-        if writes || holds || lanes == 0 || !is_written || !compile::fits(&extent, lanes) {
+        if writes || holds || lanes == 0 || !compile::fits(&extent, lanes) {
+            return None;
+        }
+        let written = written_first(before, extent.locals)?;
+        if !rules.iter().all(|(_, rule)| rule.locals().all(|l| written[l as usize])) {
             return None;
         }
         let mut assembler = Assembler::default();
-        compile::rows(&mut assembler, before, rules, lanes, widest);
+        compile::rows(&mut assembler, &extent, before, rules, lanes, widest);
         Some(Tangents { code: Executable::new(&assembler.finish())?, extent, lanes })
     }
 
@@ -124,14 +126,16 @@ fn extent_of(program: &[(Operand, Operation)]) -> Extent {
     extent
 }
 
-/// Whether every number of a program's own is written before it is read.
-fn is_written_first(program: &[(Operand, Operation)]) -> bool {
-    program
-        .iter()
-        .enumerate()
-        .all(|(i, (_, operation))| operation.locals().all(|l| is_written_by(&program[..i], l)))
-}
-
-fn is_written_by(program: &[(Operand, Operation)], local: u32) -> bool {
-    program.iter().any(|(to, _)| *to == Operand::Local(local))
+/// Which of a program's own numbers it writes; `None` where it reads one before.
+fn written_first(program: &[(Operand, Operation)], locals: usize) -> Option<Vec<bool>> {
+    let mut written = vec![false; locals];
+    for (to, operation) in program {
+        if !operation.locals().all(|l| written[l as usize]) {
+            return None;
+        }
+        if let Operand::Local(l) = *to {
+            written[l as usize] = true;
+        }
+    }
+    Some(written)
 }

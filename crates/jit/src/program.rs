@@ -83,9 +83,9 @@ pub enum Row {
     /// k da.
     Scale(Operand, u32),
     /// da + k db.
-    More(u32, Operand, u32),
+    PlusScaled(u32, Operand, u32),
     /// da − k db.
-    Less(u32, Operand, u32),
+    MinusScaled(u32, Operand, u32),
     /// k da + l db.
     Blend(Operand, u32, Operand, u32),
 }

@@ -218,8 +218,8 @@ fn lanes_of(state: &State, d: &[f64], lanes: usize, rule: Row) -> Vec<f64> {
         Row::Sum(a, b) => two(row(a), row(b), &|a, b| a + b),
         Row::Difference(a, b) => two(row(a), row(b), &|a, b| a - b),
         Row::Scale(k, a) => row(a).iter().map(|a| state.get(k) * a).collect(),
-        Row::More(a, k, b) => two(row(a), row(b), &|a, b| a + state.get(k) * b),
-        Row::Less(a, k, b) => two(row(a), row(b), &|a, b| a - state.get(k) * b),
+        Row::PlusScaled(a, k, b) => two(row(a), row(b), &|a, b| a + state.get(k) * b),
+        Row::MinusScaled(a, k, b) => two(row(a), row(b), &|a, b| a - state.get(k) * b),
         Row::Blend(k, a, l, b) => {
             let (k, l) = (state.get(k), state.get(l));
             two(row(a), row(b), &|a, b| k * a + l * b)
@@ -230,8 +230,8 @@ fn lanes_of(state: &State, d: &[f64], lanes: usize, rule: Row) -> Vec<f64> {
 fn random_row(random: &mut Random, locals: usize) -> Row {
     let (a, b) = (random.below(REGISTERS) as u32, random.below(REGISTERS) as u32);
     match random.below(10) {
-        8 => Row::More(a, operand(random, locals), b),
-        9 => Row::Less(a, operand(random, locals), b),
+        8 => Row::PlusScaled(a, operand(random, locals), b),
+        9 => Row::MinusScaled(a, operand(random, locals), b),
         0 => Row::Zero,
         1 => Row::Copy(a),
         2 => Row::Sum(a, b),

@@ -688,12 +688,13 @@ impl Tape {
         Tangents::new(&self.ops, self.prologue, self.first_op(), &self.switches, leaf_active)
     }
 
-    /// [`tangents`](Self::tangents) for `lanes` directions, compiled where the machine can; made once for all copies of the tape.
+    /// [`tangents`](Self::tangents) for `lanes` directions, compiled when they are first asked for, where the machine can; made once
+    /// for all copies of the tape.
     pub fn compiled_tangents(&self, leaf_active: &[bool], lanes: usize) -> Arc<Tangents> {
         match &self.compiled {
             Some(compiled) => compiled.tangents(leaf_active, lanes, || {
                 let mut tangents = self.tangents(leaf_active);
-                tangents.code = tangents::compile(&tangents.body, &self.switches, lanes);
+                tangents.lanes = Some(lanes);
                 tangents
             }),
             None => Arc::new(self.tangents(leaf_active)),
@@ -756,7 +757,7 @@ impl Tape {
     /// Inlined, so that a caller's literal `lanes` and instruction set are those of its loops.
     #[inline(always)]
     pub fn tangent(&self, tangents: &Tangents, regs: &[f64], modes: &[i8], lanes: usize, d: &mut [f64]) {
-        if let Some(code) = tangents.code.as_ref().filter(|code| code.lanes() == lanes) {
+        if let Some(code) = tangents.code(&self.switches, lanes) {
             return code.run(regs, modes, d);
         }
         let at = tangents::Place { regs, modes, switches: &self.switches };

@@ -1,5 +1,7 @@
 //! Directional derivatives of the registers: which have any, and the rule of each.
 
+use std::sync::OnceLock;
+
 use greybox_jit::{Operand, Operation, Operations, Row as Lanes, Rule as Code, Rules};
 
 use super::compiled::{Program, register};
@@ -12,8 +14,9 @@ pub struct Tangents {
     active: Vec<bool>,
     pub(super) prologue: Vec<Row>,
     pub(super) body: Vec<Row>,
-    /// The body for one number of lanes.
-    pub(super) code: Option<greybox_jit::Tangents>,
+    /// The number of lanes for which the body may be compiled, and the body once it was run with so many.
+    pub(super) lanes: Option<usize>,
+    pub(super) code: OnceLock<Option<greybox_jit::Tangents>>,
 }
 
 impl Tangents {
@@ -42,7 +45,7 @@ impl Tangents {
             }
         }
         let [prologue, body] = rows;
-        Tangents { active, prologue, body, code: None }
+        Tangents { active, prologue, body, lanes: None, code: OnceLock::new() }
     }
 }
 
@@ -114,10 +117,19 @@ impl Rule {
     }
 }
 
-/// The rules as machine code for `lanes` directions: what they multiply by first, then the rows. To the last bit what [`run`] gives.
-pub(super) fn compile(rows: &[Row], switches: &[Switch], lanes: usize) -> Option<greybox_jit::Tangents> {
-    let (before, rules) = rules(rows, switches);
-    greybox_jit::Tangents::compile(&before, &rules, lanes)
+impl Tangents {
+    /// The body as machine code for `lanes` directions: to the last bit what [`run`] gives.
+    #[inline]
+    pub(super) fn code(&self, switches: &[Switch], lanes: usize) -> Option<&greybox_jit::Tangents> {
+        if self.lanes != Some(lanes) {
+            return None;
+        }
+        let compile = || {
+            let (before, rules) = rules(&self.body, switches);
+            greybox_jit::Tangents::compile(&before, &rules, lanes)
+        };
+        self.code.get_or_init(compile).as_ref()
+    }
 }
 
 /// What the rules multiply by, and the rows.

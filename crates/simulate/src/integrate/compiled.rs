@@ -245,7 +245,7 @@ impl Tail {
             let mut from = self.dx(r);
             for (j, _) in weights.iter().enumerate().filter(|w| *w.1 != 0.0) {
                 let weight = Operand::Register(self.weight(j) as Reg);
-                rules.push((to(r), Rule::Always(Row::More(from, weight, self.dk(j, r)))));
+                rules.push((to(r), Rule::Always(Row::PlusScaled(from, weight, self.dk(j, r)))));
                 from = to(r);
             }
             if from == self.dx(r) && from != to(r) {
@@ -268,7 +268,7 @@ impl Tail {
                 let mass = outputs[i * nz + j];
                 if tangents.is_active(mass) {
                     let z = Operand::Register((system.highest() + j) as Reg);
-                    push(&mut rules, row, Row::Less(row, z, mass));
+                    push(&mut rules, row, Row::MinusScaled(row, z, mass));
                 }
             }
         }
@@ -284,9 +284,9 @@ impl Tail {
                 let (top, below) = (self.solved(0), self.solved(1));
                 rules.push((top, Rule::Select(change, [first, first, second])));
                 rules.push((below, Rule::Select(change, [second, second, first])));
-                push(&mut rules, below, Row::Less(below, factor(2), top));
+                push(&mut rules, below, Row::MinusScaled(below, factor(2), top));
                 push(&mut rules, rate(1), Row::Scale(factor(3), below));
-                push(&mut rules, top, Row::Less(top, factor(1), rate(1)));
+                push(&mut rules, top, Row::MinusScaled(top, factor(1), rate(1)));
                 push(&mut rules, rate(0), Row::Scale(factor(0), top));
             }
         }
