@@ -48,7 +48,7 @@ use pulp::Arch;
 
 use self::compiled::Tail;
 use self::event::MOST_EVENTS;
-pub use self::history::{Carry, delayed_states, has_history};
+pub use self::history::{Carry, Past, delayed_states, delays, has_history};
 use self::history::{History, LaneMap};
 use self::stage::{Held, Rates, Stage, dot};
 pub use self::stepper::Stepper;

@@ -12,7 +12,7 @@ mod signal;
 pub mod small;
 
 pub use integrate::{
-    Carry, Environment, Force, MOST_TRIALS, Method, Seeds, SignalLanes, Simulation, Stepper, Trajectory,
-    can_stride, delayed_states, has_history, integrate,
+    Carry, Environment, Force, MOST_TRIALS, Method, Past, Seeds, SignalLanes, Simulation, Stepper,
+    Trajectory, can_stride, delayed_states, delays, has_history, integrate,
 };
 pub use signal::{FINE, Signal};

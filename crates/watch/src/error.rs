@@ -23,12 +23,12 @@ pub enum WatchError {
     /// The model does not compile or is too stiff.
     #[error(transparent)]
     Setup(#[from] SetupError),
-    /// The model delays something.
+    /// The model delays a measurement.
     #[error(
-        "the model has `delay(...)`: its past is not part of the state, and a filter cannot correct it. Leave the delay \
-         out, or approximate it by a lag (a state of first order)"
+        "a measurement of the model has `delay(...)`: what is measured is a state of the past, and a filter corrects the \
+         present one. Shift the channel by the delay, or leave it out"
     )]
-    Delayed,
+    DelayedMeasurement,
     /// Nothing may move.
     #[error(
         "every parameter is fixed: there is nothing to watch. Take `fixed = true` from the parameters that may change"

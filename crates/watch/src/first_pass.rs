@@ -41,7 +41,6 @@ fn short_blocks(first: &First, options: &Options) -> Result<Short, WatchError> {
     let First { machine, usual, start, samples } = first;
     let mut tracker = Tracker::new(machine, (&start.0, &start.1), Effects::Everything)?;
     let effects = tracker.count(machine);
-    let by = Conditions { machine, usual, place: &usual.place, memory: options.memory };
     let seconds = samples[samples.len() - 1].t - samples[0].t;
     let parts = (samples.len() / BLOCK_SAMPLES).clamp(BLOCKS.0, BLOCKS.1);
     let short = (seconds / parts as f64).max(usual.dt);
@@ -50,11 +49,15 @@ fn short_blocks(first: &First, options: &Options) -> Result<Short, WatchError> {
     let nx = machine.system.nx;
     let (mut sum, mut squares, mut count) = (vec![0.0; nx], vec![0.0; nx], 0.0);
     let mut scratch = Scratch::default();
-    for pair in samples.windows(2) {
+    // (What is before a gap is no past of what comes after it.)
+    let mut first = 0;
+    for (k, pair) in samples.windows(2).enumerate() {
+        let earlier = &samples[first..k];
+        let by = Conditions { machine, usual, place: &usual.place, memory: options.memory, earlier };
         if pair[1].t - pair[0].t > short {
             tracker.restart((&start.0, &start.1));
             block.clear();
-            began = pair[1].t;
+            (began, first) = (pair[1].t, k + 1);
             continue;
         }
         if !tracker.advance(&by, (&pair[0], &pair[1]), &mut scratch, |c, i| block.push(c, &i)) {

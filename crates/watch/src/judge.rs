@@ -194,7 +194,7 @@ impl Watch {
             // (The followed parameters were to explain what they do not.)
             let now = &mut self.now;
             now.values.clone_from(&now.usual.place.values);
-            now.adaptive.filter.take_state(&now.reference.filter);
+            now.adaptive.take_state(&now.reference);
             now.fit.restart();
         }
         Change { since: change.since, ..found }
@@ -219,7 +219,7 @@ impl Watch {
         fit.merge(&before.fit, |effect| !changed(effect));
         let change = now.usual.place.go(&now.usual.free, &fit.estimate());
         released.fit = fit;
-        now.reference.filter.follow(&change);
+        now.reference.follow(&self.machine, &change);
     }
 }
 

@@ -184,8 +184,8 @@ pub(crate) fn learn(model: &Model, recording: &Recording, options: &Options) -> 
     let thinning = thinning(&data);
     let thin = if thinning > 1 { Arc::new(data.thinned(model, thinning)) } else { data.clone() };
     let setup = Setup::new(model, thin, free)?;
-    if !setup.system.rhs.delays.is_empty() || !setup.system.output.delays.is_empty() {
-        return Err(WatchError::Delayed);
+    if !setup.system.output.delays.is_empty() {
+        return Err(WatchError::DelayedMeasurement);
     }
     let filter = Filter::new(&setup);
     let weight = 1.0 / filter.strides().len() as f64;
@@ -198,7 +198,8 @@ pub(crate) fn learn(model: &Model, recording: &Recording, options: &Options) -> 
     let usual = usual(&fitted, &filter.rate_noise(&fitted.at), weight, thinning);
     let setup = fitted.at.setup;
     let indices = setup.free.iter().map(|f| f.index).collect();
-    let machine = Machine::new(model.clone(), setup.system.clone(), usual.steps.method(), indices);
+    let (system, steps) = (setup.system.clone(), usual.steps.method());
+    let machine = Machine::new(model.clone(), system, steps, indices, &usual.place.values);
     Ok(First { machine, usual, start: (x, deviations), samples: samples(&data, recording.time[0]) })
 }
 

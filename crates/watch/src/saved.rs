@@ -1,6 +1,5 @@
 //! The state of a watch as data.
 
-use greybox_model::System;
 use greybox_recursive::{Chart, LeastSquares};
 use serde::de::Error;
 use serde::{Deserialize, Deserializer, Serialize};
@@ -8,6 +7,7 @@ use serde::{Deserialize, Deserializer, Serialize};
 use crate::blocks::{Block, Scores};
 use crate::event::Irregular;
 use crate::learn::{Place, Sample, Usual};
+use crate::machine::Machine;
 use crate::released::{Louder, Released};
 use crate::tracker::{Effects, Tracker};
 
@@ -42,6 +42,8 @@ pub struct Saved {
     pub(crate) began: f64,
     pub(crate) history: Vec<Scores>,
     pub(crate) last: Sample,
+    /// Samples before it, as far as the model delays something.
+    pub(crate) earlier: Vec<Sample>,
     pub(crate) settling: Option<Settling>,
     pub(crate) irregular: Irregular,
     /// Blocks that irregularities wait until they are reported, and the next wait: it doubles while they go on.
@@ -91,7 +93,7 @@ pub(crate) struct Known {
 }
 
 /// Version of [`Saved`].
-pub(crate) const VERSION: u32 = 2;
+pub(crate) const VERSION: u32 = 3;
 
 /// The version, where it is this one.
 fn this_version<'de, D: Deserializer<'de>>(deserializer: D) -> Result<u32, D::Error> {
@@ -126,7 +128,8 @@ impl Saved {
     }
 
     /// Whether its parts have the sizes that they have of each other: it may have been written by anybody.
-    pub(crate) fn is_consistent(&self, system: &System) -> bool {
+    pub(crate) fn is_consistent(&self, machine: &Machine) -> bool {
+        let system = &machine.system;
         let (np, nx, ny) = (self.usual.free.len(), system.nx, system.ny);
         let effects = np + system.nz + ny;
         let scores = |s: &Scores| s.gradient.len() == effects && s.information.len() == effects;
@@ -134,7 +137,8 @@ impl Saved {
             |p: &Place| p.values.len() == system.np && p.forces.len() == system.nz && p.offsets.len() == ny;
         let fit = |f: &LeastSquares| f.len() == effects && f.is_consistent();
         let before = |b: &Before| {
-            b.tracker.shape() == Some((nx, effects, Effects::Everything))
+            b.tracker.has_past_of(machine)
+                && b.tracker.shape() == Some((nx, effects, Effects::Everything))
                 && place(&b.place)
                 && fit(&b.fit)
                 && b.block.is_consistent(effects, ny)
@@ -162,6 +166,10 @@ impl Saved {
             && self.louder.is_none_or(|l| l.channel < ny)
             && self.rest.1.len() == nx
             && self.last.measured.len() == ny
+            && self.earlier.iter().all(|s| s.inputs.len() == system.nu && s.t < self.last.t)
+            && self.earlier.windows(2).all(|w| w[0].t < w[1].t)
+            && self.reference.has_past_of(machine)
+            && self.adaptive.has_past_of(machine)
             && self.reference.shape() == Some((nx, effects, Effects::Everything))
             && self.adaptive.shape() == Some((nx, np, Effects::Parameters))
             && self.fit.len() == np

@@ -1,10 +1,11 @@
 //! A filter on a model: from sample to sample, and what each innovation tells of parameters, forces and offsets.
 
 use greybox_recursive::{Filter, Innovation, Measured, Predicted, RecursiveError};
+use greybox_simulate::Past;
 use serde::{Deserialize, Serialize};
 
 use crate::learn::{Place, Sample, Usual};
-use crate::machine::{Machine, Span, Step};
+use crate::machine::{Beginning, Machine, Span, Step};
 
 /// What innovations are regressed on.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
@@ -20,6 +21,27 @@ pub(crate) enum Effects {
 pub(crate) struct Tracker {
     pub(crate) filter: Filter,
     effects: Effects,
+    /// What the delayed expressions of the equations were, by the estimates of that time.
+    #[serde(with = "past")]
+    past: Vec<Past>,
+}
+
+/// [`Past`] as data: times, values, slopes and lanes.
+mod past {
+    use greybox_simulate::Past;
+    use serde::{Deserialize, Deserializer, Serialize, Serializer};
+
+    type Columns = (Vec<f64>, Vec<f64>, Vec<f64>, Vec<f64>);
+
+    pub(super) fn serialize<S: Serializer>(past: &[Past], serializer: S) -> Result<S::Ok, S::Error> {
+        let columns = past.iter().map(|p| (&p.time, &p.value, &p.slope, &p.lanes));
+        columns.collect::<Vec<_>>().serialize(serializer)
+    }
+
+    pub(super) fn deserialize<'de, D: Deserializer<'de>>(deserializer: D) -> Result<Vec<Past>, D::Error> {
+        let past = Vec::<Columns>::deserialize(deserializer)?.into_iter();
+        Ok(past.map(|(time, value, slope, lanes)| Past { time, value, slope, lanes }).collect())
+    }
 }
 
 /// Memory of a step, used anew by each.
@@ -40,6 +62,8 @@ pub(crate) struct Conditions<'a> {
     pub(crate) place: &'a Place,
     /// Seconds that the state remembers.
     pub(crate) memory: f64,
+    /// Samples before the one from which it is predicted.
+    pub(crate) earlier: &'a [Sample],
 }
 
 impl Tracker {
@@ -48,7 +72,25 @@ impl Tracker {
         (state, deviation): (&[f64], &[f64]),
         effects: Effects,
     ) -> Result<Tracker, RecursiveError> {
-        Ok(Tracker { filter: Filter::new(state, deviation, count(machine, effects))?, effects })
+        let filter = Filter::new(state, deviation, count(machine, effects))?;
+        Ok(Tracker { filter, effects, past: Vec::new() })
+    }
+
+    /// Is where another one is, and was where that was.
+    pub(crate) fn take_state(&mut self, other: &Tracker) {
+        self.filter.take_state(&other.filter);
+        self.past.clone_from(&other.past);
+    }
+
+    /// Moves as far as effects that move by `change` take it.
+    pub(crate) fn follow(&mut self, machine: &Machine, change: &[f64]) {
+        self.filter.follow(change);
+        machine.follow(&mut self.past, change);
+    }
+
+    /// Whether its past is one of this machine.
+    pub(crate) fn has_past_of(&self, machine: &Machine) -> bool {
+        machine.has(&self.past)
     }
 
     /// States and effects, where the sizes of all parts agree.
@@ -59,6 +101,7 @@ impl Tracker {
     /// The state begins anew with this mean and these standard deviations.
     pub(crate) fn restart(&mut self, (mean, deviation): (&[f64], &[f64])) {
         self.filter.restart(mean, deviation);
+        self.past.clear();
     }
 
     /// Number of effects.
@@ -101,19 +144,23 @@ impl Tracker {
         for rate in &by.usual.rates {
             noise[rate.entry] = rate.variance(self.filter.state(), dt).sqrt();
         }
-        let span = Span { from, dt, before, after };
-        if !by.machine.step(&by.place.values, self.filter.state(), &span, step) {
+        let span = Span { earlier: by.earlier, from, dt, before, after };
+        let (x, by_effects) = (self.filter.state(), self.filter.sensitivity());
+        let start = Beginning { x, by_effects, past: &mut self.past };
+        if !by.machine.step(&by.place.values, start, &span, step) {
             return false;
         }
         wide.clear();
         wide.resize(nx * width, 0.0);
         for i in 0..nx {
-            wide[i * width..i * width + np].copy_from_slice(&step.by_parameters[i * np..(i + 1) * np]);
+            let row = &mut wide[i * width..(i + 1) * width];
+            row[..np].copy_from_slice(&step.by_parameters[i * np..(i + 1) * np]);
+            row[np..].iter_mut().zip(others(&step.by_others, i, nx)).for_each(|(w, d)| *w = *d);
         }
         for (j, force) in by.place.forces.iter().enumerate() {
             let top = system.offsets[j] + system.orders[j] - 1;
             if self.effects == Effects::Everything {
-                wide[top * width + np + j] = dt;
+                wide[top * width + np + j] += dt;
             }
             step.state[top] += force * dt;
             for c in 0..system.ny {
@@ -145,8 +192,10 @@ impl Tracker {
         for c in 0..ny {
             rows[c * width..c * width + np]
                 .copy_from_slice(&step.outputs_by_parameters[c * np..(c + 1) * np]);
+            let row = &mut rows[c * width + np..(c + 1) * width];
+            row.iter_mut().zip(others(&step.outputs_by_others, c, ny)).for_each(|(r, d)| *r = *d);
             if self.effects == Effects::Everything {
-                rows[c * width + np + system.nz + c] = 1.0;
+                row[system.nz + c] += 1.0;
             }
         }
         let measured = (0..ny).map(|c| Measured {
@@ -157,6 +206,12 @@ impl Tracker {
         });
         self.filter.correct(measured, learn);
     }
+}
+
+/// Row `i` of `rows`.
+fn others(derivatives: &[f64], i: usize, rows: usize) -> &[f64] {
+    let width = derivatives.len() / rows;
+    &derivatives[i * width..(i + 1) * width]
 }
 
 fn count(machine: &Machine, effects: Effects) -> usize {

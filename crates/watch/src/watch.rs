@@ -57,7 +57,7 @@ impl Watch {
         options.check()?;
         let first = learn(model, first, options)?;
         let pass = first_pass(&first, options)?;
-        let First { machine, usual, start, samples } = first;
+        let First { machine, usual, start, mut samples } = first;
         let adaptive = Tracker::new(&machine, (&start.0, &start.1), Effects::Parameters)?;
         let (mean, std): (Vec<f64>, Vec<f64>) =
             usual.free.iter().map(|f| (usual.place.values[f.index], f.std)).unzip();
@@ -82,7 +82,8 @@ impl Watch {
             block: pass.begun.0,
             began: pass.begun.1,
             history: Vec::new(),
-            last: samples.into_iter().next_back().ok_or(WatchError::Diverged)?,
+            last: samples.pop().ok_or(WatchError::Diverged)?,
+            earlier: within(samples, machine.reach),
             settling: None,
             irregular: Irregular::default(),
             wait: (0, 1),
@@ -90,10 +91,10 @@ impl Watch {
         let mut watch = Watch::new(machine, now);
         pass.blocks.iter().for_each(|block| watch.learn_block(block));
         let now = &mut watch.now;
-        now.adaptive.filter.take_state(&now.reference.filter);
+        now.adaptive.take_state(&now.reference);
         let change = now.usual.place.clone().go(&now.usual.free, &now.fit.estimate());
         now.usual.free.iter().zip(&change).for_each(|(f, d)| now.values[f.index] += d);
-        now.adaptive.filter.follow(&change);
+        now.adaptive.follow(&watch.machine, &change);
         let learned = watch.learned();
         Ok((watch, Event::Learned(learned)))
     }
@@ -137,11 +138,12 @@ impl Watch {
         if let Some(f) = saved.usual.free.iter().find(|f| model.parameter(&f.name) != Some(f.index)) {
             return other(format!("the model has no parameter `{}` in that place", f.name));
         }
-        if !saved.is_consistent(&system) {
+        let free = saved.usual.free.iter().map(|f| f.index).collect();
+        let steps = saved.usual.steps.method();
+        let machine = Machine::new(model.clone(), system.into(), steps, free, &saved.usual.place.values);
+        if !saved.is_consistent(&machine) {
             return other("its parts do not fit together".to_owned());
         }
-        let free = saved.usual.free.iter().map(|f| f.index).collect();
-        let machine = Machine::new(model.clone(), system.into(), saved.usual.steps.method(), free);
         Ok(Watch::new(machine, saved))
     }
 
@@ -200,6 +202,7 @@ impl Watch {
             tracker.restart((&now.rest.0, &now.rest.1));
         }
         now.block.clear();
+        now.earlier.clear();
         (now.began, now.last) = (sample.t, sample);
     }
 
@@ -224,7 +227,11 @@ impl Watch {
             return None;
         }
         let t = sample.t;
-        now.last = sample;
+        let last = std::mem::replace(&mut now.last, sample);
+        if self.machine.reach > 0.0 {
+            now.earlier.push(last);
+            forget(&mut now.earlier, t - self.machine.reach);
+        }
         if t - now.began < now.block_seconds - 0.5 * now.usual.dt {
             return None;
         }
@@ -235,7 +242,13 @@ impl Watch {
     /// The usual model takes a sample, and while a change settles, what was usual before. `false` where it leaves every bound.
     fn keep(&mut self, sample: &Sample) -> bool {
         let (machine, now, scratch) = (&self.machine, &mut self.now, &mut self.scratch);
-        let by = Conditions { machine, usual: &now.usual, place: &now.usual.place, memory: now.memory };
+        let by = Conditions {
+            machine,
+            usual: &now.usual,
+            place: &now.usual.place,
+            memory: now.memory,
+            earlier: &now.earlier,
+        };
         let (samples, block) = ((&now.last, sample), &mut now.block);
         let kept = now.reference.advance(&by, samples, scratch, |c, i| block.push(c, &i));
         if let Some(before) = now.settling.as_mut().and_then(|s| s.before.as_mut()) {
@@ -266,7 +279,7 @@ impl Watch {
         fit.forget((-(sample.t - now.last.t) / now.memory).exp());
         let weight = 1.0 / now.inflation.sqrt();
         let row = &mut self.row;
-        let by = Conditions { machine, usual: &now.usual, place, memory: now.memory };
+        let by = Conditions { machine, usual: &now.usual, place, memory: now.memory, earlier: &now.earlier };
         let kept_up = now.adaptive.advance(&by, (&now.last, sample), scratch, |_, i| {
             row.clear();
             row.extend(i.row.iter().map(|psi| weight * psi));
@@ -277,7 +290,7 @@ impl Watch {
             fit.estimate_into(at);
             let change = place.go(&now.usual.free, at);
             now.values.clone_from(&place.values);
-            now.adaptive.filter.follow(&change);
+            now.adaptive.follow(machine, &change);
         }
         kept_up
     }
@@ -298,7 +311,7 @@ impl Watch {
         if let Some(released) = &mut now.released {
             let goes_on = released.learn(&block, &place.effects(&now.usual.free));
             let change = place.go(&now.usual.free, &released.fit.estimate());
-            now.reference.filter.follow(&change);
+            now.reference.follow(&self.machine, &change);
             if !goes_on {
                 now.released = None;
             }
@@ -324,4 +337,24 @@ impl Watch {
         }
         Ended { t, scores, deviates, scatter, block }
     }
+}
+
+/// Samples that are kept beyond those in reach, so that they are cut but now and then.
+const SPARE: usize = 256;
+
+/// Cuts off samples before `t`, but for the last of them.
+fn forget(samples: &mut Vec<Sample>, t: f64) {
+    let old = samples.partition_point(|s| s.t <= t).saturating_sub(1);
+    if old > SPARE {
+        samples.drain(..old);
+    }
+}
+
+/// Those of the last seconds; none where none are remembered.
+fn within(mut samples: Vec<Sample>, seconds: f64) -> Vec<Sample> {
+    match samples.last().map(|last| last.t) {
+        Some(end) if seconds > 0.0 => forget(&mut samples, end - seconds),
+        _ => samples.clear(),
+    }
+    samples
 }

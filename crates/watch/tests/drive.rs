@@ -172,7 +172,7 @@ fn a_state_of_another_version_is_refused() {
     let text = serde_json::to_string(watch.saved()).unwrap();
     assert!(serde_json::from_str::<Saved>(&text).is_ok());
     // (Such a state also lacks what came later.)
-    let old = text.replace("\"version\":2", "\"version\":1").replace("\"wide\"", "\"other\"");
+    let old = text.replace("\"version\":3", "\"version\":1").replace("\"wide\"", "\"other\"");
     let error = serde_json::from_str::<Saved>(&old).unwrap_err();
     assert!(error.to_string().contains("version 1"), "{error}");
 }
@@ -310,10 +310,9 @@ fn what_cannot_be_watched_is_refused() {
         Watch::learn(&model, recording, &options).map(|_| ()).unwrap_err()
     };
     let usual = Options::default();
-    let late = MODEL
-        .replace("b*angle'", "b*delay(angle', tau)")
-        .replace("k =", "tau = { value = 0.01, unit = \"s\" }\nk =");
-    assert_eq!(refused(&late, &recording, usual), WatchError::Delayed);
+    let late = format!("{MODEL}\n[measurements]\nangle = \"delay(angle, tau)\"")
+        .replace("k = {", "tau = { value = 0.02, unit = \"s\", fixed = true }\nk = {");
+    assert_eq!(refused(&late, &recording, usual), WatchError::DelayedMeasurement);
     let fixed = MODEL
         .replace("rad\" }\nk", "rad\", fixed = true }\nk")
         .replace("m/rad\" }", "m/rad\", fixed = true }");

@@ -52,18 +52,43 @@ angle = { unit = "rad" }
 plate = "J*angle'' + b*angle' + c*sign(angle') + k*angle = torque"
 "#;
 
+/// The model of a machine whose torque acts late.
+const LATE_MODEL: &str = r#"
+name = "throttle"
+[inputs]
+torque = { unit = "N*m", hold = "zero" }
+[parameters]
+J = { value = 0.02, unit = "kg*m^2", fixed = true }
+b = { value = 0.03, unit = "N*m*s/rad" }
+c = { value = 0.08, unit = "N*m" }
+k = { value = 0.7, unit = "N*m/rad" }
+tau = { value = 0.05, unit = "s" }
+[states]
+angle = { unit = "rad" }
+[equations]
+plate = "J*angle'' + b*angle' + c*sign(angle') + k*angle = delay(torque, tau)"
+"#;
+
+/// Steps of the machine from sample to sample.
+const SUBSTEPS: usize = 20;
+
 /// What the machine and its sensor are at one time.
 #[derive(Clone, Copy)]
 struct Now {
     throttle: Throttle,
+    /// Steps after which the torque acts, of the machine whose model has a delay.
+    late: Option<usize>,
     /// Offset and noise of the sensor, rad.
     offset: f64,
     noise: f64,
 }
 
-const USUAL: Now = Now { throttle: Throttle::NEW, offset: 0.0, noise: 0.002 };
+const USUAL: Now = Now { throttle: Throttle::NEW, late: None, offset: 0.0, noise: 0.002 };
 /// A machine that is not quite what the model says: its spring stiffens.
 const ODD: Now = with(Throttle { stiffening: 0.01, ..Throttle::NEW });
+
+/// One whose torque acts 35 ms late.
+const LATE: Now = Now { late: Some(70), ..USUAL };
 
 const fn with(throttle: Throttle) -> Now {
     Now { throttle, ..USUAL }
@@ -77,6 +102,13 @@ struct Case {
     /// Names that are right; none where nothing happens.
     right: &'static [Name],
     goes: Goes,
+}
+
+impl Case {
+    fn model(&self) -> Result<Model> {
+        let text = if self.usual.late.is_some() { LATE_MODEL } else { MODEL };
+        Model::from_toml(text, "throttle.toml").context("the throttle's model")
+    }
 }
 
 /// How a change goes on.
@@ -195,6 +227,20 @@ const CASES: &[Case] = &[
         right: &[Name::Noise],
         goes: Goes::Then(&[Name::Parameter("c")]),
     },
+    Case {
+        name: "torque that acts 35 ms late: 7 ms later",
+        usual: LATE,
+        at: |_| Now { late: Some(84), ..LATE },
+        right: &[Name::Parameter("tau")],
+        goes: Goes::Stays,
+    },
+    Case {
+        name: "torque that acts 35 ms late: Coulomb friction + 30 %",
+        usual: LATE,
+        at: |_| Now { throttle: Throttle { coulomb: 0.13, ..Throttle::NEW }, ..LATE },
+        right: &[Name::Parameter("c")],
+        goes: Goes::Stays,
+    },
     Case { name: "nothing", usual: USUAL, at: |_| USUAL, right: &[], goes: Goes::Stays },
     Case {
         name: "model lacks a stiffening: Coulomb friction + 30 %",
@@ -214,7 +260,6 @@ const CASES: &[Case] = &[
 
 /// Time, torque and measured angle of every sample.
 fn record(case: &Case, seed: u64) -> [Vec<f64>; 3] {
-    const SUBSTEPS: usize = 20;
     let mut random = Pcg64Mcg::seed_from_u64(seed);
     let mut normal = || -> f64 { StandardNormal.sample(&mut random) };
     let seconds = if case.right.is_empty() { SOUND } else { CHANGE + AFTER };
@@ -229,7 +274,14 @@ fn record(case: &Case, seed: u64) -> [Vec<f64>; 3] {
         out[0].push(t);
         out[1].push(torque);
         out[2].push(state[0] + now.offset + now.noise * normal());
-        state = now.throttle.step(state, torque, STEP, SUBSTEPS);
+        let Some(late) = now.late else {
+            state = now.throttle.step(state, torque, STEP, SUBSTEPS);
+            continue;
+        };
+        for step in k * SUBSTEPS..(k + 1) * SUBSTEPS {
+            let acts = step.checked_sub(late).map_or(0.0, |before| out[1][before / SUBSTEPS]);
+            state = now.throttle.step(state, acts, STEP / SUBSTEPS as f64, 1);
+        }
     }
     out
 }
@@ -253,7 +305,7 @@ struct Trial {
 
 fn trial(case: &Case, seed: u64) -> Result<Trial> {
     let [time, torque, angle] = record(case, seed);
-    let model = Model::from_toml(MODEL, "throttle.toml").context("the throttle's model")?;
+    let model = case.model()?;
     let options = Options { alarms_per_day: 24.0 * ALARMS, ..Options::default() };
     let count = time.iter().take_while(|t| **t < options.learn).count();
     let column = |name: &str, values: &[f64]| Channel {
@@ -521,9 +573,9 @@ pub(crate) fn write(root: &Path, outcomes: &[Outcome]) -> Result<()> {
 /// A machine that cannot be watched, or a folder that cannot be written.
 pub(crate) fn keep(folder: &Path, first: u64, count: Option<usize>) -> Result<()> {
     std::fs::create_dir_all(folder).with_context(|| format!("{} cannot be made", folder.display()))?;
-    let model = Model::from_toml(MODEL, "throttle.toml").context("the throttle's model")?;
     let options = Options::default();
     for (number, case) in CASES.iter().enumerate() {
+        let model = case.model()?;
         for seed in first..first + count.unwrap_or(SEEDS) as u64 {
             let [time, torque, angle] = record(case, seed);
             let n = time.iter().take_while(|t| **t < options.learn).count();

@@ -261,6 +261,83 @@ impl Carry {
     }
 }
 
+/// What a delayed expression of the equations was before a sample.
+#[derive(Debug, Clone, Default, PartialEq)]
+pub struct Past {
+    /// Increasing times, counted from the sample: zero and before, s.
+    pub time: Vec<f64>,
+    /// Its values then, SI.
+    pub value: Vec<f64>,
+    /// Its slopes then, SI.
+    pub slope: Vec<f64>,
+    /// How the values depend on the lanes of the [`Seeds`](crate::Seeds), times × lanes; empty where they depend on none.
+    pub lanes: Vec<f64>,
+}
+
+impl Past {
+    /// Whether all of it is there, for so many lanes, and its times increase up to zero.
+    pub fn is_consistent(&self, lanes: usize) -> bool {
+        let finite = |v: &[f64]| v.iter().all(|v| v.is_finite());
+        self.value.len() == self.time.len()
+            && self.slope.len() == self.time.len()
+            && (self.lanes.is_empty() || Some(self.lanes.len()) == self.time.len().checked_mul(lanes))
+            && [&self.time, &self.value, &self.slope, &self.lanes].iter().all(|v| finite(v))
+            && self.time.windows(2).all(|w| w[0] < w[1])
+            && self.time.last().is_none_or(|t| *t <= 0.0)
+    }
+}
+
+impl History {
+    /// A past before the time `s`.
+    pub(super) fn known(past: &Past, s: f64, lanes: usize) -> History {
+        History {
+            s: past.time.iter().map(|t| s + t).collect(),
+            value: past.value.clone(),
+            slope: past.slope.clone(),
+            lanes: match past.lanes.is_empty() {
+                true => vec![0.0; past.time.len() * lanes],
+                false => past.lanes.clone(),
+            },
+            ..History::default()
+        }
+    }
+
+    /// As much of it as reaches back over `seconds` from `s`.
+    pub(super) fn past(&self, s: f64, seconds: f64, lanes: usize) -> Past {
+        let from = self.s.partition_point(|t| *t <= s - seconds).saturating_sub(1);
+        Past {
+            time: self.s[from..].iter().map(|t| t - s).collect(),
+            value: self.value[from..].to_vec(),
+            slope: self.slope[from..].to_vec(),
+            lanes: self.lanes[from * lanes..].to_vec(),
+        }
+    }
+}
+
+/// The delays τ of the equations, one for each delayed expression, s.
+///
+/// ```
+/// # use greybox_model::{Model, System};
+/// let model = Model::from_toml(r#"
+/// [parameters]
+/// a = { value = 1.0, unit = "1/s" }
+/// tau = { value = 0.25, unit = "s" }
+/// [states]
+/// x = { unit = "m" }
+/// [equations]
+/// late = "x' + a*delay(x, 2*tau) = 0"
+/// "#, "model.toml").unwrap();
+/// let system = System::compile(&model).unwrap();
+/// assert_eq!(greybox_simulate::delays(&system, &[1.0, 0.2]), [0.4]);
+/// ```
+pub fn delays(system: &System, parameters: &[f64]) -> Vec<f64> {
+    let tape = &system.rhs;
+    let (mut registers, mut modes) = (vec![0.0; tape.registers()], vec![1; tape.switches.len()]);
+    registers[system.parameters()..][..system.np].copy_from_slice(parameters);
+    tape.prepare(&mut registers, &mut modes);
+    tape.delays.iter().map(|d| registers[d.tau as usize].max(0.0)).collect()
+}
+
 /// Entries of the state vector that an equation delays as they are.
 pub fn delayed_states(system: &System) -> Vec<usize> {
     system.rhs.delays.iter().filter_map(|d| state_leaf(system, d.arg_leaf)).collect()

@@ -1,5 +1,6 @@
 //! A simulation that goes from sample to sample and may be set elsewhere at each of them.
 
+use super::history::{History, Past};
 use super::{Core, Simulation};
 
 /// A simulation that goes from sample to sample: its state, and the tangents of the state, may be set at each of them, as a
@@ -60,6 +61,49 @@ impl<'a> Simulation<'a> {
         let known = vec![0; core.rhs_history.len()];
         Stepper { core, sample: 0, moved: false, known }
     }
+
+    /// A simulation that goes on at `sample` from the state `x0`, where the delayed expressions of the equations were what
+    /// `past` says of each: a stepper that was at that sample leaves it ([`Stepper::past`]). An expression without a past
+    /// holds its initial value. The past depends on the lanes as it says, but not on those of the initial states.
+    ///
+    /// ```
+    /// # use greybox_model::{Model, System};
+    /// use greybox_simulate::{Environment, Method, Seeds, Simulation};
+    /// # let model = Model::from_toml(r#"
+    /// # [parameters]
+    /// # a = { value = 1.0, unit = "1/s" }
+    /// # tau = { value = 0.25, unit = "s" }
+    /// # [states]
+    /// # x = { unit = "m" }
+    /// # [equations]
+    /// # late = "x' + a*delay(x, tau) = 0"
+    /// # "#, "model.toml").unwrap();
+    /// # let system = System::compile(&model).unwrap();
+    /// let environment = Environment { start: 0.0, dt: 0.01, len: 100, inputs: vec![], forces: vec![] };
+    /// let simulation = Simulation {
+    ///     system: &system,
+    ///     environment: &environment,
+    ///     parameters: &[1.0, 0.25],
+    ///     method: Method::Rk4 { substeps: 1 },
+    ///     seeds: &Seeds::default(),
+    /// };
+    /// let mut whole = simulation.stepper(&[1.0]);
+    /// (0..40).for_each(|_| assert!(whole.step()));
+    /// let mut rest = simulation.stepper_from(whole.sample(), whole.state(), &whole.past(0.25));
+    /// (0..40).for_each(|_| assert!(whole.step() && rest.step()));
+    /// assert!((rest.state()[0] - whole.state()[0]).abs() < 1e-12);
+    /// ```
+    pub fn stepper_from(&self, sample: usize, x0: &[f64], past: &[Past]) -> Stepper<'a> {
+        let s = sample as f64 * self.environment.dt;
+        let mut core = Core::new(self, x0, s);
+        let lanes = core.lanes;
+        for (history, past) in core.rhs_history.iter_mut().zip(past) {
+            *history = History::known(past, s, lanes);
+        }
+        core.start_modes();
+        let known = core.rhs_history.iter().map(|h| h.s.len()).collect();
+        Stepper { core, sample, moved: false, known }
+    }
 }
 
 impl Stepper<'_> {
@@ -99,6 +143,13 @@ impl Stepper<'_> {
     /// The lanes of the initial states begin anew: each is the derivative by its entry of the state as it is now. What was
     /// before does not depend on that.
     pub fn restart_lanes(&mut self) {
+        self.restart_lanes_after(&[]);
+    }
+
+    /// As [`restart_lanes`](Self::restart_lanes), where the initial states of before depended on the other lanes: `by` has a
+    /// row for each initial state, with the derivatives by the parameters and then by the signals of the
+    /// [`Seeds`](crate::Seeds). What was before depends on these as its initial states did.
+    pub fn restart_lanes_after(&mut self, by: &[f64]) {
         let (first, entries) = (self.core.seeds.parameters.len(), &self.core.seeds.initial);
         let (lanes, width) = (self.core.lanes, self.core.width);
         for i in 0..self.core.system.nx {
@@ -106,10 +157,16 @@ impl Stepper<'_> {
                 self.core.d[self.core.at_dx + i * width + first + l] = f64::from(u8::from(i == *entry));
             }
         }
+        let initial = first..first + entries.len();
         for (history, known) in self.core.rhs_history.iter_mut().zip(&mut self.known) {
             let end = history.s.len();
             for entry in history.lanes[*known * lanes..].chunks_exact_mut(lanes.max(1)) {
-                entry[first..first + entries.len()].fill(0.0);
+                for (l, by) in initial.clone().zip(by.chunks_exact((lanes - entries.len()).max(1))) {
+                    let d = std::mem::take(&mut entry[l]);
+                    entry[..first].iter_mut().zip(by).for_each(|(e, by)| *e += d * by);
+                    entry[initial.end..].iter_mut().zip(&by[first..]).for_each(|(e, by)| *e += d * by);
+                }
+                entry[initial.clone()].fill(0.0);
             }
             *known = end;
         }
@@ -155,6 +212,11 @@ impl Stepper<'_> {
         self.core.s = self.sample as f64 * self.core.env.dt;
         self.forget();
         self.core.result.diverged.is_none()
+    }
+
+    /// What the delayed expressions of the equations were in the last `seconds`, as they were simulated.
+    pub fn past(&self, seconds: f64) -> Vec<Past> {
+        self.core.rhs_history.iter().map(|h| h.past(self.core.s, seconds, self.core.lanes)).collect()
     }
 
     /// Cuts off what no delay reaches any more.
