@@ -16,6 +16,7 @@ mod peer;
 mod scale;
 mod simulation;
 mod sparse;
+mod watching;
 mod whole;
 
 use std::path::{Path, PathBuf};
@@ -70,7 +71,10 @@ const SLOW: f64 = 10.0;
 
 /// All rows, in the order of the table.
 fn rows() -> Vec<Row> {
-    [sparse::rows(), simulation::rows(), control::rows(), whole::rows()].into_iter().flatten().collect()
+    [sparse::rows(), simulation::rows(), control::rows(), watching::rows(), whole::rows()]
+        .into_iter()
+        .flatten()
+        .collect()
 }
 
 /// What a run measured.
