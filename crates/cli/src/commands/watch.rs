@@ -28,7 +28,7 @@ mod connection;
 mod mqtt;
 mod source;
 
-use address::{Address, Source};
+use address::Source;
 use source::{Certificate, Message};
 
 /// How often the state is saved.
@@ -69,7 +69,7 @@ pub(crate) struct Arguments {
 
     /// Broker and topic to take samples from, instead of standard input: mqtt://host:1883/topic, by TLS mqtts://user:password@host:8883/topic; may be repeated, for topics of one broker
     #[arg(long, value_name = "URL")]
-    from: Vec<Address>,
+    from: Vec<String>,
 
     /// Certificate of this client (PEM), for a broker that demands one: mqtts://
     #[arg(long, value_name = "FILE", requires = "from")]

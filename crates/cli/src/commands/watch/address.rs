@@ -30,8 +30,11 @@ impl Source {
     /// The broker of all of these addresses; `None` where there are none.
     ///
     /// # Errors
-    /// Bad input: they are of several brokers, or of several users.
-    pub(super) fn of(addresses: &[Address]) -> Result<Option<Source>, Failure> {
+    /// Bad input: one is no address, or they are of several brokers or users.
+    pub(super) fn of(addresses: &[String]) -> Result<Option<Source>, Failure> {
+        // (Read here, since clap would print a wrong one with its password.)
+        let read = |text: &String| text.parse().map_err(|e| Failure::input(format!("`--from`: {e}")));
+        let addresses = addresses.iter().map(read).collect::<Result<Vec<Address>, Failure>>()?;
         let Some((first, others)) = addresses.split_first() else { return Ok(None) };
         let mut source = Source { address: first.clone(), topics: vec![first.topic.clone()] };
         for other in others {
@@ -152,9 +155,8 @@ mod tests {
 
     #[test]
     fn several_addresses_are_topics_of_one_broker() {
-        let of = |texts: &[&str]| {
-            Source::of(&texts.iter().map(|text| text.parse().unwrap()).collect::<Vec<Address>>())
-        };
+        let of =
+            |texts: &[&str]| Source::of(&texts.iter().map(|text| (*text).to_owned()).collect::<Vec<_>>());
         assert_eq!(of(&[]).unwrap(), None);
         let joined = of(&["mqtt://h/a", "mqtt://me:secret@h:1883/b/#", "mqtt://h/a", "mqtt://me:secret@h/c"]);
         let Source { address, topics } = joined.unwrap().unwrap();
@@ -164,6 +166,7 @@ mod tests {
             (["mqtt://h/a", "mqtt://i/a"], "two brokers, mqtt://h:1883 and mqtt://i:1883"),
             (["mqtt://h/a", "mqtts://h/a"], "two brokers, mqtt://h:1883 and mqtts://h:8883"),
             (["mqtt://h/a", "mqtt://h:1884/a"], "two brokers"),
+            (["mqtt://h/a", "mqtt://me:secret@h"], "`--from`: there is no topic"),
             (["mqtt://me:secret@h/a", "mqtt://you:secret@h/b"], "logs in at mqtt://h:1883 in two ways"),
             (["mqtt://me:secret@h/a", "mqtt://me:secrets@h/b"], "logs in at mqtt://h:1883 in two ways"),
         ] {

@@ -126,7 +126,9 @@ fn follow(
     let topics: Vec<String> = source.topics.iter().map(|topic| format!(" -t '{topic}'")).collect();
     let pipe = match topics.len() {
         1 => format!("mosquitto_sub -L {broker}/{}", source.address.topic),
-        _ => format!("mosquitto_sub -h {}{}", source.address.host, topics.concat()),
+        _ => {
+            format!("mosquitto_sub -h {} -p {}{}", source.address.host, source.address.port, topics.concat())
+        }
     };
     Err(Failure::input(format!("{broker}: this greybox was built without MQTT"))
         .help(format!("install it with `cargo install --features mqtt …`, or pipe `{pipe}` into it")))
