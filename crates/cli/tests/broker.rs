@@ -6,7 +6,7 @@ use std::fmt::Write as _;
 use std::process::Stdio;
 
 use common::Bench;
-use running::{Broker, Watching, watch};
+use running::{Broker, Running, Watching, until, watch};
 
 #[allow(dead_code, reason = "not every test file uses all of it")]
 mod common;
@@ -148,15 +148,47 @@ fn certificates(bench: &Bench) -> bool {
             .to_owned(),
     ]
     .iter()
-    .all(|arguments| {
-        let mut openssl = std::process::Command::new("openssl");
-        openssl.args(arguments.split_whitespace()).current_dir(bench.path(".")).stderr(Stdio::null());
-        openssl.status().is_ok_and(|status| status.success())
-    });
+    .all(|arguments| openssl(bench, arguments));
     if !made {
         eprintln!("skipped: openssl is not installed (Debian: openssl)");
     }
     made
+}
+
+fn openssl(bench: &Bench, arguments: &str) -> bool {
+    let mut openssl = std::process::Command::new("openssl");
+    openssl.args(arguments.split_whitespace()).current_dir(bench.path(".")).stderr(Stdio::null());
+    openssl.status().is_ok_and(|status| status.success())
+}
+
+/// Certificates of clients beside [`certificates`], with keys of every format.
+fn client_certificates(bench: &Bench) {
+    let signed = "x509 -req -days 2 -CA authority.pem -CAkey authority.key -CAcreateserial";
+    for arguments in [
+        "req -newkey ec -pkeyopt ec_paramgen_curve:prime256v1 -nodes -subj /CN=rig -keyout client.key -out client.csr",
+        &format!("{signed} -in client.csr -out client.pem"),
+        "ec -in client.key -out sec1.key",
+        "req -newkey rsa:2048 -nodes -subj /CN=rig -keyout rsa8.key -out rsa.csr",
+        &format!("{signed} -in rsa.csr -out rsa.pem"),
+        "rsa -in rsa8.key -traditional -out rsa.key",
+        "pkey -in client.key -aes256 -passout pass:secret -out encrypted.key",
+        "rsa -in rsa8.key -traditional -aes256 -passout pass:secret -out old.key",
+        "x509 -req -days 2 -in client.csr -CA other.pem -CAkey other.key -CAcreateserial -out stranger.pem",
+        "x509 -in client.pem -outform der -out client.der",
+        &format!("{signed} -in client.csr -extfile names -out third.pem"),
+        "req -newkey ec -pkeyopt ec_paramgen_curve:secp521r1 -nodes -x509 -subj /CN=rig -keyout p521.key -out p521.pem",
+    ] {
+        assert!(openssl(bench, arguments), "openssl {arguments}");
+    }
+    bench.write("both.pem", &(bench.read("client.pem") + &bench.read("sec1.key")));
+    bench.write("damaged.key", &bench.read("client.key").replace("\nM", "\n?"));
+    for (file, form) in [
+        ("client.key", "BEGIN PRIVATE KEY"),
+        ("sec1.key", "BEGIN EC PRIVATE KEY"),
+        ("rsa.key", "BEGIN RSA PRIVATE KEY"),
+    ] {
+        assert!(bench.read(file).contains(form), "{file}");
+    }
 }
 
 /// What comes by TLS is what was sent; a broker that the machine does not trust, or that is another, is refused.
@@ -215,6 +247,183 @@ fn a_broker_by_tls_is_followed_where_its_certificate_is_trusted() {
         assert!(stderr.contains(words), "{from}: {stderr}");
     }
     drop(silent);
+}
+
+/// A broker that demands a certificate takes that of this client, its key in whatever format; every other is refused, here or there.
+#[test]
+fn a_broker_that_demands_a_certificate_gets_one() {
+    let bench = bench();
+    if !certificates(&bench) {
+        return;
+    }
+    client_certificates(&bench);
+    let at = |file: &str| bench.path(file).display().to_string();
+    let config = format!(
+        "allow_anonymous true\nrequire_certificate true\ncafile {}\ncertfile {}\nkeyfile {}",
+        at("authority.pem"),
+        at("broker.pem"),
+        at("broker.key")
+    );
+    let Some(mut broker) = Broker::start(&bench, &config) else { return };
+    let lines = messages(20.0);
+    let (whole, state) = fed(&bench, &lines.join("\n"));
+    let from = |port: &str| format!("mqtts://127.0.0.1:{port}/plant/throttle");
+    let with = |arguments: &[&str]| {
+        let mut command = watch(&bench);
+        command.args(["--learn", "15"]).args(arguments).env("SSL_CERT_FILE", at("authority.pem"));
+        command.env_remove("SSL_CERT_DIR");
+        command
+    };
+    let here = from(&broker.port);
+    for [certificate, key] in [
+        ["client.pem", "client.key"],
+        ["client.pem", "sec1.key"],
+        ["third.pem", "client.key"],
+        ["rsa.pem", "rsa8.key"],
+        ["rsa.pem", "rsa.key"],
+    ] {
+        let mut command = with(&["--from", &here, "--cert", certificate, "--key", key]);
+        assert_eq!(Watching::start_as(&mut command).until("subscribed").len(), 1, "{certificate} {key}");
+    }
+
+    let mut command = with(&["--from", &here, "--cert", "both.pem", "--state", "state.json"]);
+    let watching = Watching::start_as(&mut command);
+    watching.until("subscribed");
+    let login = ["--cafile", &at("authority.pem"), "--cert", &at("client.pem"), "--key", &at("client.key")];
+    broker.publish(&lines, &login);
+    watching.until_saved(&bench, "state.json", &state);
+    assert_eq!(watching.rest(), whole);
+    broker.kill();
+    assert_eq!(watching.next().1["event"], "disconnected");
+    assert!(broker.run());
+    while watching.next().1["event"] != "subscribed" {}
+
+    // Another broker, which demands one by TLS 1.2.
+    let port = std::net::TcpListener::bind("127.0.0.1:0").unwrap().local_addr().unwrap().port().to_string();
+    let server = "s_server -quiet -tls1_2 -Verify 1 -verify_return_error -CAfile authority.pem -cert broker.pem -key broker.key";
+    let mut older = std::process::Command::new("openssl");
+    older.args(server.split_whitespace()).args(["-accept", &port]).current_dir(bench.path("."));
+    let older = older.stdin(Stdio::piped()).stdout(Stdio::null()).stderr(Stdio::null()).spawn().unwrap();
+    let _older = Running(older);
+    until("it listens", || std::net::TcpStream::connect(format!("127.0.0.1:{port}")).is_ok());
+    let plain = here.replace("mqtts", "mqtt");
+    let (here, older) = (here.as_str(), &from(&port));
+    for (arguments, parts) in [
+        (
+            &["--from", here][..],
+            ["demands a certificate of its client", "--cert client.pem --key client.key"],
+        ),
+        (&["--from", older], ["demands a certificate of its client", "--cert client.pem --key client.key"]),
+        (
+            &["--from", here, "--cert", "stranger.pem", "--key", "client.key"],
+            ["does not trust the authority that signed this client's certificate", "mosquitto: `cafile`"],
+        ),
+        (&["--from", here, "--cert", "nowhere.pem"], ["nowhere.pem: no such file", "check the path"]),
+        (&["--from", here, "--cert", "client.pem", "--key", "gone.key"], ["gone.key: no such file", "path"]),
+        (&["--from", here, "--cert", "client.key"], ["client.key: there is no certificate", "--cert"]),
+        (&["--from", here, "--cert", "client.pem"], ["client.pem: there is no private key", "after `--key`"]),
+        (
+            &["--from", here, "--cert", "client.pem", "--key", "rsa.key"],
+            ["rsa.key: the key is not that of the certificate in client.pem", "was requested"],
+        ),
+        (
+            &["--from", here, "--cert", "client.pem", "--key", "encrypted.key"],
+            ["encrypted.key: the key in this file is encrypted", "openssl pkey"],
+        ),
+        (
+            &["--from", here, "--cert", "rsa.pem", "--key", "old.key"],
+            ["old.key: the key in this file is encrypted", "openssl pkey"],
+        ),
+        (&["--from", here, "--cert", "client.der"], ["client.der: this is DER, not PEM", "-inform der"]),
+        (
+            &["--from", here, "--cert", "client.pem", "--key", "damaged.key"],
+            ["damaged.key: the certificate or key in this file is damaged", "copy the file again"],
+        ),
+        (
+            &["--from", here, "--cert", "p521.pem", "--key", "p521.key"],
+            ["p521.key: the key is of no kind that is taken here", "P-384"],
+        ),
+        (
+            &["--from", &plain, "--cert", "both.pem"],
+            ["mqtt://127.0.0.1:", "`--cert both.pem` is for TLS, and this address is without"],
+        ),
+        (&["--cert", "both.pem"], ["--from <URL>", "required"]),
+        (&["--from", here, "--key", "client.key"], ["--cert <FILE>", "required"]),
+    ] {
+        let said = with(arguments).stdin(Stdio::null()).output().unwrap();
+        let stderr = String::from_utf8(said.stderr).unwrap();
+        assert_eq!(said.status.code(), Some(2), "{arguments:?}: {stderr}");
+        assert!(parts.iter().all(|part| stderr.contains(part)), "{arguments:?}: {stderr}");
+    }
+}
+
+/// Samples of several topics are one stream; what comes by two subscriptions is one sample.
+#[test]
+fn several_topics_of_a_broker_are_one_stream() {
+    let bench = bench();
+    let Some(broker) = Broker::start(&bench, "allow_anonymous true") else { return };
+    let lines = messages(20.0);
+    let (whole, state) = fed(&bench, &lines.join("\n"));
+    let from = |topic: &str| format!("--from=mqtt://127.0.0.1:{}/{topic}", broker.port);
+    let (first, second) = (from("hall/1/throttle"), from("yard/samples"));
+    let watching = Watching::start(&bench, &["--learn", "15", &first, &second, "--state", "state.json"]);
+    let overlapping = Watching::start(&bench, &["--learn", "15", &first, &from("hall/#"), &second]);
+    for topic in ["hall/1/throttle", "yard/samples"] {
+        assert_eq!(watching.next().1["topic"], topic);
+    }
+    (0..3).for_each(|_| assert_eq!(overlapping.next().1["event"], "subscribed"));
+    for (k, piece) in lines.chunks(300).enumerate() {
+        let topic = ["hall/1/throttle", "yard/samples"][k % 2];
+        broker.publish_to(topic, piece, &[]);
+        broker.publish_to("elsewhere", piece, &[]);
+    }
+    watching.until_saved(&bench, "state.json", &state);
+    assert_eq!(watching.rest(), whole);
+    let mut said = Vec::new();
+    while said.len() < whole.len() {
+        let (line, event) = overlapping.next();
+        if event["event"] == "irregular" {
+            assert!(event["repeated"].as_u64() > Some(0) && event["late"] == 0, "{line}");
+        } else {
+            said.push(line);
+        }
+    }
+    assert_eq!(said, whole);
+
+    let refused = bench.greybox_fed(&["watch", "throttle.toml", &first, "--from=mqtt://other/yard"], "");
+    assert_eq!(refused.code, 2);
+    for part in ["`--from` names two brokers, mqtt://127.0.0.1:", "and mqtt://other:1883", "one broker"] {
+        assert!(refused.stderr.contains(part), "{}", refused.stderr);
+    }
+}
+
+/// A broker that refuses one topic of two: the subscription is refused, and the topic named.
+#[test]
+fn a_topic_that_is_refused_is_named() {
+    use std::io::{Read as _, Write as _};
+    let bench = bench();
+    for (codes, named) in [(&[1, 0x80][..], "`yard`"), (&[0x80, 0x80], "`hall`, `yard`"), (&[1], "`yard`")] {
+        let listener = std::net::TcpListener::bind("127.0.0.1:0").unwrap();
+        let port = listener.local_addr().unwrap().port();
+        let broker = std::thread::spawn(move || {
+            let mut socket = listener.accept().unwrap().0;
+            let mut packet = [0; 256];
+            assert!(socket.read(&mut packet).unwrap() > 0);
+            socket.write_all(&[0x20, 2, 0, 0]).unwrap();
+            let read = socket.read(&mut packet).unwrap();
+            // (Its number, then each topic with its length before it and a byte of options after it.)
+            assert_eq!(&packet[4..read], b"\0\x04hall\x01\0\x04yard\x01");
+            let answer = [&[0x90, 2 + codes.len() as u8, packet[2], packet[3]], codes].concat();
+            socket.write_all(&answer).unwrap();
+            let _ = socket.read(&mut packet);
+        });
+        let from = |topic: &str| format!("--from=mqtt://127.0.0.1:{port}/{topic}");
+        let said = bench.greybox_fed(&["watch", "throttle.toml", &from("hall"), &from("yard")], "");
+        broker.join().unwrap();
+        assert_eq!(said.code, 2);
+        let part = format!("the broker refuses the subscription to {named}\n");
+        assert!(said.stderr.contains(&part), "{}", said.stderr);
+    }
 }
 
 #[test]

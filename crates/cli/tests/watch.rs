@@ -133,6 +133,55 @@ fn dates_say_the_same() {
     );
 }
 
+/// What `ros2 topic echo --csv /joint_states` prints of a joint, `sensor_msgs/msg/JointState`: no header, a stamp in seconds and
+/// nanoseconds, an empty frame, a name, position, velocity, effort.
+#[test]
+fn rows_without_a_header_say_the_same() {
+    let bench = bench();
+    let names = "--columns=t [s],t [ns],_,_,angle [rad],,torque [N*m]";
+    let (mut ros, mut csv) = (String::new(), "t,torque [N*m],angle [rad]\n".to_owned());
+    for [t, torque, angle] in throttle::samples(20.0) {
+        let nanoseconds = 456_789 + (t * 1e9).round() as u64;
+        let (sec, nanosec) = (1_795_955_696 + nanoseconds / 1_000_000_000, nanoseconds % 1_000_000_000);
+        let _ = writeln!(ros, "{sec},{nanosec},,throttle_joint,{angle:?},nan,{torque:?}");
+        let _ = writeln!(csv, "{sec}.{nanosec:09},{torque:?},{angle:?}");
+    }
+    assert!(ros.starts_with("1795955696,456789,,throttle_joint,"), "{ros:.60}");
+    let watch = ["watch", "throttle.toml", "--json", "--learn", "15"];
+    let from_csv = bench.greybox_fed(&watch, &csv);
+    let named = [&watch[..], &[names]].concat();
+    let from_ros = bench.greybox_fed(&named, &ros);
+    assert_eq!(
+        (from_ros.code, from_ros.stdout.as_str()),
+        (0, from_csv.stdout.as_str()),
+        "{}",
+        from_ros.stderr
+    );
+    let learned = &events(&from_ros.stdout)[0];
+    assert_eq!((&learned["event"], &learned["t"]), (&"learned".into(), &1_795_955_711.000_456_8.into()));
+
+    // Rows that cannot be read: the rest of one where the stream is joined, a header, one of two joints.
+    let rows = [
+        "56789,,throttle_joint,0.1,nan,0.2\n",
+        "sec,nanosec,frame_id,name,position,velocity,effort\n",
+        &ros,
+        "1795955716,0,,throttle_joint,other_joint,0.0,0.0,nan,nan,0.0,0.0\n",
+    ];
+    let said = bench.greybox_fed(&named, &rows.concat());
+    let (unreadable, others): (Vec<Value>, Vec<Value>) =
+        events(&said.stdout).into_iter().partition(|e| e["event"] == "unreadable");
+    assert_eq!(others, events(&from_csv.stdout));
+    let lines: Vec<&Value> = unreadable.iter().map(|e| &e["line"]).collect();
+    assert_eq!(lines, [1, 2, 2003]);
+    for (event, part) in unreadable.iter().zip([
+        "standard input:1: cells in the row: 6; columns that are named: 7; name every column",
+        "standard input:2:t (column 1): `sec` is not a number",
+        "standard input:2003: cells in the row: 11; columns that are named: 7",
+    ]) {
+        assert!(event["message"].as_str().unwrap().starts_with(part), "{event}");
+    }
+}
+
 /// JSON lines, keys within objects, other names and units, lines that cannot be read: the same events.
 #[test]
 fn json_lines_say_the_same() {
@@ -350,6 +399,29 @@ fn what_cannot_be_watched_is_refused() {
     refused(&[model], "t,torque,angle [m]\n0,0,0\n", &["channel `angle` is in [m]", "[rad]"]);
     refused(&[model], "0,1,2\n", &["standard input:1"]);
     refused(&[model], &format!("t,torque,angle\n{}", "x\n".repeat(200)), &["100 lines one after the other"]);
+    let columns =
+        |names: &str, input: &str, parts: &[&str]| refused(&[model, "--columns", names], input, parts);
+    columns("t,torque,_", "", &["--columns: there is no channel `angle`", "it names `torque`", "--map"]);
+    columns("t,torque,angle [m]", "", &["--columns: channel `angle` is in [m]", "[rad]"]);
+    columns("sec,torque,angle", "", &["--columns: there is no time", "`t [s],t [ns]`"]);
+    columns("t,angle,angle", "", &["--columns:angle (column 3): the name `angle` stands twice"]);
+    let rows = "0,1\n".repeat(200);
+    columns(
+        "t,torque,angle",
+        &rows,
+        &["100 lines one after the other", "columns that are named: 3", "those not to read `_`"],
+    );
+    columns(
+        "t,torque,angle",
+        "{\"t\": 0}\n",
+        &["standard input:1: this is a JSON object", "leave `--columns` out"],
+    );
+    columns("t,torque,angle", "m torque=0,angle=0 1\n", &["this is a line of the Influx protocol", "leave"]);
+    refused(
+        &[model, "--columns", "t,torque,angle", "--from", "mqtt://host/topic"],
+        "",
+        &["cannot be used with"],
+    );
     bench.write("state.json", "{}");
     refused(&[model, "--state", "state.json"], "", &["state.json: this is no state of a watch"]);
     let late = throttle::MODEL

@@ -23,7 +23,8 @@ const LABEL: &str = "first seconds";
 /// Lines in which nothing could be read from which on the input is taken to be something else.
 const UNREADABLE: usize = 100;
 
-/// A watch on lines of samples: CSV with a header, JSON objects, or the Influx line protocol.
+/// A watch on lines of samples: CSV with a header or with [named columns](Session::with_columns), JSON objects, or the Influx
+/// line protocol.
 #[derive(Debug)]
 pub struct Session {
     model: LoadedModel,
@@ -32,6 +33,8 @@ pub struct Session {
     /// Lines, or messages, so far.
     line: u64,
     lines: Option<Lines>,
+    /// Names of the columns of lines without a header.
+    columns: Option<String>,
     /// That of the samples, from the first of them on.
     clock: Option<Clock>,
     stage: Stage,
@@ -139,22 +142,38 @@ impl Session {
             None => (None, Stage::Learning(First::default())),
         };
         let map = map.to_vec();
-        Ok(Session { model, map, options, line: 0, lines: None, clock, stage, unreadable: 0 })
+        Ok(Session { model, map, options, line: 0, lines: None, columns: None, clock, stage, unreadable: 0 })
+    }
+
+    /// The same on rows of CSV that have no header, whose columns have these names: `t [s],t [ns],_,angle [deg]`, as
+    /// [`CsvLines::named`](greybox_recording::CsvLines::named) takes them.
+    ///
+    /// # Errors
+    /// Bad input: names that do not fit, or without the model's channels.
+    pub fn with_columns(mut self, names: &str) -> Result<Session, Failure> {
+        Lines::named(&self.model.model, &self.map, names)?;
+        self.columns = Some(names.to_owned());
+        Ok(self)
     }
 
     /// Takes the next line.
     ///
     /// # Errors
-    /// Bad input: a header without the model's channels, first seconds from which nothing can be learned, or
-    /// nothing but lines that cannot be read.
+    /// Bad input: a header without the model's channels, lines of another kind than their columns were named for, first
+    /// seconds from which nothing can be learned, or nothing but lines that cannot be read.
     pub fn line(&mut self, text: &str) -> Result<Vec<Output>, Failure> {
         self.line += 1;
         if text.trim().is_empty() {
             return Ok(Vec::new());
         }
         let (model, place) = (&self.model.model, Place { topic: None, line: self.line });
-        match &self.lines {
-            None => {
+        match (&self.lines, &self.columns) {
+            (None, Some(columns)) => {
+                let lines = Lines::named(model, &self.map, columns)?;
+                lines.check_first(text, place)?;
+                self.lines = Some(lines);
+            }
+            (None, None) => {
                 let lines = Lines::new(model, &self.map, text, place)?;
                 let sample = lines.begins_with_a_sample();
                 self.lines = Some(lines);
@@ -162,13 +181,13 @@ impl Session {
                     return Ok(Vec::new());
                 }
             }
-            Some(lines) if lines.may_be_a_header(text) => {
+            (Some(lines), None) if lines.may_be_a_header(text) => {
                 if let Ok(again) = Lines::new(model, &self.map, text, place) {
                     self.lines = Some(again);
                     return Ok(Vec::new());
                 }
             }
-            Some(_) => {}
+            (Some(_), _) => {}
         }
         self.sample(text, None)
     }
@@ -240,9 +259,12 @@ impl Session {
                     return Err(Failure::input(format!(
                         "{UNREADABLE} lines one after the other cannot be read; the last: {message}"
                     ))
-                    .help(match topic {
-                        None => "send CSV with a header, or one JSON object a line with the time as `t`",
-                        Some(_) => {
+                    .help(match (topic, &self.columns) {
+                        (None, None) => {
+                            "send CSV with a header, or one JSON object a line with the time as `t`"
+                        }
+                        (None, Some(_)) => "name every column of a row after `--columns`, those not to read `_`",
+                        (Some(_), _) => {
                             "subscribe to the topic of the samples alone: JSON objects with the time as `t`, or lines of \
                              the Influx protocol"
                         }

@@ -172,6 +172,16 @@ pub enum RecordingError {
         /// Number of the first column of that name, counted from 1.
         first: usize,
     },
+    /// Names given to the columns of lines that have no header do not fit.
+    #[error("{place}: {found}; {help}")]
+    Columns {
+        /// What names them, or the row that has other ones.
+        place: Place,
+        /// What is wrong.
+        found: String,
+        /// How to fix it.
+        help: &'static str,
+    },
     /// A row has more or fewer cells than the header.
     #[error(
         "{place}: the row has {}, the header has {expected}; {help}",
@@ -433,6 +443,7 @@ impl RecordingError {
             | Self::NoChannels { place }
             | Self::HeaderCell { place, .. }
             | Self::DuplicateName { place, .. }
+            | Self::Columns { place, .. }
             | Self::CellCount { place, .. }
             | Self::NotANumber { place, .. }
             | Self::NotFinite { place, .. }

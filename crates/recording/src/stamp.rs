@@ -80,21 +80,35 @@ impl Stamp {
     pub fn decimal(text: &str, exponent: i32) -> Option<Stamp> {
         let value: f64 = text.parse().ok().filter(|v: &f64| v.is_finite())?;
         let seconds = value * scale(exponent);
-        let exact = || {
-            let (whole, fraction) = text.split_once('.').unwrap_or((text, ""));
-            let digits: i128 = format!("{whole}{fraction}").parse().ok()?;
-            let per =
-                10u32.checked_pow(u32::try_from(fraction.len()).ok()?.checked_add_signed(-exponent)?)?;
-            Some(Stamp::count(digits, per, Zone::Seconds))
-        };
-        let large = seconds.abs() > ROOM as f64;
-        Some(large.then(exact).flatten().unwrap_or_else(|| Stamp::number(seconds)))
+        let exact = if seconds.abs() > ROOM as f64 { exact(text, exponent) } else { None };
+        Some(exact.unwrap_or_else(|| Stamp::number(seconds)))
+    }
+
+    /// The same of a part of a time: it may be small and belong to a large one, so that every digit counts.
+    pub(crate) fn part(text: &str, exponent: i32) -> Option<Stamp> {
+        exact(text, exponent).or_else(|| Stamp::decimal(text, exponent))
+    }
+
+    /// This time and another part of it.
+    pub(crate) fn plus(self, part: Stamp) -> Stamp {
+        let rest = self.rest + part.rest;
+        let whole = rest.floor();
+        let seconds = self.seconds.saturating_add(part.seconds).saturating_add(whole as i64);
+        Stamp { seconds, rest: rest - whole, zone: self.zone }
     }
 
     /// Seconds after `origin`, which is in whole ones.
     pub fn after(&self, origin: i64) -> f64 {
         self.seconds.saturating_sub(origin) as f64 + self.rest
     }
+}
+
+/// Every digit of a decimal number without an exponent; `None` where there are too many.
+fn exact(text: &str, exponent: i32) -> Option<Stamp> {
+    let (whole, fraction) = text.split_once('.').unwrap_or((text, ""));
+    let digits: i128 = format!("{whole}{fraction}").parse().ok()?;
+    let per = 10u32.checked_pow(u32::try_from(fraction.len()).ok()?.checked_add_signed(-exponent)?)?;
+    Some(Stamp::count(digits, per, Zone::Seconds))
 }
 
 /// Seconds per unit.

@@ -21,13 +21,15 @@ use crate::loading;
 
 mod address;
 #[cfg(feature = "mqtt")]
+mod certificate;
+#[cfg(feature = "mqtt")]
 mod connection;
 #[cfg(feature = "mqtt")]
 mod mqtt;
 mod source;
 
-use address::Address;
-use source::Message;
+use address::Source;
+use source::{Certificate, Message};
 
 /// How often the state is saved.
 const SAVED_EVERY: Duration = Duration::from_secs(1);
@@ -43,8 +45,9 @@ const WAITING: usize = 4096;
   greybox watch drive.toml --learn 120 --alarms-per-day 0.1 --state drive.state < samples.csv
   greybox watch drive.toml --from mqtt://localhost:1883/drive/samples --state drive.state
   tail -f log.csv | greybox watch drive.toml --map \"theta=sensor_3 [deg]\" --json
+  ros2 topic echo --csv /joint_states | greybox watch arm.toml --columns \"t [s],t [ns],_,_,angle,_,torque\"
 
-Samples come on standard input, one a line: CSV with a header (first column `t`, in seconds or a date), JSON objects such as
+Samples come on standard input, one a line: CSV with a header (first column `t`, in seconds or a date), or without one and --columns, JSON objects such as
 {\"t\": 0.01, \"angle\": 1.25}, or the Influx line protocol; or, with --from, as messages of an MQTT broker. The first seconds tell what is usual; while they last, nothing is watched. With --json,
 every event and, after every block of samples, the estimates with their covariance are JSON objects, one a line.")]
 pub(crate) struct Arguments {
@@ -64,9 +67,27 @@ pub(crate) struct Arguments {
     #[arg(long, value_name = "RATE", default_value_t = Options::default().alarms_per_day)]
     alarms_per_day: f64,
 
-    /// Broker and topic to take samples from, instead of standard input: mqtt://host:1883/topic, by TLS mqtts://user:password@host:8883/topic
+    /// Broker and topic to take samples from, instead of standard input: mqtt://host:1883/topic, by TLS mqtts://user:password@host:8883/topic; may be repeated, for topics of one broker
     #[arg(long, value_name = "URL")]
-    from: Option<Address>,
+    from: Vec<String>,
+
+    /// Certificate of this client (PEM), for a broker that demands one: mqtts://
+    #[arg(long, value_name = "FILE", requires = "from")]
+    cert: Option<PathBuf>,
+
+    /// Private key of that certificate (PEM, not encrypted), where it stands in a file of its own
+    #[arg(long, value_name = "FILE", requires = "cert")]
+    key: Option<PathBuf>,
+
+    // (Not a doc comment: rustdoc takes a unit in brackets for a link.)
+    #[arg(
+        long,
+        value_name = "NAMES",
+        conflicts_with = "from",
+        help = "Names of the columns of CSV without a header, with their units, such as \"t [s],t [ns],_,angle [deg]\": `_` is \
+                not read, several columns `t` add up"
+    )]
+    columns: Option<String>,
 
     /// File that keeps what was learned, saved every second; where it exists, the watch goes on from it
     #[arg(long, value_name = "FILE")]
@@ -86,11 +107,17 @@ pub(crate) fn run(arguments: &Arguments, format: OutputFormat) -> Result<Answer,
     let state = arguments.state.as_deref();
     let saved = state.map(read).transpose()?.flatten();
     let mut session = Session::new(model, &arguments.names.map, options, saved)?;
+    if let Some(columns) = &arguments.columns {
+        session = session.with_columns(columns)?;
+    }
+    let certificate = arguments.cert.as_deref();
+    let certificate =
+        certificate.map(|certificate| Certificate { certificate, key: arguments.key.as_deref() });
     let mut kept = Kept { path: state, changed: false, saved: now() };
     let stopped = stop_signals()?;
     let (to, messages) = mpsc::sync_channel(WAITING);
-    match &arguments.from {
-        Some(address) => source::broker(address, to)?,
+    match Source::of(&arguments.from)? {
+        Some(source) => source::broker(source, certificate, to)?,
         None => source::standard_input(to),
     }
     let ended = watch(&mut session, &messages, &mut kept, (&stopped, format));

@@ -906,6 +906,26 @@ fn options() -> Vec<Row> {
         all("work that is negative", "greybox diagnose model.toml run.csv --out out --work -1"),
         all("work without a number", "greybox diagnose model.toml run.csv --out out --work"),
         all("an option given twice", "greybox diagnose model.toml run.csv --out out --out there"),
+        all(
+            "a watch of two brokers",
+            "greybox watch model.toml --from mqtt://one/samples --from mqtt://other/samples",
+        ),
+        all("an address of a broker without a topic", "greybox watch model.toml --from mqtt://broker"),
+        all(
+            "a certificate without TLS",
+            "greybox watch model.toml --from mqtt://broker/samples --cert client.pem",
+        ),
+        all(
+            "a key without its certificate",
+            "greybox watch model.toml --from mqtts://broker/samples --key client.key",
+        ),
+        all("names of columns without a time", "greybox watch model.toml --columns sec,nanosec,x"),
+        all("a column named twice", "greybox watch model.toml --columns t,x,x"),
+        all("a time in minutes among the names of columns", "greybox watch model.toml --columns 't [min],x'"),
+        all(
+            "objects where columns are named",
+            "echo '{\"t\": 0}' | greybox watch model.toml --columns t,f,x",
+        ),
         all("an input of `--inputs` that is not there", "greybox check run.csv --inputs g"),
         all(
             "two kinds of monomials",

@@ -84,16 +84,23 @@ impl Broker {
     }
 
     pub(crate) fn client(&self, program: &str, more: &[&str]) -> Command {
+        self.client_of(program, "plant/throttle", more)
+    }
+
+    fn client_of(&self, program: &str, topic: &str, more: &[&str]) -> Command {
         let mut command = Command::new(program);
-        command.args(["-h", "127.0.0.1", "-p", &self.port, "-q", "1", "-t", "plant/throttle"]).args(more);
+        command.args(["-h", "127.0.0.1", "-p", &self.port, "-q", "1", "-t", topic]).args(more);
         command
     }
 
     /// Publishes every line as a message, and waits until the broker has them all.
     pub(crate) fn publish(&self, lines: &[String], more: &[&str]) {
-        let arguments = [more, &["-l"]].concat();
-        let mut publisher =
-            Running(self.client("mosquitto_pub", &arguments).stdin(Stdio::piped()).spawn().unwrap());
+        self.publish_to("plant/throttle", lines, more);
+    }
+
+    pub(crate) fn publish_to(&self, topic: &str, lines: &[String], more: &[&str]) {
+        let mut command = self.client_of("mosquitto_pub", topic, &[more, &["-l"]].concat());
+        let mut publisher = Running(command.stdin(Stdio::piped()).spawn().unwrap());
         let mut input = publisher.0.stdin.take().unwrap();
         lines.iter().for_each(|line| writeln!(input, "{line}").unwrap());
         drop(input);

@@ -32,6 +32,9 @@ impl fmt::Display for Place<'_> {
     }
 }
 
+/// The option that names the columns of rows without a header, in messages.
+const COLUMNS: &str = "--columns";
+
 /// How lines are read: chosen by the first of them.
 #[derive(Debug)]
 pub(super) struct Lines {
@@ -79,6 +82,20 @@ impl Lines {
             true => None,
             false => Some(CsvLines::new(text, &place.label(), place.line)?),
         };
+        Lines::of(model, map, csv, &Names { place: place.to_string(), has: "the header has" })
+    }
+
+    /// Rows of a CSV file without a header, whose columns have these names.
+    ///
+    /// # Errors
+    /// Bad input: names that do not fit, or that lack the model's channels.
+    pub(super) fn named(model: &Model, map: &[Rename], columns: &str) -> Result<Lines, Failure> {
+        let label = Place { topic: None, line: 0 }.label();
+        let csv = CsvLines::named(columns, COLUMNS, &label)?;
+        Lines::of(model, map, Some(csv), &Names { place: COLUMNS.to_owned(), has: "it names" })
+    }
+
+    fn of(model: &Model, map: &[Rename], csv: Option<CsvLines>, stated_in: &Names) -> Result<Lines, Failure> {
         let (mut channels, mut columns) = (Vec::new(), Vec::new());
         for (number, wanted) in wanted(model).into_iter().enumerate() {
             let channel = wanted.channel.to_owned();
@@ -90,12 +107,12 @@ impl Lines {
                 None => (number, None),
                 Some(csv) => {
                     let found = csv.columns().iter().position(|(n, _)| n == name);
-                    let index = found.ok_or_else(|| missing(csv, name, &channel, place))?;
+                    let index = found.ok_or_else(|| missing(csv, name, &channel, stated_in))?;
                     (index, csv.columns()[index].1.as_deref())
                 }
             };
             let stated = header.or(given);
-            let unit = unit(model, &wanted, stated, place)?;
+            let unit = unit(model, &wanted, stated, &stated_in.place)?;
             channels.push(name.to_owned());
             columns.push(Column { channel, index, unit });
         }
@@ -114,6 +131,24 @@ impl Lines {
     /// Whether a line may be the header again, of a log that is written on.
     pub(super) fn may_be_a_header(&self, text: &str) -> bool {
         matches!(self.format, Format::Csv(_)) && text.trim_start_matches(['"', ' ']).starts_with('t')
+    }
+
+    /// Sees that the first line is a row, where columns have names that the caller gave.
+    ///
+    /// # Errors
+    /// Bad input: it is a JSON object, or a line of the Influx protocol.
+    pub(super) fn check_first(&self, text: &str, place: Place<'_>) -> Result<(), Failure> {
+        let kind = match self.row(text, place) {
+            Ok(_) => return Ok(()),
+            Err(_) if is_json(text) => "a JSON object",
+            Err(_) if influx::parse(text).is_ok() => "a line of the Influx protocol",
+            // (The first line of a log that is followed may be the rest of one.)
+            Err(_) => return Ok(()),
+        };
+        Err(Failure::input(format!(
+            "{place}: this is {kind}, but `{COLUMNS}` names the columns of CSV without a header"
+        ))
+        .help("leave `--columns` out: such a line names its values itself"))
     }
 
     /// Time and columns of a line, SI; `None` for one that has nothing of the model: a blank one, a comment, a line of
@@ -173,15 +208,21 @@ fn wanted(model: &Model) -> Vec<Wanted<'_>> {
     inputs.chain(measured).collect()
 }
 
-fn missing(csv: &CsvLines, name: &str, channel: &str, place: Place<'_>) -> Failure {
-    let available = listed(csv.columns().iter().map(|(n, _)| format!("`{n}`")).collect());
-    Failure::input(format!(
-        "{place}: there is no channel `{name}`, which the model needs; the header has {available}"
-    ))
-    .help(format!("name the channel that is `{channel}`: `--map \"{channel}=CHANNEL\"`"))
+/// Where names and units of columns are stated.
+struct Names {
+    place: String,
+    /// What it does, before a list of them.
+    has: &'static str,
 }
 
-fn unit(model: &Model, wanted: &Wanted<'_>, stated: Option<&str>, place: Place<'_>) -> Result<Unit, Failure> {
+fn missing(csv: &CsvLines, name: &str, channel: &str, names: &Names) -> Failure {
+    let Names { place, has } = names;
+    let available = listed(csv.columns().iter().map(|(n, _)| format!("`{n}`")).collect());
+    Failure::input(format!("{place}: there is no channel `{name}`, which the model needs; {has} {available}"))
+        .help(format!("name the channel that is `{channel}`: `--map \"{channel}=CHANNEL\"`"))
+}
+
+fn unit(model: &Model, wanted: &Wanted<'_>, stated: Option<&str>, place: &str) -> Result<Unit, Failure> {
     let channel = wanted.channel;
     let found = recorded_unit(model, stated, wanted.unit, wanted.measured)
         .map_err(|e| Failure::input(format!("{place}: channel `{channel}`: {e}")))?;
@@ -192,7 +233,7 @@ fn unit(model: &Model, wanted: &Wanted<'_>, stated: Option<&str>, place: Place<'
         "{place}: channel `{channel}` is in [{}], but the model has it in [{}]",
         found.text, wanted.unit.text
     ))
-    .help("correct the unit in the header or in the model"))
+    .help("correct the unit there or in the model"))
 }
 
 /// Time and values of a line of the Influx protocol.

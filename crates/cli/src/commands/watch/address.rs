@@ -4,6 +4,8 @@ use std::str::FromStr;
 
 use percent_encoding::percent_decode_str;
 
+use crate::failure::Failure;
+
 /// `mqtt://[user[:password]@]host[:port]/topic`, or `mqtts://…` by TLS.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub(crate) struct Address {
@@ -14,6 +16,52 @@ pub(crate) struct Address {
     pub(super) user: Option<String>,
     pub(super) password: Option<String>,
     pub(super) topic: String,
+}
+
+/// A broker, and the topics that are read of it.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub(super) struct Source {
+    /// That of its first topic.
+    pub(super) address: Address,
+    pub(super) topics: Vec<String>,
+}
+
+impl Source {
+    /// The broker of all of these addresses; `None` where there are none.
+    ///
+    /// # Errors
+    /// Bad input: one is no address, or they are of several brokers or users.
+    pub(super) fn of(addresses: &[String]) -> Result<Option<Source>, Failure> {
+        // (Read here, since clap would print a wrong one with its password.)
+        let read = |text: &String| text.parse().map_err(|e| Failure::input(format!("`--from`: {e}")));
+        let addresses = addresses.iter().map(read).collect::<Result<Vec<Address>, Failure>>()?;
+        let Some((first, others)) = addresses.split_first() else { return Ok(None) };
+        let mut source = Source { address: first.clone(), topics: vec![first.topic.clone()] };
+        for other in others {
+            let (one, another) = (first.broker(), other.broker());
+            if one != another {
+                return Err(Failure::input(format!("`--from` names two brokers, {one} and {another}"))
+                    .help("take all topics from one broker: let one bridge the other's topics, or watch each by itself"));
+            }
+            let address = &mut source.address;
+            match (&address.user, &other.user) {
+                (_, None) => {}
+                (None, Some(_)) => {
+                    (address.user, address.password) = (other.user.clone(), other.password.clone());
+                }
+                (Some(_), Some(_))
+                    if (&address.user, &address.password) == (&other.user, &other.password) => {}
+                (Some(_), Some(_)) => {
+                    return Err(Failure::input(format!("`--from` logs in at {one} in two ways"))
+                        .help("state user and password once, and let the user read all topics"));
+                }
+            }
+            if !source.topics.contains(&other.topic) {
+                source.topics.push(other.topic.clone());
+            }
+        }
+        Ok(Some(source))
+    }
 }
 
 /// The port of MQTT, and that of MQTT by TLS.
@@ -104,6 +152,28 @@ fn check_topic(topic: &str) -> Result<(), String> {
 #[cfg(test)]
 mod tests {
     use super::*;
+
+    #[test]
+    fn several_addresses_are_topics_of_one_broker() {
+        let of =
+            |texts: &[&str]| Source::of(&texts.iter().map(|text| (*text).to_owned()).collect::<Vec<_>>());
+        assert_eq!(of(&[]).unwrap(), None);
+        let joined = of(&["mqtt://h/a", "mqtt://me:secret@h:1883/b/#", "mqtt://h/a", "mqtt://me:secret@h/c"]);
+        let Source { address, topics } = joined.unwrap().unwrap();
+        assert_eq!(topics, ["a", "b/#", "c"]);
+        assert_eq!((address.user.as_deref(), address.password.as_deref()), (Some("me"), Some("secret")));
+        for (texts, part) in [
+            (["mqtt://h/a", "mqtt://i/a"], "two brokers, mqtt://h:1883 and mqtt://i:1883"),
+            (["mqtt://h/a", "mqtts://h/a"], "two brokers, mqtt://h:1883 and mqtts://h:8883"),
+            (["mqtt://h/a", "mqtt://h:1884/a"], "two brokers"),
+            (["mqtt://h/a", "mqtt://me:secret@h"], "`--from`: there is no topic"),
+            (["mqtt://me:secret@h/a", "mqtt://you:secret@h/b"], "logs in at mqtt://h:1883 in two ways"),
+            (["mqtt://me:secret@h/a", "mqtt://me:secrets@h/b"], "logs in at mqtt://h:1883 in two ways"),
+        ] {
+            let said = of(&texts).unwrap_err().to_string();
+            assert!(said.contains(part) && !said.contains("secret"), "{said}");
+        }
+    }
 
     #[test]
     fn addresses_are_read() {

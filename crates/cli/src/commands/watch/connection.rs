@@ -1,14 +1,16 @@
 //! The connection to a broker: TCP, or TLS over it.
 
-use std::io::{self, Read, Write};
+use std::io::{self, ErrorKind, Read, Write};
 use std::net::{TcpStream, ToSocketAddrs};
 use std::sync::Arc;
 use std::time::Duration;
 
 use rustls::pki_types::ServerName;
+use rustls::sign::CertifiedKey;
 use rustls::{CertificateError, ClientConfig, ClientConnection, Error, RootCertStore, StreamOwned};
 
 use super::address::Address;
+use super::certificate::Identity;
 
 /// What is waited for an answer.
 pub(super) const ANSWER: Duration = Duration::from_secs(10);
@@ -39,24 +41,66 @@ pub(super) fn no_answer() -> Ended {
 /// Bytes from and to a broker.
 pub(super) enum Stream {
     Plain(TcpStream),
-    Secure(Box<StreamOwned<ClientConnection, TcpStream>>),
+    Secure(Box<Secure>),
+}
+
+/// The same by TLS.
+pub(super) struct Secure {
+    tls: StreamOwned<ClientConnection, TcpStream>,
+    identity: Arc<Identity>,
 }
 
 impl Stream {
-    /// To the first address of the host that takes a connection.
-    pub(super) fn open(address: &Address) -> Result<Stream, Ended> {
+    /// To the first address of the host that takes a connection; with the certificate of this client, if it has one.
+    pub(super) fn open(address: &Address, certificate: Option<&Arc<CertifiedKey>>) -> Result<Stream, Ended> {
         let socket = connected(address)?;
         match address.secure {
             false => Ok(Stream::Plain(socket)),
-            true => secured(address, socket),
+            true => secured(address, socket, Identity::new(certificate.cloned())),
         }
+    }
+
+    /// The broker has let this client in.
+    pub(super) fn accepted(&self) {
+        if let Stream::Secure(secure) = self {
+            secure.identity.accepted();
+        }
+    }
+
+    /// Why it has ended by this error.
+    pub(super) fn lost(&self, error: &io::Error) -> Ended {
+        self.refused(error).unwrap_or_else(|| lost(error))
+    }
+
+    /// Why the broker has closed it.
+    pub(super) fn closed(&self) -> Ended {
+        let refused = self.refused(&ErrorKind::UnexpectedEof.into());
+        refused.unwrap_or_else(|| Lost("the broker has closed the connection".to_owned()))
+    }
+
+    fn refused(&self, error: &io::Error) -> Option<Ended> {
+        match self {
+            Stream::Plain(_) => None,
+            Stream::Secure(secure) => secure.identity.refused(error),
+        }
+    }
+
+    /// Sends all of these bytes.
+    pub(super) fn send(&mut self, bytes: &[u8]) -> Result<(), Ended> {
+        let Err(error) = self.write_all(bytes).and_then(|()| self.flush()) else { return Ok(()) };
+        // A broker that has closed it may have said why before.
+        let said = match self.read(&mut [0; 1]) {
+            Err(said) if said.kind() == ErrorKind::InvalidData => said,
+            _ => error,
+        };
+        Err(self.lost(&said))
     }
 
     /// How long a read waits.
     pub(super) fn wait_at_most(&self, wait: Duration) -> io::Result<()> {
         match self {
             Stream::Plain(socket) => socket.set_read_timeout(Some(wait)),
-            Stream::Secure(stream) => stream.sock.set_read_timeout(Some(wait)),
+            Stream::Secure(secure) => secure.tls.sock.set_read_timeout(Some(wait)),
         }
     }
 }
@@ -65,7 +109,7 @@ impl Read for Stream {
     fn read(&mut self, buffer: &mut [u8]) -> io::Result<usize> {
         match self {
             Stream::Plain(socket) => socket.read(buffer),
-            Stream::Secure(stream) => stream.read(buffer),
+            Stream::Secure(secure) => secure.tls.read(buffer),
         }
     }
 }
@@ -74,14 +118,14 @@ impl Write for Stream {
     fn write(&mut self, bytes: &[u8]) -> io::Result<usize> {
         match self {
             Stream::Plain(socket) => socket.write(bytes),
-            Stream::Secure(stream) => stream.write(bytes),
+            Stream::Secure(secure) => secure.tls.write(bytes),
         }
     }
 
     fn flush(&mut self) -> io::Result<()> {
         match self {
             Stream::Plain(socket) => socket.flush(),
-            Stream::Secure(stream) => stream.flush(),
+            Stream::Secure(secure) => secure.tls.flush(),
         }
     }
 }
@@ -108,7 +152,7 @@ fn connected(address: &Address) -> Result<TcpStream, Ended> {
 
 /// TLS 1.2 or 1.3 over a connection, where the broker's certificate is that of its host, signed by an authority that this
 /// machine trusts: those of the system, or of the file that `SSL_CERT_FILE` names.
-fn secured(address: &Address, socket: TcpStream) -> Result<Stream, Ended> {
+fn secured(address: &Address, socket: TcpStream, identity: Identity) -> Result<Stream, Ended> {
     let found = rustls_native_certs::load_native_certs();
     let mut trusted = RootCertStore::empty();
     trusted.add_parsable_certificates(found.certs);
@@ -120,20 +164,22 @@ fn secured(address: &Address, socket: TcpStream) -> Result<Stream, Ended> {
         ));
     }
     let failed = |e: Error| Lost(format!("no TLS: {e}"));
+    let identity = Arc::new(identity);
     let provider = Arc::new(rustls::crypto::ring::default_provider());
     let config = ClientConfig::builder_with_provider(provider)
         .with_safe_default_protocol_versions()
         .map_err(failed)?
         .with_root_certificates(trusted)
-        .with_no_client_auth();
+        .with_client_cert_resolver(Arc::clone(&identity) as Arc<_>);
     let name = ServerName::try_from(address.host.clone())
         .map_err(|_| Lost(format!("`{}` is no name that a certificate could have", address.host)))?;
     let connection = ClientConnection::new(Arc::new(config), name).map_err(failed)?;
-    let mut stream = StreamOwned::new(connection, socket);
-    while stream.conn.is_handshaking() {
-        stream.conn.complete_io(&mut stream.sock).map_err(|e| untrusted(&e))?;
+    let mut tls = StreamOwned::new(connection, socket);
+    while tls.conn.is_handshaking() {
+        let shaken = tls.conn.complete_io(&mut tls.sock);
+        shaken.map_err(|e| identity.refused(&e).unwrap_or_else(|| untrusted(&e)))?;
     }
-    Ok(Stream::Secure(Box::new(stream)))
+    Ok(Stream::Secure(Box::new(Secure { tls, identity })))
 }
 
 /// Why TLS could not begin.

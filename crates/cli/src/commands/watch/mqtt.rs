@@ -2,11 +2,13 @@
 
 use std::collections::VecDeque;
 use std::hash::{BuildHasher, RandomState};
-use std::io::{ErrorKind, Read, Write};
+use std::io::{ErrorKind, Read};
+use std::sync::Arc;
 use std::sync::mpsc::SyncSender;
 use std::thread;
 use std::time::{Duration, Instant};
 
+use greybox_recording::listed;
 use mqtt_protocol_core::mqtt::common::Cursor;
 use mqtt_protocol_core::mqtt::connection::{ConnectionOptions, Event, TimerKind};
 use mqtt_protocol_core::mqtt::packet::v3_1_1::{Connack, Connect, Publish, Suback, Subscribe};
@@ -15,7 +17,9 @@ use mqtt_protocol_core::mqtt::prelude::*;
 use mqtt_protocol_core::mqtt::result_code::{ConnectReturnCode, MqttError};
 use mqtt_protocol_core::mqtt::{Connection as Protocol, Version, role};
 
-use super::address::Address;
+use rustls::sign::CertifiedKey;
+
+use super::address::{Address, Source};
 use super::connection::{ANSWER, Ended, Stream, lost, no_answer};
 use super::now;
 use super::source::{Connection, Message};
@@ -32,12 +36,12 @@ use Ended::{Lost, Over, Refused};
 
 /// Sends the messages of a broker, as long as anybody takes them. What fails before the first subscription is an error;
 /// afterwards it is reported and tried again.
-pub(super) fn follow(address: &Address, to: &SyncSender<Message>) {
+pub(super) fn follow(source: &Source, certificate: Option<&Arc<CertifiedKey>>, to: &SyncSender<Message>) {
     let (first, longest) = PAUSES;
     let (mut pause, mut ever) = (first, false);
     loop {
         let mut subscribed = false;
-        let ended = match Subscription::open(address, to) {
+        let ended = match Subscription::open(source, certificate, to) {
             Ok(mut subscription) => {
                 let Err(ended) = subscription.follow();
                 subscribed = subscription.subscribed;
@@ -45,7 +49,7 @@ pub(super) fn follow(address: &Address, to: &SyncSender<Message>) {
             }
             Err(ended) => ended,
         };
-        let broker = address.broker();
+        let broker = source.address.broker();
         ever |= subscribed;
         let (message, help) = match ended {
             Over => return,
@@ -67,7 +71,7 @@ pub(super) fn follow(address: &Address, to: &SyncSender<Message>) {
 
 /// A connection, from its first byte to its end.
 struct Subscription<'a> {
-    address: &'a Address,
+    source: &'a Source,
     to: &'a SyncSender<Message>,
     stream: Stream,
     protocol: Protocol<role::Client>,
@@ -80,15 +84,19 @@ struct Subscription<'a> {
 enum Never {}
 
 impl<'a> Subscription<'a> {
-    fn open(address: &'a Address, to: &'a SyncSender<Message>) -> Result<Self, Ended> {
+    fn open(
+        source: &'a Source,
+        certificate: Option<&Arc<CertifiedKey>>,
+        to: &'a SyncSender<Message>,
+    ) -> Result<Self, Ended> {
         let options = ConnectionOptions::new().maximum_packet_size_recv(LARGEST);
         let mut protocol = Protocol::with_options(Version::V3_1_1, options);
         protocol.set_auto_pub_response(true);
         protocol.set_pingresp_recv_timeout(ANSWER.as_millis() as u64);
         Ok(Subscription {
-            address,
+            source,
             to,
-            stream: Stream::open(address)?,
+            stream: Stream::open(&source.address, certificate)?,
             protocol,
             timers: Vec::new(),
             confirmed_by: now() + ANSWER,
@@ -98,7 +106,7 @@ impl<'a> Subscription<'a> {
 
     /// Greets, subscribes, and takes what comes until the connection ends.
     fn follow(&mut self) -> Result<Never, Ended> {
-        let connect = connect(self.address).map_err(unfit)?;
+        let connect = connect(&self.source.address).map_err(unfit)?;
         let events = self.protocol.checked_send(connect);
         self.handle(events)?;
         let mut buffer = vec![0; 1 << 16];
@@ -107,7 +115,7 @@ impl<'a> Subscription<'a> {
             let wait = left.max(Duration::from_millis(1));
             self.stream.wait_at_most(wait).map_err(|e| lost(&e))?;
             match self.stream.read(&mut buffer) {
-                Ok(0) => return Err(Lost("the broker has closed the connection".to_owned())),
+                Ok(0) => return Err(self.stream.closed()),
                 Ok(read) => {
                     let mut bytes = Cursor::new(&buffer[..read]);
                     // (One packet at a time.)
@@ -118,7 +126,7 @@ impl<'a> Subscription<'a> {
                 }
                 Err(e) if matches!(e.kind(), ErrorKind::WouldBlock | ErrorKind::TimedOut) => {}
                 Err(e) if e.kind() == ErrorKind::Interrupted => {}
-                Err(e) => return Err(lost(&e)),
+                Err(e) => return Err(self.stream.lost(&e)),
             }
             self.fire()?;
         }
@@ -154,8 +162,7 @@ impl<'a> Subscription<'a> {
         while let Some(event) = events.pop_front() {
             match event {
                 Event::RequestSendPacket { packet, .. } => {
-                    let bytes = packet.to_continuous_buffer();
-                    self.stream.write_all(&bytes).and_then(|()| self.stream.flush()).map_err(|e| lost(&e))?;
+                    self.stream.send(&packet.to_continuous_buffer())?;
                 }
                 Event::NotifyPacketReceived(packet) => events.extend(self.take(&packet)?),
                 Event::RequestTimerReset { kind, duration_ms } => {
@@ -180,12 +187,14 @@ impl<'a> Subscription<'a> {
     fn take(&mut self, packet: &Packet) -> Result<Vec<Event>, Ended> {
         match packet {
             Packet::V3_1_1Connack(answer) => {
+                self.stream.accepted();
                 accepted(answer)?;
                 let id = self.protocol.acquire_packet_id().map_err(unfit)?;
                 // At least once: what comes twice is passed over as a repeated sample.
-                let entry = SubEntry::new(&self.address.topic, SubOpts::new().set_qos(Qos::AtLeastOnce));
-                let subscribe =
-                    Subscribe::builder().packet_id(id).entries(vec![entry.map_err(unfit)?]).build();
+                let options = SubOpts::new().set_qos(Qos::AtLeastOnce);
+                let entries = self.source.topics.iter().map(|topic| SubEntry::new(topic, options));
+                let entries = entries.collect::<Result<Vec<_>, _>>().map_err(unfit)?;
+                let subscribe = Subscribe::builder().packet_id(id).entries(entries).build();
                 Ok(self.protocol.checked_send(subscribe.map_err(unfit)?))
             }
             Packet::V3_1_1Suback(answer) => {
@@ -201,13 +210,21 @@ impl<'a> Subscription<'a> {
     }
 
     fn confirm(&mut self, answer: &Suback) -> Result<(), Ended> {
-        let (broker, topic) = (self.address.broker(), self.address.topic.clone());
-        if !answer.return_codes().iter().all(|code| code.is_success()) {
+        let codes = answer.return_codes();
+        // (One code a topic; a broker that sends fewer has not taken the others.)
+        let topics = self.source.topics.iter().enumerate();
+        let refused = topics.filter(|(k, _)| !codes.get(*k).is_some_and(|code| code.is_success()));
+        let refused: Vec<String> = refused.map(|(_, topic)| format!("`{topic}`")).collect();
+        if !refused.is_empty() {
             let help = "see what the broker lets this user read, in its access control list";
-            return Err(Refused(format!("the broker refuses the subscription to `{topic}`"), help));
+            return Err(Refused(format!("the broker refuses the subscription to {}", listed(refused)), help));
         }
         self.subscribed = true;
-        self.send(Message::Connection(Connection::Subscribed { broker, topic }))
+        for topic in &self.source.topics {
+            let (broker, topic) = (self.source.address.broker(), topic.clone());
+            self.send(Message::Connection(Connection::Subscribed { broker, topic }))?;
+        }
+        Ok(())
     }
 
     /// Passes a message on; one that the broker has kept from before the subscription is no new sample.

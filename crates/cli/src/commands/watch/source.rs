@@ -1,12 +1,13 @@
 //! Where the samples of a watch come from: what is read elsewhere waits here in a row.
 
 use std::io::{self, BufRead};
+use std::path::Path;
 use std::sync::mpsc::SyncSender;
 use std::thread;
 
 use serde_json::{Value, json};
 
-use super::address::Address;
+use super::address::Source;
 use crate::failure::Failure;
 
 /// What comes in.
@@ -75,21 +76,60 @@ pub(super) fn standard_input(to: SyncSender<Message>) {
     });
 }
 
+/// Files of the certificate of this client, and of its key where that stands apart.
+#[derive(Debug, Clone, Copy)]
+pub(super) struct Certificate<'a> {
+    pub(super) certificate: &'a Path,
+    #[cfg_attr(not(feature = "mqtt"), expect(dead_code, reason = "connections alone read it"))]
+    pub(super) key: Option<&'a Path>,
+}
+
 /// Sends the messages of a broker, as long as anybody takes them.
 ///
 /// # Errors
-/// Bad input where this greybox knows no brokers.
+/// Bad input: a certificate that does not fit, or any broker where this greybox knows none.
+pub(super) fn broker(
+    source: Source,
+    certificate: Option<Certificate<'_>>,
+    to: SyncSender<Message>,
+) -> Result<(), Failure> {
+    if let (Some(Certificate { certificate, .. }), false) = (certificate, source.address.secure) {
+        return Err(Failure::input(format!(
+            "{}: `--cert {}` is for TLS, and this address is without",
+            source.address.broker(),
+            certificate.display()
+        ))
+        .help("write `mqtts://…` (port 8883 where none is stated), or leave `--cert` out"));
+    }
+    follow(source, certificate, to)
+}
+
 #[cfg(feature = "mqtt")]
-pub(super) fn broker(address: &Address, to: SyncSender<Message>) -> Result<(), Failure> {
-    let address = address.clone();
-    thread::spawn(move || super::mqtt::follow(&address, &to));
+fn follow(
+    source: Source,
+    certificate: Option<Certificate<'_>>,
+    to: SyncSender<Message>,
+) -> Result<(), Failure> {
+    let certificate = certificate.map(|c| super::certificate::read(c.certificate, c.key)).transpose()?;
+    thread::spawn(move || super::mqtt::follow(&source, certificate.as_ref(), &to));
     Ok(())
 }
 
 /// As this greybox knows no brokers.
 #[cfg(not(feature = "mqtt"))]
-pub(super) fn broker(address: &Address, _to: SyncSender<Message>) -> Result<(), Failure> {
-    let (broker, topic) = (address.broker(), &address.topic);
+fn follow(
+    source: Source,
+    _certificate: Option<Certificate<'_>>,
+    _to: SyncSender<Message>,
+) -> Result<(), Failure> {
+    let broker = source.address.broker();
+    let topics: Vec<String> = source.topics.iter().map(|topic| format!(" -t '{topic}'")).collect();
+    let pipe = match topics.len() {
+        1 => format!("mosquitto_sub -L {broker}/{}", source.address.topic),
+        _ => {
+            format!("mosquitto_sub -h {} -p {}{}", source.address.host, source.address.port, topics.concat())
+        }
+    };
     Err(Failure::input(format!("{broker}: this greybox was built without MQTT"))
-        .help(format!("install it with `cargo install --features mqtt …`, or pipe `mosquitto_sub -L {broker}/{topic}` into it")))
+        .help(format!("install it with `cargo install --features mqtt …`, or pipe `{pipe}` into it")))
 }
