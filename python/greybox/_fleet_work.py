@@ -119,8 +119,8 @@ def _is_parquet(file: str) -> bool:
 
 
 def by_episode(place: str, options: Options) -> list[str]:
-    """The recordings in a file: its episodes, or itself where it is one recording or cannot be read, which its worker
-    tells."""
+    """The recordings in a file: its episodes, or itself where it is one recording or cannot be read: its worker reports
+    that."""
     if not _is_parquet(place):
         return [place]
     try:
@@ -179,7 +179,8 @@ def _frames(parts: list[bytes], run: Run) -> Recording:
     if frame[time].dtype.kind == "M":
         frame[time] = (frame[time] - frame[time].iloc[0]).dt.total_seconds()
     plain = frame.select_dtypes(["number", "bool"]).rename(columns={time: time.replace(time.split(" [")[0], "t", 1)})
-    return Recording(plain, run.name)
+    # Errors name the place, as those of the command.
+    return Recording(Recording(plain, run.place), run.name)
 
 
 def _episode(frame: Any, time: str, run: Run) -> Any:

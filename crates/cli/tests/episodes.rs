@@ -125,7 +125,7 @@ fn what_names_no_episode_is_refused() {
         "identify",
         "runs/data.parquet#0",
         "--block",
-        "100",
+        "1000",
         "--inputs",
         "f",
         "--states",

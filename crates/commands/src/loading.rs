@@ -161,7 +161,7 @@ pub fn recordings_of(folder: &Path) -> Result<Vec<PathBuf>, Failure> {
 }
 
 /// The recordings in the file at `path`, by their paths: `data.parquet#0`, `data.parquet#1`, …; the path itself where the
-/// file is one recording, or cannot be read, which is told when it is its turn.
+/// file is one recording, or cannot be read: that is reported when its turn comes.
 pub fn by_episode(path: PathBuf) -> Vec<PathBuf> {
     match episodes(&path) {
         Ok(episodes) if !episodes.is_empty() => {
