@@ -61,10 +61,17 @@ def matching(pattern: str, options: Options) -> list[str]:
     return sorted(glob(pattern, recursive=True))
 
 
+def apart(place: str) -> tuple[str, str | None]:
+    """File and episode of ``data.parquet#3``; a file that is called so comes first."""
+    episode = _native.episode(place)
+    return (place, None) if episode is None else (place[: -len(episode) - 1], episode)
+
+
 def content(place: str, options: Options) -> bytes:
-    """The bytes of a recording."""
+    """The bytes of a recording; of an episode, those of the whole file."""
     if not is_url(place):
         return _native.content(place)
+    place, _ = apart(place)
     system, path = _system(place, options)
     try:
         return bytes(system.cat_file(path))

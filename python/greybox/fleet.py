@@ -20,9 +20,9 @@ from typing import Any, Union
 from . import _native
 from ._engines import each, engine
 from ._errors import GreyboxError, InputError, InternalError
-from ._fleet_work import Outcome, Plan, Run, fleet, hash_of, work as _work
+from ._fleet_work import Outcome, Plan, Run, by_episode, fleet, hash_of, work as _work
 from ._inputs import ModelLike, model as native, names, renames
-from ._places import Folder, Options, content, entries, is_folder, is_url, matching
+from ._places import Folder, Options, apart, content, entries, is_folder, is_url, matching
 from ._tables import RunsLike, table
 from ._records import Named, Record
 from ._results import Diagnosis, _Result, _write
@@ -147,7 +147,7 @@ def diagnose(
         model: the nominal model.
         recordings: a folder, a pattern (``"fleet/**/*.csv"``), or paths, each on a disk that all workers see, or a URL
             that fsspec reads. Folders ``key=value`` of Parquet files, as Spark, Polars and pandas partition a dataset,
-            are one recording each.
+            are one recording each, and so is each episode of a Parquet file, ``data.parquet#3``.
         on: a Dask client, the module ``ray``, an executor of ``concurrent.futures``, or none: the threads of this
             process.
         out: folder of the results, as of the command, or its URL; none where only the summary is wanted.
@@ -184,7 +184,9 @@ def diagnose(
     # A fault in what all share is told once.
     fleet(plan)
     told_of = table(runs)
-    work_on = _runs([place for place in _places(recordings, storage_options) if place not in held], storage_options)
+    files = [place for place in _places(recordings, storage_options) if place not in held]
+    places = [place for file in files for place in by_episode(file, storage_options) if place not in held]
+    work_on = _runs(places, storage_options)
     if told_of is not None:
         _native.check_table(*told_of, [run.name for run in work_on])
     parts: list[str] = []
@@ -278,8 +280,13 @@ def _runs(places: list[str], options: Options) -> list[Run]:
     taken = {"summary.json": "summary.json", "summary.html": "summary.html"}
     for place, part in zip(places, parts):
         name = "/".join(part[len(shared) :])
-        partition = _ending(name) not in _native.EXTENSIONS and is_folder(place, options)
-        folder = name if partition else os.path.splitext(name)[0]
+        _, episode = apart(place)
+        partition = episode is None and _ending(name) not in _native.EXTENSIONS and is_folder(place, options)
+        if episode is not None:
+            # (`#` begins the fragment of a link.)
+            folder = f"{name[: -len(episode) - 1]}.{episode}"
+        else:
+            folder = name if partition else os.path.splitext(name)[0]
         if folder in taken:
             raise InputError(
                 f"{place}: its results would go where those of `{taken[folder]}` go, to `{folder}`; rename the recording"

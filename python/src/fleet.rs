@@ -7,6 +7,7 @@ use std::sync::Arc;
 use greybox_commands::fleet::{self, Channels, File, Member, Table};
 use greybox_commands::{Failure, loading};
 use greybox_diagnose::Options;
+use greybox_recording::Location;
 use greybox_report::summary::Statistics;
 use greybox_report::{Report, ReportError, merge};
 use pyo3::prelude::*;
@@ -112,11 +113,35 @@ impl Fleet {
     }
 }
 
-/// The content of the recording at a path.
+/// The content of the recording at a path; of an episode, that of the whole file.
 #[pyfunction]
 pub(crate) fn content<'py>(py: Python<'py>, path: PathBuf) -> PyResult<Bound<'py, PyBytes>> {
     let content = py.detach(|| loading::content(&path));
     raised(py, content).map(|content| PyBytes::new(py, &content))
+}
+
+/// What stands behind the `#` of a path or URL that names an episode of a file.
+#[pyfunction]
+pub(crate) fn episode(place: PathBuf) -> Option<String> {
+    Location::of(place).episode
+}
+
+/// The episodes of the file at a path, each a recording of its own; none where it is one, or cannot be read.
+#[pyfunction]
+pub(crate) fn episodes(py: Python<'_>, path: PathBuf) -> Vec<i64> {
+    py.detach(|| greybox_recording::episodes(path)).unwrap_or_default()
+}
+
+/// As `episodes`, of the content of a Parquet file; none in a build that reads no Parquet.
+#[pyfunction]
+pub(crate) fn episodes_of(py: Python<'_>, content: Vec<u8>) -> Vec<i64> {
+    #[cfg(feature = "parquet")]
+    return py.detach(|| greybox_recording::parse_episodes(content, "")).unwrap_or_default();
+    #[cfg(not(feature = "parquet"))]
+    {
+        let _ = (py, content);
+        Vec::new()
+    }
 }
 
 /// Name and text of the mechanisms of a folder.

@@ -211,7 +211,7 @@ impl Sources {
                 Place::Memory(_) => None,
             })
             .collect();
-        let mut files = loading::each_recording(&paths, &self.wanted)?.into_iter();
+        let mut files = loading::each_recording(&paths, &self.wanted)?;
         let mut names = HashSet::new();
         let mut read = Vec::with_capacity(all.len());
         for place in all {

@@ -28,6 +28,9 @@ fn _native(module: &Bound<'_, PyModule>) -> PyResult<()> {
     module.add("READS_PARQUET", cfg!(feature = "parquet"))?;
     module.add_class::<fleet::Fleet>()?;
     module.add_function(wrap_pyfunction!(fleet::content, module)?)?;
+    module.add_function(wrap_pyfunction!(fleet::episode, module)?)?;
+    module.add_function(wrap_pyfunction!(fleet::episodes, module)?)?;
+    module.add_function(wrap_pyfunction!(fleet::episodes_of, module)?)?;
     module.add_function(wrap_pyfunction!(fleet::mechanisms, module)?)?;
     module.add_function(wrap_pyfunction!(fleet::statistics, module)?)?;
     module.add_function(wrap_pyfunction!(fleet::failed, module)?)?;

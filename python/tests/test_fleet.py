@@ -184,6 +184,37 @@ def test_partitions_of_a_dataset_are_recordings(recordings, tmp_path):
         assert found == expected
 
 
+def test_episodes_of_a_file_are_recordings(recordings, tmp_path):
+    pandas = pytest.importorskip("pandas")
+    pytest.importorskip("pyarrow")
+    pytest.importorskip("fsspec")
+    frames = [pandas.DataFrame(run(k, ROWS)).assign(episode_index=k) for k in range(3)]
+    # As they lie: the rows of two episodes mixed, those of each in the order of time.
+    mixed = pandas.concat(frames[:2]).sort_index(kind="stable")
+    (tmp_path / "set").mkdir()
+    pandas.concat([mixed, frames[2], frames[0].tail(3).assign(episode_index=7)]).to_parquet(tmp_path / "set/data.parquet")
+    frames[0].drop(columns="episode_index").to_parquet(tmp_path / "set/one.parquet")
+    summary = fleet.diagnose(recordings.model, tmp_path / "set", out=tmp_path / "out")
+    assert [one.recording for one in summary.recordings] == [*(f"data.parquet#{k}" for k in range(3)), "one.parquet"]
+    assert [one.recording for one in summary.failed] == ["data.parquet#7"]
+    assert "at least 8 are needed" in summary.failed[0].message
+    folders = [*(f"data.parquet.{k}" for k in range(3)), "one"]
+    assert sorted(path.name for path in (tmp_path / "out").iterdir() if path.is_dir()) == folders
+    for k in range(3):
+        report = json.loads((tmp_path / "out" / f"data.parquet.{k}" / "report.json").read_text())
+        wanted = json.loads((recordings.folder / "command" / f"run{k:03}" / "report.json").read_text())
+        assert report["parameters"] == wanted["parameters"]
+        found, expected = ([(m["kind"], m["parameters"]) for m in one["mechanisms"]] for one in (report, wanted))
+        assert found == expected
+    assert fleet.diagnose(recordings.model, tmp_path / "set", out=tmp_path / "out").done_before == 4
+    # By URL, and one by its name.
+    assert len(fleet.diagnose(recordings.model, f"file://{tmp_path}/set").recordings) == 4
+    one = fleet.diagnose(recordings.model, f"file://{tmp_path}/set/data.parquet#2")
+    assert [run.recording for run in one.recordings] == ["data.parquet#2"]
+    with pytest.raises(greybox.InputError, match="data.parquet#9: the file has no episode 9"):
+        fleet.diagnose(recordings.model, tmp_path / "set/data.parquet#9")
+
+
 def test_map_reduce_and_conclude_give_the_command_s_summary(recordings):
     bag = pytest.importorskip("dask.bag")
     folder = recordings.folder / "command"

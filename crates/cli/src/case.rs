@@ -1,6 +1,7 @@
 //! `--save-case`: what another needs to see why a command did what it did.
 
 use std::any::Any;
+use std::collections::HashSet;
 use std::fs;
 use std::panic::{self, AssertUnwindSafe};
 use std::path::{Path, PathBuf};
@@ -9,7 +10,7 @@ use clap::Args;
 use greybox_commands::case::{Values, masked, statistics};
 use greybox_commands::check::check_for_model;
 use greybox_model::Model;
-use greybox_recording::{Finding, Recording, health};
+use greybox_recording::{Finding, Location, Recording, health};
 use serde_json::{Value, json};
 
 use crate::answer::Answer;
@@ -103,7 +104,7 @@ impl CaseOptions {
             files.model.iter().chain(&files.mechanisms).filter(|(path, _)| path.is_file()).map(copied),
         );
         if self.with_data {
-            packed.extend(files.recordings.iter().filter(|(path, _)| path.is_file()).map(copied));
+            packed.extend(files.data().filter(|(path, _)| path.is_file()).map(|file| copied(&file)));
         }
         if outcome.is_ok() {
             let reported = subject.files.iter().filter(|name| self.with_data || !name.ends_with(".html"));
@@ -136,7 +137,7 @@ impl CaseOptions {
                 };
                 reported["file"] = json!(name);
                 reported["held_out"] = json!(k >= subject.train.len());
-                reported["bytes"] = json!(fs::metadata(path).map(|m| m.len()).ok());
+                reported["bytes"] = json!(fs::metadata(Location::of(path).file).map(|m| m.len()).ok());
                 reported
             })
             .collect();
@@ -264,11 +265,14 @@ struct Inputs {
 impl Inputs {
     fn of(subject: &Subject<'_>) -> Inputs {
         let paths: Vec<&PathBuf> = subject.train.iter().chain(subject.holdout).collect();
+        let files: Vec<PathBuf> = paths.iter().map(|path| Location::of(path).file).collect();
         let named = |k: usize| {
-            let name = loading::file_name(paths[k]);
-            let twins = paths.iter().filter(|path| loading::file_name(path) == name).count();
-            let name = if twins > 1 { format!("{}/{name}", k + 1) } else { name };
-            (paths[k].clone(), format!("recordings/{name}"))
+            let name = loading::file_name(&files[k]);
+            let is_twin = |file: &PathBuf| *file != files[k] && loading::file_name(file) == name;
+            // Episodes of a file lie in one copy of it.
+            let first = files.iter().position(|file| *file == files[k]).unwrap_or(k);
+            let folder = if files.iter().any(is_twin) { format!("{}/", first + 1) } else { String::new() };
+            (paths[k].clone(), format!("recordings/{folder}{}", loading::file_name(paths[k])))
         };
         let mine = |folder: &Path| loading::files_of(folder, &["toml"]).unwrap_or_default();
         let inside = |path: PathBuf, place: &str| {
@@ -287,6 +291,20 @@ impl Inputs {
                 .collect(),
             folder: subject.mechanisms.map(Path::to_owned),
         }
+    }
+
+    /// The files of the recordings, each once, with their names in the case.
+    fn data(&self) -> impl Iterator<Item = (PathBuf, String)> {
+        let mut seen = HashSet::new();
+        let file = |(path, name): &(PathBuf, String)| {
+            let Location { file, episode } = Location::of(path);
+            let name = match episode {
+                Some(episode) => name.strip_suffix(&format!("#{episode}")).unwrap_or(name),
+                None => name,
+            };
+            (file, name.to_owned())
+        };
+        self.recordings.iter().map(file).filter(move |(file, _)| seen.insert(file.clone()))
     }
 
     /// The arguments of this process, with the files of the case in the place of their own and the results in `rerun`.

@@ -54,12 +54,12 @@ struct ChannelUse {
 }
 
 /// Checks recordings, with the roles that a model gives their channels, or with `inputs` as what drives them. One that cannot
-/// be read or does not fit the model stops no other.
+/// be read or does not fit the model stops no other, and none is kept once it is checked.
 ///
 /// # Errors
 /// Bad input: none of the recordings could be checked; the first of their errors.
 pub fn check(
-    recordings: Vec<Result<Recording, Failure>>,
+    recordings: impl IntoIterator<Item = Result<Recording, Failure>>,
     model: Option<&Model>,
     inputs: &[String],
 ) -> Result<Checked, Failure> {

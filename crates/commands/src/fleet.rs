@@ -11,7 +11,7 @@ use std::path::{Path, PathBuf};
 use greybox_calibrate::Data;
 use greybox_diagnose::{Options, ProgressListener};
 use greybox_fleet::Runs;
-use greybox_recording::{Recording, Rename};
+use greybox_recording::{Location, Recording, Rename};
 use greybox_report::contract::{ModelId, Producer};
 use greybox_report::summary::{Run, Statistics, Summary};
 use greybox_report::{Report, ReportError, merge};
@@ -226,6 +226,22 @@ fn statistics(member: Member<'_>, report: &str) -> Result<Statistics, ReportErro
     let [_, html, _] = FILES;
     let page = format!("{}/{html}", member.folder);
     Report::from_json(report).map(|report| merge::map(member.name, Some(&page), &report))
+}
+
+/// The folder of the results of the recording at `path`: called as its file without the ending, and `data.parquet.3` for the
+/// episode `data.parquet#3`, since `#` begins the fragment of a link.
+///
+/// ```
+/// use greybox_commands::fleet::folder_of;
+/// assert_eq!(folder_of("runs/monday.csv".as_ref()), "monday");
+/// assert_eq!(folder_of("runs/data.parquet#3".as_ref()), "data.parquet.3");
+/// ```
+pub fn folder_of(path: &Path) -> String {
+    let Location { file, episode } = Location::of(path);
+    match episode {
+        Some(episode) => format!("{}.{episode}", loading::file_name(&file)),
+        None => file.file_stem().map(|stem| stem.to_string_lossy().into_owned()).unwrap_or_default(),
+    }
 }
 
 /// What a recording that could not be diagnosed leaves for the summary.

@@ -1,12 +1,16 @@
 //! Reading models and recordings, with errors for the usual mistakes.
 
+use std::collections::BTreeMap;
 use std::fs;
 use std::io::{self, ErrorKind};
 use std::path::{Path, PathBuf};
 
 use greybox_diagnose::library::{self, Library};
 use greybox_model::{Model, Problem};
-use greybox_recording::{CsvBlocks, EXTENSIONS, Recording, RecordingError, Rename, Selection, read_selected};
+use greybox_recording::{
+    CsvBlocks, EXTENSIONS, Location, Recording, RecordingError, Rename, Selection, episodes, parse_episode,
+    read_selected,
+};
 
 use crate::failure::Failure;
 use crate::foreign;
@@ -31,11 +35,15 @@ pub struct LoadedModel {
 pub fn model(path: &Path) -> Result<LoadedModel, Failure> {
     read_text(path).and_then(|text| model_of(text, path)).map_err(|failure| match foreign::of(path) {
         Some(kind) => kind.as_model(path),
-        None if path.is_file() && EXTENSIONS.iter().any(|e| has_extension(path, e)) => {
+        None if is_recording(&Location::of(path).file) => {
             not_a_model(path, if has_extension(path, "csv") { "a recording (CSV)" } else { "a recording" })
         }
         None => failure,
     })
+}
+
+fn is_recording(path: &Path) -> bool {
+    path.is_file() && EXTENSIONS.iter().any(|e| has_extension(path, e))
 }
 
 /// The error where a recording stands in the place of the model.
@@ -143,12 +151,29 @@ pub fn mechanisms_of(texts: &[(String, String)], folder: &Path) -> Result<Librar
     library::combine(texts).map_err(|e| Failure::mechanism(&e, texts, folder))
 }
 
-/// The recordings of a folder, in the order of their names.
+/// The recordings of a folder, in the order of their files' names; each episode of a file with several is one.
 ///
 /// # Errors
 /// Bad input: as [`files_of`], or no recording in it.
 pub fn recordings_of(folder: &Path) -> Result<Vec<PathBuf>, Failure> {
-    some_recordings(folder, files_of(folder, &EXTENSIONS)?)
+    let recordings = some_recordings(folder, files_of(folder, &EXTENSIONS)?)?;
+    Ok(recordings.into_iter().flat_map(by_episode).collect())
+}
+
+/// The recordings in the file at `path`, by their paths: `data.parquet#0`, `data.parquet#1`, …; the path itself where the
+/// file is one recording, or cannot be read: that is reported when its turn comes.
+pub fn by_episode(path: PathBuf) -> Vec<PathBuf> {
+    match episodes(&path) {
+        Ok(episodes) if !episodes.is_empty() => {
+            let named = |episode: i64| {
+                let mut named = path.clone().into_os_string();
+                named.push(format!("#{episode}"));
+                PathBuf::from(named)
+            };
+            episodes.into_iter().map(named).collect()
+        }
+        _ => vec![path],
+    }
 }
 
 fn some_recordings(folder: &Path, recordings: Vec<PathBuf>) -> Result<Vec<PathBuf>, Failure> {
@@ -173,7 +198,7 @@ pub fn without_folders(paths: &[PathBuf]) -> Result<Vec<PathBuf>, Failure> {
                 for folder in folders_of(path) {
                     found.extend(files_of(&folder, &EXTENSIONS)?);
                 }
-                files.extend(some_recordings(path, found)?);
+                files.extend(some_recordings(path, found)?.into_iter().flat_map(by_episode));
             }
             false => files.push(path.clone()),
         }
@@ -282,29 +307,29 @@ impl Wanted {
 /// Bad input: a file that is missing, a model or a folder in its place, one named twice, any fault in it, or a channel
 /// that is wanted and that it does not have.
 pub fn recordings(paths: &[PathBuf], wanted: &Wanted) -> Result<Vec<Recording>, Failure> {
-    each_recording(paths, wanted)?.into_iter().collect()
+    each_recording(paths, wanted)?.collect()
 }
 
-/// Reads recordings, each of which may fail on its own.
+/// Reads recordings when their turn comes, each of which may fail on its own.
 ///
 /// # Errors
-/// Bad input: a file named twice.
-pub fn each_recording(
-    paths: &[PathBuf],
-    wanted: &Wanted,
-) -> Result<Vec<Result<Recording, Failure>>, Failure> {
+/// Bad input: a recording named twice.
+pub fn each_recording<'a>(
+    paths: &'a [PathBuf],
+    wanted: &'a Wanted,
+) -> Result<impl Iterator<Item = Result<Recording, Failure>>, Failure> {
     no_twins(paths)?;
-    let read = |path: &PathBuf| {
+    let read = move |path: &'a PathBuf| {
         let mut recording =
             read_selected(path, &wanted.selection).map_err(|error| unreadable(path, error))?;
         recording.name = called(path, paths);
         wanted.apply(&mut recording)?;
         Ok(recording)
     };
-    Ok(paths.iter().map(read).collect())
+    Ok(paths.iter().map(read))
 }
 
-/// The bytes of the recording at `path`.
+/// The bytes of the recording at `path`; of an episode, those of the whole file.
 ///
 /// # Errors
 /// Bad input: a file that is missing, or a folder or a device in its place.
@@ -318,30 +343,39 @@ pub fn content(path: &Path) -> Result<Vec<u8>, Failure> {
 /// # Errors
 /// Bad input: any fault in it, or a channel that is wanted and that it does not have.
 pub fn recording_of(bytes: Vec<u8>, path: &Path, wanted: &Wanted) -> Result<Recording, Failure> {
-    let label = path.display().to_string();
-    let mut recording = greybox_recording::parse(bytes, &label, &file_name(path), &wanted.selection)
+    let (label, name) = (path.display().to_string(), file_name(path));
+    let episode = Location::of(path).episode;
+    let mut recording = parse_episode(bytes, &label, &name, episode.as_deref(), &wanted.selection)
         .map_err(|error| unreadable(path, error))?;
     wanted.apply(&mut recording)?;
     Ok(recording)
 }
 
-/// An error where a recording is named twice.
+/// An error where a recording is named twice, or an episode beside the whole file.
 ///
 /// # Errors
 /// Bad input: the second of the two.
 pub fn no_twins<'a>(paths: impl IntoIterator<Item = &'a PathBuf>) -> Result<(), Failure> {
-    let mut seen: Vec<&PathBuf> = Vec::new();
+    let mut seen: BTreeMap<PathBuf, Vec<(Option<String>, &PathBuf)>> = BTreeMap::new();
     for path in paths {
-        if let Some(twin) = seen.iter().find(|twin| **twin == path || same_file(twin, path)) {
+        let Location { file, episode } = Location::of(path);
+        let same = seen.entry(fs::canonicalize(&file).unwrap_or(file)).or_default();
+        if let Some((_, twin)) = same.iter().find(|(other, _)| overlap(other.as_deref(), episode.as_deref()))
+        {
             return Err(Failure::file(
                 path,
                 format!("this recording is named twice (also as {})", twin.display()),
             )
             .help("name each recording once, either for training or after `--holdout`"));
         }
-        seen.push(path);
+        same.push((episode, path));
     }
     Ok(())
+}
+
+/// Whether two episodes of a file share rows; none stands for the whole file.
+fn overlap(a: Option<&str>, b: Option<&str>) -> bool {
+    a.zip(b).is_none_or(|(a, b)| a == b)
 }
 
 fn unreadable(path: &Path, error: RecordingError) -> Failure {
@@ -365,7 +399,8 @@ pub fn blocks(
     wanted: &Wanted,
 ) -> Result<impl Iterator<Item = Result<Recording, Failure>>, Failure> {
     let open = |path: &PathBuf| {
-        if EXTENSIONS.iter().any(|e| *e != "csv" && has_extension(path, e)) {
+        let Location { file, episode } = Location::of(path);
+        if episode.is_some() || EXTENSIONS.iter().any(|e| *e != "csv" && has_extension(&file, e)) {
             return Err(Failure::file(path, "only CSV files are read in blocks")
                 .help("leave `--block` out, or export the recording as CSV"));
         }
@@ -403,10 +438,11 @@ pub fn train_and_holdout(
     Ok((train_recordings, held))
 }
 
-/// Whether both paths lead to one existing file.
+/// Whether both paths lead to one existing file, and not to different episodes of it.
 pub fn same_file(a: &Path, b: &Path) -> bool {
-    match (fs::canonicalize(a), fs::canonicalize(b)) {
-        (Ok(a), Ok(b)) => a == b,
+    let (a, b) = (Location::of(a), Location::of(b));
+    match (fs::canonicalize(a.file), fs::canonicalize(b.file)) {
+        (Ok(one), Ok(other)) => one == other && overlap(a.episode.as_deref(), b.episode.as_deref()),
         _ => false,
     }
 }

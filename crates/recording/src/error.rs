@@ -47,6 +47,14 @@ fn counted(number: usize, what: &str) -> String {
     format!("{number} {what}{}", if number == 1 { "" } else { "s" })
 }
 
+/// How several episodes of a file are named at once: their first run without a gap, as a shell expands it.
+fn several(file: &str, episodes: &[i64]) -> String {
+    match episodes.chunk_by(|a, b| b.wrapping_sub(*a) == 1).find(|run| run.len() > 1) {
+        Some([first, .., last]) => format!("which a shell expands: `{file}#{{{first}..{last}}}`"),
+        _ => "one after the other".to_owned(),
+    }
+}
+
 /// Why a recording could not be read or written. Each message is one paragraph: place, what was found, fix.
 #[derive(Debug, thiserror::Error)]
 #[non_exhaustive]
@@ -388,16 +396,59 @@ pub enum RecordingError {
     },
     /// The times restart with every episode of a data set.
     #[error(
-        "{place}: the file holds {episodes} episodes (column `{column}`), each with times of its own; one file holds one \
-         recording: split it into a file for each value of `{column}`"
+        "{place}: the file holds {} ({}; column `{column}`), each a recording with times of its own; name one, \
+         `{file}#{}`, or several, {}; a folder of recordings takes each by itself: `greybox diagnose MODEL.toml FOLDER`",
+        counted(episodes.len(), "episode"),
+        crate::episode::in_words(episodes),
+        episodes.first().copied().unwrap_or_default(),
+        several(file, episodes)
     )]
     SeveralEpisodes {
         /// The file.
         place: Place,
+        /// Its name without its folder.
+        file: String,
         /// The column that numbers the episodes.
-        column: String,
-        /// How many there are.
-        episodes: usize,
+        column: &'static str,
+        /// The episodes, in increasing order.
+        episodes: Vec<i64>,
+    },
+    /// The file has episodes, but not this one.
+    #[error(
+        "{place}: the file has no episode {wanted}; name one of those in its column `{column}`: {}",
+        crate::episode::in_words(episodes)
+    )]
+    NoSuchEpisode {
+        /// The recording as named by the caller.
+        place: Place,
+        /// The episode that was named.
+        wanted: i64,
+        /// The column that numbers the episodes.
+        column: &'static str,
+        /// Those that are there, in increasing order.
+        episodes: Vec<i64>,
+    },
+    /// An episode was named of a file that has none.
+    #[error("{place}: `#{episode}` names an episode, but {found}; {help}")]
+    NoEpisodes {
+        /// The recording as named by the caller.
+        place: Place,
+        /// What stands behind `#`.
+        episode: String,
+        /// What the file is instead.
+        found: &'static str,
+        /// How to fix it.
+        help: &'static str,
+    },
+    /// Something else than a whole number in the place of the number of an episode.
+    #[error("{place}: `{found}` is not the number of an episode; {help}")]
+    EpisodeNumber {
+        /// The recording as named by the caller, or the cell.
+        place: Place,
+        /// What was found instead.
+        found: String,
+        /// How to fix it.
+        help: &'static str,
     },
     /// There is a time, and no variable or column has a value for each.
     #[error(
@@ -462,6 +513,9 @@ impl RecordingError {
             | Self::NoSeries { place, .. }
             | Self::NoOverlap { place, .. }
             | Self::SeveralEpisodes { place, .. }
+            | Self::NoSuchEpisode { place, .. }
+            | Self::NoEpisodes { place, .. }
+            | Self::EpisodeNumber { place, .. }
             | Self::NoSignals { place, .. }
             | Self::ColumnLength { place, .. } => place,
         }

@@ -1,5 +1,6 @@
 //! A file whatever its format: its bytes, what errors call it, and how much its values may need.
 
+use crate::episode::Location;
 use crate::error::{Place, RecordingError};
 use std::fs;
 use std::io::ErrorKind;
@@ -9,12 +10,12 @@ use std::path::Path;
 #[cfg(any(feature = "mat", feature = "mcap", feature = "parquet"))]
 pub(crate) const ROOM: u64 = 2 << 30;
 
-/// The content of the file at `path`, for [`parse`](crate::parse).
+/// The content of the file at `path`, for [`parse`](crate::parse); where the path names an episode, that of the whole file.
 ///
 /// # Errors
 /// No such file, a folder or a device in its place, or a file that cannot be read.
 pub fn content(path: impl AsRef<Path>) -> Result<Vec<u8>, RecordingError> {
-    bytes(path.as_ref()).map(|(content, ..)| content)
+    bytes(&Location::of(path).file).map(|(content, ..)| content)
 }
 
 /// The content of the file at `path`, what errors call it, and its name.

@@ -49,6 +49,7 @@ mod clocks;
 mod columns;
 mod correlation;
 pub mod csv;
+mod episode;
 mod error;
 mod file;
 mod finding;
@@ -87,6 +88,9 @@ pub use crate::character::{Character, character};
 pub use crate::clocks::{Clock, Series};
 pub use crate::correlation::Correlation;
 pub use crate::csv::{CsvBlocks, CsvLines, parse_csv, read_csv, write_csv, write_csv_file};
+#[cfg(feature = "parquet")]
+pub use crate::episode::parse_episodes;
+pub use crate::episode::{Location, episodes};
 pub use crate::error::{Place, RecordingError};
 pub use crate::file::{content, is_device, write_whole};
 pub use crate::finding::{Finding, Severity, listed};
@@ -100,7 +104,7 @@ pub use crate::mcap::parse_mcap;
 pub use crate::npz::parse_npz;
 #[cfg(feature = "parquet")]
 pub use crate::parquet::parse_parquet;
-pub use crate::read::{EXTENSIONS, parse, read, read_selected};
+pub use crate::read::{EXTENSIONS, parse, parse_episode, read, read_selected};
 pub use crate::recording::{Channel, MIN_SAMPLES, Piece, Recording, SIZES};
 pub use crate::rename::{Rename, RenameError};
 pub use crate::selection::Selection;

@@ -6,7 +6,14 @@
 //! data sets of robot learning have them (`observation.state`), are the channels `observation.state[0]`,
 //! `observation.state[1]`, …. What else there is (texts, lists of different lengths, decimals) is left out, and reported in
 //! the warnings of the recording. Compression: Snappy, Zstandard, LZ4, gzip.
+//!
+//! A file whose times restart with the value of its column `episode_index` holds several recordings. The name `data.parquet#3`
+//! names the one of the rows where it is 3, wherever they stand: their order among themselves is that of the file, and errors
+//! count them alone.
 
+mod episodes;
+
+use crate::episode::split;
 use crate::error::{Place, RecordingError};
 use crate::file::{ROOM, guarded};
 use crate::finding::{Finding, Severity, listed};
@@ -16,28 +23,28 @@ use ::parquet::basic::{LogicalType, Repetition, TimeUnit, Type};
 use ::parquet::column::reader::{ColumnReader, ColumnReaderImpl};
 use ::parquet::data_type::DataType;
 use ::parquet::errors::ParquetError;
-use ::parquet::file::reader::{FileReader, SerializedFileReader};
+use ::parquet::file::reader::{ChunkReader, FileReader, SerializedFileReader};
 use ::parquet::schema::types::{ColumnDescriptor, SchemaDescriptor};
 use bytes::Bytes;
+pub(crate) use episodes::episodes;
 use std::collections::HashMap;
+use std::ops::Range;
 
-/// Reads a recording called `name` from the bytes of a Parquet file.
+/// Reads a recording called `name` from the bytes of a Parquet file; where the name ends in `.parquet#3`, episode 3.
 ///
 /// # Errors
 /// [`RecordingError::Damaged`] or [`RecordingError::TooLarge`] where the bytes cannot be read; [`RecordingError::NoTime`] or
 /// [`RecordingError::NoSignals`] where they make no recording, [`RecordingError::SeveralEpisodes`] where they make several;
-/// else as [`Recording::from_columns`].
+/// [`RecordingError::NoSuchEpisode`], [`RecordingError::NoEpisodes`] or [`RecordingError::EpisodeNumber`] where the episode
+/// named is none; else as [`Recording::from_columns`].
 ///
 /// ```
 /// let error = greybox_recording::parse_parquet(b"t,u\n0,1\n".to_vec(), "run1.parquet").unwrap_err();
 /// assert!(error.to_string().starts_with("run1.parquet: the file is damaged"));
 /// ```
 pub fn parse_parquet(bytes: Vec<u8>, name: &str) -> Result<Recording, RecordingError> {
-    parse(bytes, name, name)
+    parse(bytes, name, name, split(name).map(|(_, episode)| episode))
 }
-
-/// Name of the column that numbers the episodes of data sets of robot learning.
-const EPISODE: &str = "episode_index";
 
 /// A channel, or the time.
 struct Column {
@@ -55,6 +62,16 @@ enum Meaning {
     Unsigned,
     /// Seconds per unit, from any instant.
     Timestamp(f64),
+}
+
+impl Meaning {
+    /// Seconds per unit of a column with this unit, where it may be a time.
+    fn scale(self, unit: Option<&str>) -> Option<f64> {
+        match self {
+            Meaning::Timestamp(scale) => Some(scale),
+            Meaning::Number | Meaning::Unsigned => seconds(unit),
+        }
+    }
 }
 
 /// How the values of a column lie in its rows.
@@ -90,8 +107,7 @@ impl Shape {
 /// What the rows of a column hold.
 #[derive(Debug, Default)]
 struct Cells {
-    rows: usize,
-    /// The numbers of all rows, NaN = missing.
+    /// The numbers of all rows that are read, NaN = missing.
     values: Vec<f64>,
     /// For lists, how many there are in each row.
     lengths: Vec<usize>,
@@ -116,79 +132,117 @@ impl Cells {
     }
 }
 
-/// How many values the file states that a column has, those that are missing included.
-fn stated(file: &SerializedFileReader<Bytes>, column: usize) -> u64 {
-    let groups = file.metadata().row_groups().iter();
-    let values = groups.filter_map(|group| Some(group.columns().get(column)?.num_values()));
-    values.map(|n| u64::try_from(n).unwrap_or(u64::MAX)).fold(0, u64::saturating_add)
+/// A file that is being read.
+struct Table<R: ChunkReader> {
+    file: SerializedFileReader<R>,
+    /// Bytes of the file.
+    length: u64,
+    /// What errors call it.
+    label: String,
 }
 
-pub(crate) fn parse(bytes: Vec<u8>, label: &str, name: &str) -> Result<Recording, RecordingError> {
-    guarded(label, || read(bytes, label, name))
+impl<R: ChunkReader + 'static> Table<R> {
+    fn open(source: R, label: &str) -> Result<Table<R>, RecordingError> {
+        let length = source.len();
+        let label = label.to_owned();
+        match SerializedFileReader::new(source) {
+            Ok(file) => Ok(Table { file, length, label }),
+            Err(error) => Err(RecordingError::Damaged {
+                place: Place::file(&label),
+                variable: None,
+                found: error.to_string(),
+            }),
+        }
+    }
+
+    fn place(&self) -> Place {
+        Place::file(&self.label)
+    }
+
+    fn too_large(&self, variable: Option<String>) -> RecordingError {
+        RecordingError::TooLarge { place: self.place(), variable, limit_gib: ROOM >> 30 }
+    }
+
+    fn schema(&self) -> &SchemaDescriptor {
+        self.file.metadata().file_metadata().schema_descr()
+    }
+
+    /// How many rows the file states.
+    fn rows(&self) -> u64 {
+        u64::try_from(self.file.metadata().file_metadata().num_rows()).unwrap_or(u64::MAX)
+    }
+
+    /// How many values the file states that a column has, those that are missing included.
+    fn stated(&self, column: usize) -> u64 {
+        let groups = self.file.metadata().row_groups().iter();
+        let values = groups.filter_map(|group| Some(group.columns().get(column)?.num_values()));
+        values.map(|n| u64::try_from(n).unwrap_or(u64::MAX)).fold(0, u64::saturating_add)
+    }
+
+    /// The cells of a column in these rows.
+    fn cells(
+        &self,
+        column: usize,
+        shape: Shape,
+        meaning: Meaning,
+        rows: &Rows,
+    ) -> Result<Cells, RecordingError> {
+        self.unchecked_cells(column, shape, meaning, rows).map_err(|error| RecordingError::Damaged {
+            place: self.place(),
+            variable: Some(self.schema().column(column).path().string()),
+            found: error.to_string(),
+        })
+    }
 }
 
-fn read(bytes: Vec<u8>, label: &str, name: &str) -> Result<Recording, RecordingError> {
-    let place = || Place::file(label);
-    let damaged = |variable: Option<&str>, error: &ParquetError| RecordingError::Damaged {
-        place: Place::file(label),
-        variable: variable.map(str::to_owned),
-        found: error.to_string(),
-    };
-    let length = bytes.len() as u64;
-    let file = SerializedFileReader::new(Bytes::from(bytes)).map_err(|e| damaged(None, &e))?;
-    let schema = file.metadata().file_metadata().schema_descr();
-    let rows = u64::try_from(file.metadata().file_metadata().num_rows()).unwrap_or(u64::MAX);
-    let too_large = |variable| RecordingError::TooLarge { place: place(), variable, limit_gib: ROOM >> 30 };
-    let mut needed = rows.saturating_mul(8 * schema.num_columns() as u64);
-    if needed > ROOM {
-        return Err(too_large(None));
+/// Rows of a file, in increasing order.
+struct Rows {
+    runs: Vec<Range<usize>>,
+}
+
+impl Rows {
+    fn all(rows: u64) -> Rows {
+        let all = 0..usize::try_from(rows).unwrap_or(usize::MAX);
+        Rows { runs: std::iter::once(all).collect() }
     }
-    let (mut columns, mut left_out) = (Vec::new(), Vec::new());
-    for (c, column) in schema.columns().iter().enumerate() {
-        let path = column.path().string();
-        let (Some(meaning), Some(shape)) = (meaning(column), Shape::of(schema, c)) else {
-            left_out.push(format!("`{path}`"));
-            continue;
-        };
-        let path = if shape.is_list { column.path().parts()[0].clone() } else { path };
-        let (name, unit) = header_cell(&path, || place().column(c, &path))?;
-        if shape.is_list {
-            needed = needed.saturating_add(stated(&file, c).saturating_mul(8));
-            if needed > ROOM {
-                return Err(too_large(Some(path)));
-            }
-        }
-        let scale = match meaning {
-            Meaning::Timestamp(scale) => Some(scale),
-            _ => seconds(unit.as_deref()),
-        };
-        let cells = cells(&file, c, shape, meaning, rows, length).map_err(|e| damaged(Some(&path), &e))?;
-        let single = column.physical_type() == Type::FLOAT;
-        if !shape.is_list {
-            columns.push(Column { channel: Channel { name, unit, values: cells.values }, scale, single });
-        } else if let Some(lists) = cells.by_element() {
-            columns.extend(lists.into_iter().enumerate().map(|(k, values)| Column {
-                channel: Channel { name: format!("{name}[{k}]"), unit: unit.clone(), values },
-                scale: None,
-                single,
-            }));
-        } else {
-            left_out.push(format!("`{path}` (lists of different lengths)"));
-        }
+
+    fn count(&self) -> u64 {
+        self.runs.iter().map(|run| run.len() as u64).fold(0, u64::saturating_add)
     }
+
+    /// Those of a range of rows, counted from its first one.
+    fn within(&self, range: Range<usize>) -> impl Iterator<Item = Range<usize>> {
+        let first = self.runs.partition_point(|run| run.end <= range.start);
+        let runs = self.runs.iter().skip(first).take_while(move |run| run.start < range.end);
+        runs.map(move |run| run.start.max(range.start) - range.start..run.end.min(range.end) - range.start)
+    }
+}
+
+pub(crate) fn parse(
+    bytes: Vec<u8>,
+    label: &str,
+    name: &str,
+    episode: Option<&str>,
+) -> Result<Recording, RecordingError> {
+    guarded(label, || {
+        let table = Table::open(Bytes::from(bytes), label)?;
+        let rows = match episode {
+            Some(episode) => episodes::rows(&table, episode)?,
+            None => episodes::only(&table, name)?,
+        };
+        read(&table, name, &rows)
+    })
+}
+
+fn read(table: &Table<Bytes>, name: &str, rows: &Rows) -> Result<Recording, RecordingError> {
+    let label = &table.label;
+    let (columns, left_out) = columns(table, rows)?;
     let left_out = listed(left_out);
-    let time =
-        TIMES.iter().find_map(|t| columns.iter().position(|c| c.channel.name == *t && c.scale.is_some()));
-    let Some(time) = time else {
-        let mut found: Vec<String> = columns.iter().map(|c| format!("`{}`", c.channel.header())).collect();
-        found.extend((!left_out.is_empty()).then_some(left_out));
-        let help = "call the column of times, in s, `t`";
-        return Err(RecordingError::NoTime { place: place(), found: listed(found), help });
-    };
-    let Column { channel: time, scale, single } = columns.remove(time);
+    let (time, columns) = time_apart(label, columns, &left_out)?;
+    let Column { channel: time, scale, single } = time;
     if columns.is_empty() {
         return Err(RecordingError::NoSignals {
-            place: place(),
+            place: table.place(),
             time: time.name,
             rows: time.values.len(),
             found: left_out,
@@ -205,7 +259,7 @@ fn read(bytes: Vec<u8>, label: &str, name: &str) -> Result<Recording, RecordingE
     let mut places = HashMap::new();
     for (c, channel) in channels.iter().enumerate() {
         if let Some(first) = places.insert(&channel.name, c) {
-            let place = place().column(c + 1, &channel.name);
+            let place = table.place().column(c + 1, &channel.name);
             return Err(RecordingError::DuplicateName {
                 place,
                 name: channel.name.clone(),
@@ -213,7 +267,6 @@ fn read(bytes: Vec<u8>, label: &str, name: &str) -> Result<Recording, RecordingE
             });
         }
     }
-    check_episodes(label, &times, &channels)?;
     let longest = times.iter().fold(0.0f64, |most, t| most.max(t.abs()));
     let resolution = if single { longest * f64::from(f32::EPSILON) } else { 0.0 };
     let mut recording = Recording::checked(label, name, times, channels, resolution)?;
@@ -224,18 +277,68 @@ fn read(bytes: Vec<u8>, label: &str, name: &str) -> Result<Recording, RecordingE
     Ok(recording)
 }
 
-/// Sees that the file holds one episode where its times restart.
-fn check_episodes(label: &str, times: &[f64], channels: &[Channel]) -> Result<(), RecordingError> {
-    let Some(column) = channels.iter().find(|c| c.name == EPISODE) else { return Ok(()) };
-    let changes = column.values.windows(2).filter(|w| w[0] != w[1]).count();
-    if changes == 0 || times.windows(2).all(|w| w[1] > w[0]) {
-        return Ok(());
+/// The columns of numbers, and the names of the others.
+fn columns(table: &Table<Bytes>, rows: &Rows) -> Result<(Vec<Column>, Vec<String>), RecordingError> {
+    let schema = table.schema();
+    let mut needed = rows.count().saturating_mul(8 * schema.num_columns() as u64);
+    if needed > ROOM {
+        return Err(table.too_large(None));
     }
-    Err(RecordingError::SeveralEpisodes {
-        place: Place::file(label),
-        column: EPISODE.to_owned(),
-        episodes: changes + 1,
-    })
+    let (mut columns, mut left_out) = (Vec::new(), Vec::new());
+    for (c, column) in schema.columns().iter().enumerate() {
+        let path = column.path().string();
+        let (Some(meaning), Some(shape)) = (meaning(column), Shape::of(schema, c)) else {
+            left_out.push(format!("`{path}`"));
+            continue;
+        };
+        let path = if shape.is_list { column.path().parts()[0].clone() } else { path };
+        let (name, unit) = header_cell(&path, || table.place().column(c, &path))?;
+        if shape.is_list {
+            needed = needed.saturating_add(expected(table, c, rows).saturating_mul(8));
+            if needed > ROOM {
+                return Err(table.too_large(Some(path)));
+            }
+        }
+        let scale = meaning.scale(unit.as_deref());
+        let cells = table.cells(c, shape, meaning, rows)?;
+        let single = column.physical_type() == Type::FLOAT;
+        if !shape.is_list {
+            columns.push(Column { channel: Channel { name, unit, values: cells.values }, scale, single });
+        } else if let Some(lists) = cells.by_element() {
+            columns.extend(lists.into_iter().enumerate().map(|(k, values)| Column {
+                channel: Channel { name: format!("{name}[{k}]"), unit: unit.clone(), values },
+                scale: None,
+                single,
+            }));
+        } else {
+            left_out.push(format!("`{path}` (lists of different lengths)"));
+        }
+    }
+    Ok((columns, left_out))
+}
+
+/// How many values a column of lists has in these rows, were they of one length.
+fn expected(table: &Table<Bytes>, column: usize, rows: &Rows) -> u64 {
+    let share = u128::from(table.stated(column)) * u128::from(rows.count());
+    u64::try_from(share.div_ceil(u128::from(table.rows().max(1)))).unwrap_or(u64::MAX)
+}
+
+/// The column of times, and the others.
+fn time_apart(
+    label: &str,
+    mut columns: Vec<Column>,
+    left_out: &str,
+) -> Result<(Column, Vec<Column>), RecordingError> {
+    let time =
+        TIMES.iter().find_map(|t| columns.iter().position(|c| c.channel.name == *t && c.scale.is_some()));
+    let Some(time) = time else {
+        let mut found: Vec<String> = columns.iter().map(|c| format!("`{}`", c.channel.header())).collect();
+        found.extend((!left_out.is_empty()).then_some(left_out.to_owned()));
+        let help = "call the column of times, in s, `t`";
+        return Err(RecordingError::NoTime { place: Place::file(label), found: listed(found), help });
+    };
+    let time = columns.remove(time);
+    Ok((time, columns))
 }
 
 /// What a column's numbers mean; `None` where it holds none that are read.
@@ -257,53 +360,60 @@ fn meaning(column: &ColumnDescriptor) -> Option<Meaning> {
     }
 }
 
-/// The cells of a column; timestamps count from the first one.
-fn cells(
-    file: &SerializedFileReader<Bytes>,
-    column: usize,
-    shape: Shape,
-    meaning: Meaning,
-    rows: u64,
-    length: u64,
-) -> Result<Cells, ParquetError> {
-    let mut cells = Cells::default();
-    let mut first = None;
-    let most = stated(file, column);
-    for group in 0..file.num_row_groups() {
-        check_place(file, group, column, length)?;
-        if shape.is_list {
-            check_pages(file, group, column)?;
-        }
-        let left = Left {
-            rows: (rows as usize).saturating_sub(cells.rows),
-            values: (most as usize).saturating_sub(cells.values.len()),
-        };
-        let cells = &mut cells;
-        match file.get_row_group(group)?.get_column_reader(column)? {
-            ColumnReader::BoolColumnReader(r) => append(cells, r, shape, left, |v| f64::from(u8::from(v)))?,
-            ColumnReader::Int32ColumnReader(r) if meaning == Meaning::Unsigned => {
-                append(cells, r, shape, left, |v| f64::from(v.cast_unsigned()))?;
+impl<R: ChunkReader + 'static> Table<R> {
+    /// The cells of a column in these rows; timestamps count from the first one.
+    fn unchecked_cells(
+        &self,
+        column: usize,
+        shape: Shape,
+        meaning: Meaning,
+        rows: &Rows,
+    ) -> Result<Cells, ParquetError> {
+        let file = &self.file;
+        let mut cells = Cells::default();
+        let mut first = None;
+        let mut begin = 0usize;
+        let most = usize::try_from(self.stated(column).min(ROOM / 8)).unwrap_or(usize::MAX);
+        for (group, metadata) in file.metadata().row_groups().iter().enumerate() {
+            check_place(file, group, column, self.length)?;
+            if shape.is_list {
+                check_pages(file, group, column)?;
             }
-            ColumnReader::Int32ColumnReader(r) => append(cells, r, shape, left, f64::from)?,
-            ColumnReader::Int64ColumnReader(r) => match meaning {
-                Meaning::Unsigned => append(cells, r, shape, left, |v| v.cast_unsigned() as f64)?,
-                // As a number since 1970 a double has no room for fractions of a microsecond.
-                Meaning::Timestamp(_) => {
-                    append(cells, r, shape, left, |v| v.wrapping_sub(*first.get_or_insert(v)) as f64)?;
+            let end = begin.saturating_add(usize::try_from(metadata.num_rows()).unwrap_or(0));
+            let wanted = Wanted { runs: rows.within(begin..end).collect(), most };
+            begin = end;
+            if wanted.runs.is_empty() {
+                continue;
+            }
+            let cells = &mut cells;
+            match file.get_row_group(group)?.get_column_reader(column)? {
+                ColumnReader::BoolColumnReader(r) => {
+                    append(cells, r, shape, &wanted, |v| f64::from(u8::from(v)))?;
                 }
-                Meaning::Number => append(cells, r, shape, left, |v| v as f64)?,
-            },
-            ColumnReader::FloatColumnReader(r) => append(cells, r, shape, left, f64::from)?,
-            ColumnReader::DoubleColumnReader(r) => append(cells, r, shape, left, |v| v)?,
-            _ => return Err(ParquetError::General("the column changes its type".to_owned())),
+                ColumnReader::Int32ColumnReader(r) if meaning == Meaning::Unsigned => {
+                    append(cells, r, shape, &wanted, |v| f64::from(v.cast_unsigned()))?;
+                }
+                ColumnReader::Int32ColumnReader(r) => append(cells, r, shape, &wanted, f64::from)?,
+                ColumnReader::Int64ColumnReader(r) => match meaning {
+                    Meaning::Unsigned => append(cells, r, shape, &wanted, |v| v.cast_unsigned() as f64)?,
+                    // As a number since 1970 a double has no room for fractions of a microsecond.
+                    Meaning::Timestamp(_) => {
+                        append(cells, r, shape, &wanted, |v| v.wrapping_sub(*first.get_or_insert(v)) as f64)?;
+                    }
+                    Meaning::Number => append(cells, r, shape, &wanted, |v| v as f64)?,
+                },
+                ColumnReader::FloatColumnReader(r) => append(cells, r, shape, &wanted, f64::from)?,
+                ColumnReader::DoubleColumnReader(r) => append(cells, r, shape, &wanted, |v| v)?,
+                _ => return Err(ParquetError::General("the column changes its type".to_owned())),
+            }
         }
+        Ok(cells)
     }
-    Ok(cells)
 }
 
 /// Sees that a column of a row group lies within the `length` bytes of the file: the library takes that for granted.
-fn check_place(
-    file: &SerializedFileReader<Bytes>,
+fn check_place<R: ChunkReader + 'static>(
+    file: &SerializedFileReader<R>,
     group: usize,
     column: usize,
     length: u64,
@@ -322,7 +432,11 @@ fn check_place(
 
 /// Sees that the pages of a column of lists have no more values than the row group states: a row is read whole, however
 /// long it claims to be.
-fn check_pages(file: &SerializedFileReader<Bytes>, group: usize, column: usize) -> Result<(), ParquetError> {
+fn check_pages<R: ChunkReader + 'static>(
+    file: &SerializedFileReader<R>,
+    group: usize,
+    column: usize,
+) -> Result<(), ParquetError> {
     let group = file.get_row_group(group)?;
     let stated = usize::try_from(group.metadata().column(column).num_values()).unwrap_or(0);
     let mut pages = group.get_column_page_reader(column)?;
@@ -337,55 +451,72 @@ fn check_pages(file: &SerializedFileReader<Bytes>, group: usize, column: usize) 
     }
 }
 
-/// How much of a column is still to be read.
-#[derive(Debug, Clone, Copy)]
-struct Left {
-    rows: usize,
-    values: usize,
+/// What is read of a row group.
+struct Wanted {
+    /// Its rows, in increasing order.
+    runs: Vec<Range<usize>>,
+    /// Most values that the column may have in the whole file.
+    most: usize,
 }
 
-/// Appends what a row group has of a column.
+/// Appends what a row group has of a column in the rows that are wanted.
 fn append<T: DataType>(
     cells: &mut Cells,
     mut reader: ColumnReaderImpl<T>,
     shape: Shape,
-    left: Left,
+    wanted: &Wanted,
     mut number: impl FnMut(T::T) -> f64,
 ) -> Result<(), ParquetError> {
-    const BLOCK: usize = 1 << 16;
-    let (end, most) = (cells.rows + left.rows, cells.values.len() + left.values);
-    while cells.rows < end {
-        let (mut levels, mut repeats, mut present) = (Vec::new(), Vec::new(), Vec::new());
-        let block = if shape.is_list { BLOCK.min(1 << 10) } else { BLOCK };
-        let block = block.min(end - cells.rows);
-        let (read, ..) = reader.read_records(block, Some(&mut levels), Some(&mut repeats), &mut present)?;
-        if read == 0 {
-            break;
-        }
-        cells.rows += read;
-        let mut present = present.into_iter();
-        if shape.full == 0 {
-            cells.values.extend(present.map(&mut number));
-            continue;
-        }
-        for (k, &level) in levels.iter().enumerate() {
-            if shape.is_list && repeats.get(k) == Some(&0) {
-                cells.lengths.push(0);
+    let mut at = 0;
+    for run in &wanted.runs {
+        at += reader.skip_records(run.start.saturating_sub(at))?;
+        // (Where rows are missing, the column is shorter than the time.)
+        while at < run.end {
+            let read = append_block(cells, &mut reader, shape, run.end - at, &mut number)?;
+            if read == 0 {
+                break;
             }
-            if shape.is_list && level < shape.element {
-                continue;
+            at += read;
+            if cells.values.len() > wanted.most {
+                return Err(ParquetError::General("it has more values than it states".to_owned()));
             }
-            if let Some(length) = cells.lengths.last_mut() {
-                *length += 1;
-            }
-            cells.values.push(match level == shape.full {
-                true => present.next().map_or(f64::NAN, &mut number),
-                false => f64::NAN,
-            });
-        }
-        if cells.values.len() > most {
-            return Err(ParquetError::General("it has more values than it states".to_owned()));
         }
     }
     Ok(())
+}
+
+/// Appends at most so many rows of a column; how many it were.
+fn append_block<T: DataType>(
+    cells: &mut Cells,
+    reader: &mut ColumnReaderImpl<T>,
+    shape: Shape,
+    rows: usize,
+    mut number: impl FnMut(T::T) -> f64,
+) -> Result<usize, ParquetError> {
+    const BLOCK: usize = 1 << 16;
+    let (mut levels, mut repeats, mut present) = (Vec::new(), Vec::new(), Vec::new());
+    let block = if shape.is_list { BLOCK.min(1 << 10) } else { BLOCK };
+    let (read, ..) =
+        reader.read_records(block.min(rows), Some(&mut levels), Some(&mut repeats), &mut present)?;
+    let mut present = present.into_iter();
+    if shape.full == 0 {
+        cells.values.extend(present.map(&mut number));
+        return Ok(read);
+    }
+    for (k, &level) in levels.iter().enumerate() {
+        if shape.is_list && repeats.get(k) == Some(&0) {
+            cells.lengths.push(0);
+        }
+        if shape.is_list && level < shape.element {
+            continue;
+        }
+        if let Some(length) = cells.lengths.last_mut() {
+            *length += 1;
+        }
+        cells.values.push(match level == shape.full {
+            true => present.next().map_or(f64::NAN, &mut number),
+            false => f64::NAN,
+        });
+    }
+    Ok(read)
 }

@@ -6,7 +6,7 @@
 use std::path::Path;
 use std::sync::Arc;
 
-use greybox_recording::{Recording, RecordingError, parse_parquet, read};
+use greybox_recording::{Recording, RecordingError, Selection, episodes, parse, parse_parquet, read};
 use parquet::basic::{Compression, ZstdLevel};
 use parquet::data_type::{BoolType, ByteArrayType, DoubleType, FloatType, Int64Type};
 use parquet::file::properties::WriterProperties;
@@ -147,10 +147,166 @@ fn the_digits_of_a_time_end_where_its_type_says() {
 fn several_episodes_are_refused_where_the_time_restarts() {
     let error = made("episodes.parquet").unwrap_err();
     assert!(matches!(error, RecordingError::SeveralEpisodes { .. }), "{error}");
-    for part in ["holds 3 episodes (column `episode_index`)", "a file for each value of `episode_index`"] {
+    for part in [
+        "holds 3 episodes (4 … 6; column `episode_index`)",
+        "`episodes.parquet#4`",
+        "a shell expands: `episodes.parquet#{4..6}`",
+        "`greybox diagnose MODEL.toml FOLDER`",
+    ] {
         assert!(error.to_string().contains(part), "{error}");
     }
     assert_eq!(made("one_time.parquet").unwrap().time.len(), 60, "episodes of one clock are one recording");
+}
+
+/// Episode e of 4, 5 and 6 has the times k/50 as `f32`, and `observation.state` is [k/50, k/25] in each.
+#[test]
+fn an_episode_is_a_recording() {
+    for e in 4..7 {
+        let episode = made(&format!("episodes.parquet#{e}")).unwrap();
+        assert_eq!(episode.name, format!("episodes.parquet#{e}"));
+        let names: Vec<&str> = episode.channels.iter().map(|c| c.name.as_str()).collect();
+        assert_eq!(names, ["observation.state[0]", "observation.state[1]", "episode_index"]);
+        let time: Vec<f64> = (0..20).map(|k| f64::from((f64::from(k) / 50.0) as f32)).collect();
+        assert_eq!(episode.time, time);
+        assert_eq!(episode.channels[0].values, time);
+        let twice: Vec<f64> = (0..20).map(|k| f64::from((f64::from(k) / 25.0) as f32)).collect();
+        assert_eq!(episode.channels[1].values, twice);
+        assert_eq!(episode.channels[2].values, [f64::from(e); 20]);
+    }
+    let part = made("one_time.parquet#5").unwrap();
+    assert_eq!((part.time.len(), part.time[0]), (20, 0.4), "one clock goes on");
+}
+
+#[test]
+fn the_episodes_of_a_file_are_listed() {
+    let folder = Path::new(env!("CARGO_MANIFEST_DIR")).join("tests/parquet");
+    assert_eq!(episodes(folder.join("episodes.parquet")).unwrap(), [4, 5, 6]);
+    for one in ["one_time.parquet", "lists.parquet", "late.parquet"] {
+        assert_eq!(episodes(folder.join(one)).unwrap(), [0i64; 0], "{one}");
+    }
+    assert!(matches!(episodes(folder.join("none.parquet")), Err(RecordingError::NotFound { .. })));
+    assert!(matches!(episodes(folder.join("make.py")).as_deref(), Ok([])));
+}
+
+#[test]
+fn an_episode_that_is_none_is_refused() {
+    for (name, parts) in [
+        (
+            "episodes.parquet#7",
+            &["episodes.parquet#7: the file has no episode 7", "`episode_index`: 4 … 6"][..],
+        ),
+        ("episodes.parquet#04", &["`04` is not the number of an episode; write a whole number after `#`"]),
+        ("episodes.parquet#", &["`` is not the number of an episode"]),
+        (
+            "late.parquet#0",
+            &["`#0` names an episode, but the file has no column", "name the file without it"],
+        ),
+        ("make.csv#0", &["make.csv: no such file"]),
+        ("none.parquet#0", &["none.parquet: no such file"]),
+    ] {
+        let error = made(name).unwrap_err();
+        assert!(parts.iter().all(|part| error.to_string().contains(part)), "{error}");
+    }
+    let error = parse(b"t,u\n0,1\n".to_vec(), "a/run.csv#3", "run.csv#3", &Selection::default()).unwrap_err();
+    assert!(error.to_string().starts_with("a/run.csv#3: `#3` names an episode, but only Parquet"), "{error}");
+}
+
+/// A file that is called so comes first, also for the reader of its bytes.
+#[test]
+fn a_file_with_a_number_sign_is_that_file() {
+    let folder = tempfile::tempdir().unwrap();
+    let path = folder.path().join("run.csv#3");
+    let rows: String = (0..20).map(|k| format!("{k},{}\n", k % 3)).collect();
+    std::fs::write(&path, format!("t,u\n{rows}")).unwrap();
+    assert_eq!(read(&path).unwrap().name, "run.csv#3");
+    std::fs::rename(&path, folder.path().join("run.csv")).unwrap();
+    assert!(matches!(read(&path), Err(RecordingError::NoEpisodes { .. })));
+}
+
+/// The rows of two episodes take turns, in three row groups; lists have one element in even rows and two in
+/// odd ones. `e` is the episode of a row.
+fn mixed(e: impl Fn(usize) -> f64) -> Vec<u8> {
+    let schema = "message m { required double t; required double episode_index; optional double x; \
+                  required group w (LIST) { repeated group list { required double element; } } }";
+    let schema = Arc::new(parse_message_type(schema).unwrap());
+    let mut writer = SerializedFileWriter::new(Vec::new(), schema, Arc::default()).unwrap();
+    for group in 0..3 {
+        let rows: Vec<usize> = (30 * group..30 * group + 30).collect();
+        // Values, levels of definition and of repetition.
+        type Levels = Option<Vec<i16>>;
+        let columns: [(Vec<f64>, Levels, Levels); 4] = [
+            (rows.iter().map(|&k| (k / 2) as f64 / 8.0).collect(), None, None),
+            (rows.iter().map(|&k| e(k)).collect(), None, None),
+            (
+                rows.iter().filter(|k| *k % 7 != 3).map(|&k| k as f64).collect(),
+                Some(rows.iter().map(|k| i16::from(k % 7 != 3)).collect()),
+                None,
+            ),
+            (
+                rows.iter().flat_map(|&k| vec![k as f64; 1 + k % 2]).collect(),
+                Some(rows.iter().flat_map(|&k| vec![1; 1 + k % 2]).collect()),
+                Some(rows.iter().flat_map(|&k| (0..1 + k % 2).map(|i| i16::from(i > 0))).collect()),
+            ),
+        ];
+        let mut file = writer.next_row_group().unwrap();
+        for (values, levels, repeats) in columns {
+            let mut column = file.next_column().unwrap().unwrap();
+            let typed = column.typed::<DoubleType>();
+            typed.write_batch(&values, levels.as_deref(), repeats.as_deref()).unwrap();
+            column.close().unwrap();
+        }
+        file.close().unwrap();
+    }
+    writer.into_inner().unwrap()
+}
+
+#[test]
+fn episodes_whose_rows_take_turns_are_taken_apart() {
+    for (e, width) in [(-2, 1), (9, 2)] {
+        let bytes = mixed(|k| [-2.0, 9.0][k % 2]);
+        let recording = parse_parquet(bytes, &format!("mixed.parquet#{e}")).unwrap();
+        let rows: Vec<usize> = (0..90).filter(|k| k % 2 == width - 1).collect();
+        assert_eq!(recording.time, rows.iter().map(|&k| (k / 2) as f64 / 8.0).collect::<Vec<_>>());
+        assert_eq!(recording.channels.len(), 2 + width);
+        for (i, &k) in rows.iter().enumerate() {
+            let value = |c: usize| recording.channels[c].values[i];
+            assert_eq!((value(0), value(1).is_nan()), (f64::from(e), k % 7 == 3));
+            assert!(value(1).is_nan() || value(1) == k as f64);
+            assert!((0..width).all(|j| value(2 + j) == k as f64));
+        }
+    }
+    // Within an episode the rows are in the order of time.
+    let error = parse_parquet(mixed(|k| f64::from(u8::from(k >= 40))), "mixed.parquet#1").unwrap_err();
+    assert!(matches!(error, RecordingError::TimeNotIncreasing { .. }), "{error}");
+    for (odd, found) in [(0.5, "`0.5`"), (f64::NAN, "`NaN`"), (1e300, "is not the number of an episode")] {
+        for name in ["mixed.parquet", "mixed.parquet#1"] {
+            let bytes = mixed(|k| if k == 70 { odd } else { (k % 2) as f64 });
+            let error = parse_parquet(bytes, name).unwrap_err();
+            assert!(matches!(error, RecordingError::EpisodeNumber { .. }), "{error}");
+            assert!(
+                error.to_string().starts_with(&format!("{name}:71:episode_index (column 2): ")),
+                "{error}"
+            );
+            assert!(error.to_string().contains(found), "{error}");
+        }
+    }
+}
+
+#[test]
+fn no_cut_and_no_changed_byte_of_an_episode_makes_a_fault() {
+    let whole = mixed(|k| (k % 2) as f64);
+    for end in (0..whole.len()).step_by(3) {
+        assert!(parse_parquet(whole[..end].to_vec(), "cut.parquet#1").is_err(), "{end}");
+    }
+    let mut refused = 0;
+    for at in 0..whole.len() {
+        for change in [0x01, 0x80, 0xff] {
+            let mut changed = whole.clone();
+            changed[at] ^= change;
+            refused += usize::from(parse_parquet(changed, "changed.parquet#1").is_err());
+        }
+    }
+    assert!(refused > 100, "{refused}");
 }
 
 #[test]

@@ -20,7 +20,7 @@ use crate::loading;
   greybox check run1.csv --model link.toml --json
 
 A folder stands for all recordings in it and in its folders (*.csv, *.mat, *.h5, *.hdf5, *.npz, *.npy, *.mcap,
-*.parquet). A recording that cannot be read stops no other; the exit status is 2 then.")]
+*.parquet); each episode of a Parquet file is one, such as data.parquet#3. A recording that cannot be read stops no other; the exit status is 2 then.")]
 pub(crate) struct Arguments {
     /// Recordings, or folders of them (CSV: first column `t` in seconds, header cells `name` or `name [unit]`;
     /// MAT-file; HDF5; NumPy; MCAP; Parquet)

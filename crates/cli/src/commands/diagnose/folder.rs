@@ -104,7 +104,7 @@ pub(super) fn run(arguments: &Arguments, folder: &Path, own: Option<&Mechanisms>
     Ok(Answer::new(words, json))
 }
 
-/// The recordings of the folder that are not held out; a table of them is none.
+/// The recordings of the folder that are not held out, episodes one by one; a table of them is none.
 fn recordings(folder: &Path, holdout: &[PathBuf], table: Option<&Path>) -> Result<Vec<PathBuf>, Failure> {
     let mut recordings = loading::recordings_of(folder)?;
     recordings.retain(|path| !table.is_some_and(|table| same_file(table, path)));
@@ -122,11 +122,11 @@ fn table(path: &Path, recordings: &[PathBuf]) -> Result<Table, Failure> {
     Table::new(&loading::text(path)?, &path.display().to_string(), names.iter().map(String::as_str))
 }
 
-/// A folder of results for each recording, called as the file without its ending.
+/// A folder of results for each recording.
 fn tasks(recordings: &[PathBuf], place: &Path) -> Result<Vec<Task>, Failure> {
     let mut tasks: Vec<Task> = Vec::with_capacity(recordings.len());
     for recording in recordings {
-        let name = recording.file_stem().map(|s| s.to_string_lossy().into_owned()).unwrap_or_default();
+        let name = fleet::folder_of(recording);
         let taken = match tasks.iter().find(|task| task.name == name) {
             Some(twin) => Some(twin.recording.display().to_string()),
             None => SUMMARY.iter().find(|file| **file == name).map(|file| (*file).to_owned()),
