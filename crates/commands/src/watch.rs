@@ -315,7 +315,7 @@ impl Session {
 fn failure(model: &LoadedModel, error: WatchError) -> Failure {
     match error {
         WatchError::Data(error) => error.into(),
-        WatchError::Setup(_) | WatchError::Delayed | WatchError::NothingFree => {
+        WatchError::Setup(_) | WatchError::DelayedMeasurement | WatchError::NothingFree => {
             Failure::file(&model.path, error)
         }
         other => Failure::input(other.to_string()),
