@@ -399,7 +399,7 @@ pub enum RecordingError {
         "{place}: the file holds {} ({}; column `{column}`), each a recording with times of its own; name one, \
          `{file}#{}`, or several, {}; a folder of recordings takes each by itself: `greybox diagnose MODEL.toml FOLDER`",
         counted(episodes.len(), "episode"),
-        crate::episode::in_words(episodes),
+        crate::finding::in_words(episodes),
         episodes.first().copied().unwrap_or_default(),
         several(file, episodes)
     )]
@@ -416,7 +416,7 @@ pub enum RecordingError {
     /// The file has episodes, but not this one.
     #[error(
         "{place}: the file has no episode {wanted}; name one of those in its column `{column}`: {}",
-        crate::episode::in_words(episodes)
+        crate::finding::in_words(episodes)
     )]
     NoSuchEpisode {
         /// The recording as named by the caller.

@@ -1,7 +1,7 @@
 //! A file whatever its format: its bytes, what errors call it, and how much its values may need.
 
-use crate::episode::Location;
 use crate::error::{Place, RecordingError};
+use crate::location::Location;
 use std::fs;
 use std::io::ErrorKind;
 use std::path::Path;

@@ -132,9 +132,30 @@ pub fn listed(mut all: Vec<String>) -> String {
     all.join(", ")
 }
 
+/// Numbers in increasing order in words: `0 … 49, 51`.
+pub(crate) fn in_words(numbers: &[i64]) -> String {
+    let runs = numbers.chunk_by(|a, b| b.wrapping_sub(*a) == 1);
+    let words = runs.flat_map(|run| match run {
+        [first, .., last] if run.len() > 2 => vec![format!("{first} … {last}")],
+        few => few.iter().map(i64::to_string).collect(),
+    });
+    match numbers.is_empty() {
+        true => "none".to_owned(),
+        false => listed(words.collect()),
+    }
+}
+
 #[cfg(test)]
 mod tests {
     use super::*;
+
+    #[test]
+    fn numbers_are_told_in_runs() {
+        assert_eq!(in_words(&[]), "none");
+        assert_eq!(in_words(&[3]), "3");
+        assert_eq!(in_words(&[-1, 0, 4, 5, 6, 9]), "-1, 0, 4 … 6, 9");
+        assert_eq!(in_words(&[i64::MIN, i64::MAX]), format!("{}, {}", i64::MIN, i64::MAX));
+    }
 
     #[test]
     fn numbers_read_well() {

@@ -61,6 +61,7 @@ pub mod health;
 pub mod interpolate;
 #[cfg(feature = "mat")]
 mod layout;
+mod location;
 #[cfg(feature = "mat")]
 pub mod mat;
 #[cfg(feature = "mcap")]
@@ -88,14 +89,15 @@ pub use crate::character::{Character, character};
 pub use crate::clocks::{Clock, Series};
 pub use crate::correlation::Correlation;
 pub use crate::csv::{CsvBlocks, CsvLines, parse_csv, read_csv, write_csv, write_csv_file};
+pub use crate::episode::episodes;
 #[cfg(feature = "parquet")]
 pub use crate::episode::parse_episodes;
-pub use crate::episode::{Location, episodes};
 pub use crate::error::{Place, RecordingError};
 pub use crate::file::{content, is_device, write_whole};
 pub use crate::finding::{Finding, Severity, listed};
 #[cfg(feature = "hdf5")]
 pub use crate::hdf5::parse_hdf5;
+pub use crate::location::{EXTENSIONS, Location};
 #[cfg(feature = "mat")]
 pub use crate::mat::parse_mat;
 #[cfg(feature = "mcap")]
@@ -104,7 +106,7 @@ pub use crate::mcap::parse_mcap;
 pub use crate::npz::parse_npz;
 #[cfg(feature = "parquet")]
 pub use crate::parquet::parse_parquet;
-pub use crate::read::{EXTENSIONS, parse, parse_episode, read, read_selected};
+pub use crate::read::{parse, parse_episode, read, read_selected};
 pub use crate::recording::{Channel, MIN_SAMPLES, Piece, Recording, SIZES};
 pub use crate::rename::{Rename, RenameError};
 pub use crate::selection::Selection;

@@ -13,11 +13,11 @@
 
 mod episodes;
 
-use crate::episode::split;
 use crate::error::{Place, RecordingError};
 use crate::file::{ROOM, guarded};
 use crate::finding::{Finding, Severity, listed};
 use crate::header::{TIMES, header_cell, seconds};
+use crate::location::split;
 use crate::recording::{Channel, Recording};
 use ::parquet::basic::{LogicalType, Repetition, TimeUnit, Type};
 use ::parquet::column::reader::{ColumnReader, ColumnReaderImpl};

@@ -1,16 +1,12 @@
 //! Files to recordings: the format by the ending of the name.
 
 use crate::csv;
-use crate::episode::{self, Location};
 use crate::error::{Place, RecordingError};
 use crate::file::bytes;
+use crate::location::{Location, split};
 use crate::recording::Recording;
 use crate::selection::Selection;
 use std::path::Path;
-
-/// Endings of the files that may hold a recording. Whether this build reads all of them, its features say
-/// (`mat`, `hdf5`, `npz`, `mcap`, `parquet`); [`read`] tells which is missing.
-pub const EXTENSIONS: [&str; 8] = ["csv", "mat", "h5", "hdf5", "npz", "npy", "mcap", "parquet"];
 
 /// Reads the recording in the file at `path`: a MAT-file where the name ends in `.mat`, HDF5 where it ends in `.h5` or
 /// `.hdf5`, arrays of NumPy where it ends in `.npz` or `.npy`, an MCAP log where it ends in `.mcap`, a Parquet file where it
@@ -71,7 +67,7 @@ pub fn parse(
     name: &str,
     selection: &Selection,
 ) -> Result<Recording, RecordingError> {
-    let episode = episode::split(name).map(|(_, episode)| episode);
+    let episode = split(name).map(|(_, episode)| episode);
     parse_episode(bytes, label, name, episode, selection)
 }
 

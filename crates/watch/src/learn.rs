@@ -12,6 +12,7 @@ use serde::{Deserialize, Serialize};
 use crate::error::WatchError;
 use crate::machine::Machine;
 use crate::options::{BLOCK_SAMPLES, BLOCKS, Options};
+use crate::sample::Sample;
 
 /// Steps of the fit.
 const ITERATIONS: usize = 60;
@@ -149,15 +150,6 @@ pub(crate) struct Usual {
     /// Seconds between two samples.
     pub(crate) dt: f64,
     pub(crate) steps: Steps,
-}
-
-/// A sample, SI, in the model's order.
-#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
-pub(crate) struct Sample {
-    pub(crate) t: f64,
-    pub(crate) inputs: Vec<f64>,
-    /// What is no number was not measured.
-    pub(crate) measured: Vec<Option<f64>>,
 }
 
 /// The first seconds.

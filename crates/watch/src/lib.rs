@@ -11,6 +11,7 @@ mod machine;
 mod naming;
 mod options;
 mod released;
+mod sample;
 mod saved;
 mod tracker;
 mod watch;

@@ -5,7 +5,7 @@ use std::sync::Arc;
 use greybox_model::{Hold, Model, System};
 use greybox_simulate::{Environment, Method, Past, Seeds, Signal, SignalLanes, Simulation, delays};
 
-use crate::learn::Sample;
+use crate::sample::Sample;
 
 /// How far back what is delayed is remembered, over the longest delay when a machine is first seen: a delay may grow.
 const REACH: f64 = 2.0;

@@ -6,9 +6,10 @@ use serde::{Deserialize, Deserializer, Serialize};
 
 use crate::blocks::{Block, Scores};
 use crate::event::Irregular;
-use crate::learn::{Place, Sample, Usual};
+use crate::learn::{Place, Usual};
 use crate::machine::Machine;
 use crate::released::{Louder, Released};
+use crate::sample::Sample;
 use crate::tracker::{Effects, Tracker};
 
 /// The state of a watch as data: what [`Watch::restore`](crate::Watch::restore) goes on from.

@@ -4,8 +4,9 @@ use greybox_recursive::{Filter, Innovation, Measured, Predicted, RecursiveError}
 use greybox_simulate::Past;
 use serde::{Deserialize, Serialize};
 
-use crate::learn::{Place, Sample, Usual};
+use crate::learn::{Place, Usual};
 use crate::machine::{Beginning, Machine, Span, Step};
+use crate::sample::Sample;
 
 /// What innovations are regressed on.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]

@@ -8,9 +8,10 @@ use crate::blocks::{Block, Ended};
 use crate::error::WatchError;
 use crate::event::{Clock, Event, Irregular};
 use crate::first_pass::first_pass;
-use crate::learn::{First, Place, Sample, learn};
+use crate::learn::{First, Place, learn};
 use crate::machine::Machine;
 use crate::options::Options;
+use crate::sample::Sample;
 use crate::saved::{Known, Saved, VERSION};
 use crate::tracker::{Conditions, Effects, Scratch, Tracker};
 
