@@ -82,7 +82,6 @@ pub fn parse_episodes(bytes: Vec<u8>, label: &str) -> Result<Vec<i64>, Recording
 }
 
 /// Numbers in increasing order in words: `0 … 49, 51`.
-#[cfg(any(test, feature = "parquet"))]
 pub(crate) fn in_words(numbers: &[i64]) -> String {
     let runs = numbers.chunk_by(|a, b| b.wrapping_sub(*a) == 1);
     let words = runs.flat_map(|run| match run {
