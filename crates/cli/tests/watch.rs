@@ -424,9 +424,9 @@ fn what_cannot_be_watched_is_refused() {
     );
     bench.write("state.json", "{}");
     refused(&[model, "--state", "state.json"], "", &["state.json: this is no state of a watch"]);
-    let late = throttle::MODEL
-        .replace("k*angle", "k*delay(angle, d)")
-        .replace("k =", "d = { value = 0.1, unit = \"s\" }\nk =");
+    let late = format!("{}\n[measurements]\nangle = \"delay(angle, d)\"\n", throttle::MODEL)
+        .replace("k = {", "d = { value = 0.1, unit = \"s\", fixed = true }\nk = {");
     bench.write("late.toml", &late);
-    refused(&["late.toml", "--learn", "10"], &short, &["late.toml: the model has `delay(...)`"]);
+    let message = "late.toml: a measurement of the model has `delay(...)`";
+    refused(&["late.toml", "--learn", "10"], &short, &[message]);
 }

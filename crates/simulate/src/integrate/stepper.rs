@@ -46,7 +46,7 @@ pub struct Stepper<'a> {
     sample: usize,
     /// The state was set here, and the past of delayed expressions does not know yet.
     moved: bool,
-    /// Entries of the past that hold tangents to initial states that are no longer those of the lanes.
+    /// Entries of the past that depend on no initial state of the present lanes.
     known: Vec<usize>,
 }
 
@@ -101,7 +101,7 @@ impl<'a> Simulation<'a> {
             *history = History::known(past, s, lanes);
         }
         core.start_modes();
-        let known = core.rhs_history.iter().map(|h| h.s.len()).collect();
+        let known = core.rhs_history.iter().map(|h| h.s.len().saturating_sub(1)).collect();
         Stepper { core, sample, moved: false, known }
     }
 }
@@ -168,7 +168,8 @@ impl Stepper<'_> {
                 }
                 entry[initial.clone()].fill(0.0);
             }
-            *known = end;
+            // (The last entry is that of the state now: it is entered anew, with the lanes that begin here.)
+            *known = end.saturating_sub(1);
         }
         self.moved = true;
     }
@@ -295,5 +296,39 @@ late = "x' + a*delay(x, tau) = u"
         }
         // Before the delay has passed since the start the state does not know its own past.
         assert!((after(150, 0.3, 3).1 - 1.0).abs() < 1e-9);
+    }
+
+    /// Lanes that begin anew at every sample: the state after a step does not depend on the one before it by what was delayed,
+    /// as long as the delay is longer than the step.
+    #[test]
+    fn what_was_before_does_not_move_with_the_state_that_is_now() {
+        let model = Model::from_toml(LATE, "late.toml").unwrap();
+        let system = System::compile(&model).unwrap();
+        let u: Vec<f64> = (0..60).map(|k| (0.1 * f64::from(k)).sin()).collect();
+        let inputs = vec![Signal::new(Hold::Linear, 0.01, &u, |_| Vec::new())];
+        let environment = Environment { start: 0.0, dt: 0.01, len: 60, inputs, forces: Vec::new() };
+        let seeds = Seeds { initial: vec![0], ..Seeds::default() };
+        let simulation = Simulation {
+            system: &system,
+            environment: &environment,
+            parameters: &[3.0, 0.07],
+            method: Method::Rk4 { substeps: 1 },
+            seeds: &seeds,
+        };
+        let mut stepper = simulation.stepper(&[0.2]);
+        let mut tangents = Vec::new();
+        for _ in 0..40 {
+            assert!(stepper.step());
+            tangents.push(stepper.tangents(0)[0]);
+            stepper.restart_lanes();
+        }
+        assert!(tangents[8..].iter().all(|d| (d - 1.0).abs() < 1e-12), "{tangents:?}");
+        // And of one that goes on from the past of another.
+        let mut rest = simulation.stepper_from(stepper.sample(), stepper.state(), &stepper.past(0.2));
+        for _ in 0..10 {
+            assert!(rest.step());
+            assert!((rest.tangents(0)[0] - 1.0).abs() < 1e-12);
+            rest.restart_lanes();
+        }
     }
 }
