@@ -319,8 +319,9 @@ x = { unit = "m" }
 body = "m*x'' + c*x' + 0.4*k*x + 0.6*k*delay(x, 0.5*tau) = delay(u, tau) + k*delay(w, tau)"
 "#;
 
-    /// Steps from sample to sample, each from where the last one ended, are the simulation of all of them: what is delayed, of
-    /// the state and of inputs of either hold, was what it was.
+    /// Steps from sample to sample, each from where the last one ended, are the simulation of all of them, and so are their
+    /// derivatives, put together: what is delayed, of the state and of inputs of either hold, was what it was, and depends on what
+    /// it depended on.
     #[test]
     fn steps_remember_what_is_delayed() {
         let model = Model::from_toml(LATE, "late.toml").unwrap();
@@ -341,13 +342,22 @@ body = "m*x'' + c*x' + 0.4*k*x + 0.6*k*delay(x, 0.5*tau) = delay(u, tau) + k*del
         let mut whole = whole.stepper(&[0.4, -0.7]);
 
         let (mut past, mut step) = (Vec::new(), Step { state: vec![0.4, -0.7], ..Step::default() });
+        let mut by_effects = vec![0.0; 4];
         for k in 0..199usize {
             // (As far back as is remembered, and a sample more or less.)
             let earlier = &samples[k.saturating_sub(5 + k % 3)..k];
             let (before, after) = (&samples[k].inputs[..], &samples[k + 1].inputs[..]);
             let span = Span { earlier, from: samples[k].t, dt, before, after };
             let x = step.state.clone();
-            assert!(whole.step() && machine.step(&values, beginning(&x, &mut past), &span, &mut step));
+            let start = Beginning { x: &x, by_effects: &by_effects, past: &mut past };
+            assert!(whole.step() && machine.step(&values, start, &span, &mut step));
+            let before = by_effects.clone();
+            for (i, j) in [(0, 0), (0, 1), (1, 0), (1, 1)] {
+                let through: f64 = (0..2).map(|k| step.by_state[i * 2 + k] * before[k * 2 + j]).sum();
+                by_effects[i * 2 + j] = step.by_parameters[i * 2 + j] + through;
+                let (found, right) = (by_effects[i * 2 + j], whole.tangents(i)[j]);
+                assert!((found - right).abs() < 1e-10, "{k} {i} {j}: {found} {right}");
+            }
             for (found, right) in step.state.iter().zip(whole.state()) {
                 assert!((found - right).abs() < 1e-11, "{k}: {found} {right}");
             }
