@@ -221,7 +221,7 @@ impl Machine {
 }
 
 /// An input that is linear between samples, at the time `t`; `next` is the first of the `earlier` samples that is clearly later,
-/// and after the last of them comes the one at the `end`.
+/// and after the last of them comes the sample `before` the span, at its beginning `from`.
 fn at(earlier: &[Sample], next: usize, (from, before): (f64, &[f64]), t: f64, input: usize) -> f64 {
     let sample = |k: usize| earlier.get(k).map_or((from, before[input]), |s| (s.t, s.inputs[input]));
     let middle = next.max(1) - 1;

@@ -314,7 +314,8 @@ impl History {
     }
 }
 
-/// The delays τ of the equations, one for each delayed expression, s.
+/// The delays τ of the equations at these `parameters` (`system.np`, SI), one for each delayed expression, s; a negative one is
+/// zero, as it is simulated.
 ///
 /// ```
 /// # use greybox_model::{Model, System};
