@@ -475,7 +475,7 @@ impl<'a> Core<'a> {
         let at_dx = tape.registers() * width;
         let at_dk = at_dx + nx * width;
         let at_b = at_dk + tableau.b.len() * nx * width;
-        let mut d = Aligned::zeros(at_b + 2 * nz * width);
+        let mut d = Aligned::zeros(at_b + tail.sides() * width);
         for (l, &p) in seeds.parameters.iter().enumerate() {
             d[(system.parameters() + p) * width + l] = 1.0;
         }
@@ -763,9 +763,7 @@ impl<'a> Core<'a> {
 
     /// One trial step of length `h` from (s, x), stage 0 evaluated there; the result in `x1`, and with `end` evaluated there.
     fn trial(&mut self, h: f64, end: bool) {
-        if self.sticking.is_empty()
-            && let Some(values) = self.values.take()
-        {
+        if let Some(values) = self.values.take() {
             self.compiled_trial(&values, h, end);
             self.values = Some(values);
             return;

@@ -55,7 +55,7 @@ second = "m/5*x'' + m*y'' + c*y' + k*(y - x) + fc*sign(y') = 0"
 first = "m*x'' + m/5*y'' + drag*x'*abs(x') + k*x + k*(x - y) + fc*sign(x') = u"
 "#;
 
-/// Three, where a program does not solve the equations.
+/// Three, of which one stands apart from the others.
 const THREE: &str = r#"
 [states]
 x = { unit = "m" }
@@ -65,6 +65,48 @@ z = { unit = "m" }
 first = "m*x'' + k*x + k*(x - y) + fc*sign(x') = u"
 second = "m*y'' + m/5*z'' + c*y' + k*(y - x) = 0"
 third = "m*z'' + m/5*y'' + c*z' + k*z = u"
+"#;
+
+/// Three whose rows change places one after the other, whatever is left of them.
+const TURNED: &str = r#"
+[states]
+x = { unit = "m" }
+y = { unit = "m" }
+z = { unit = "m" }
+[equations]
+second = "m/5*x'' + m*y'' + m/4*z'' + c*y' + k*(y - x) + fc*sign(y') = 0"
+third = "m/9*x'' + m/8*y'' + m*z'' + c*z' + k*z = u"
+first = "m*x'' + m/7*y'' + m/6*z'' + k*x + k*(x - y) + fc*sign(x') = u"
+"#;
+
+/// Four: inertias that change on the way, signs of which several stick at once, and a memory (Dahl's friction).
+const FOUR: &str = r#"
+[states]
+x = { unit = "m" }
+y = { unit = "m" }
+z = { unit = "m" }
+s = { unit = "m" }
+[equations]
+second = "m/5*x'' + m*y'' + c*y' + k*(y - x) + fc*sign(y') = 0"
+first = "m*x'' + m/5*cos(y/a)*y'' + k*x + k*(x - y) + k*s + fc*sign(x') = u"
+memory = "s' - z'*(1 - s*sign(z')/a) = 0"
+third = "m*z'' + m/7*y'' + k*z + fc*sign(z') + fc*sign(z' - x') = u"
+"#;
+
+/// Five, of which programs solve none.
+const FIVE: &str = r#"
+[states]
+x = { unit = "m" }
+y = { unit = "m" }
+z = { unit = "m" }
+v = { unit = "m" }
+w = { unit = "m" }
+[equations]
+first = "m*x'' + k*x + k*(x - y) + fc*sign(x') = u"
+second = "m*y'' + m/5*z'' + c*y' + k*(y - x) = 0"
+third = "m*z'' + m/5*y'' + c*z' + k*z = u"
+fourth = "m*v'' + c*v' + k*v + fc*sign(v') = u"
+fifth = "m*w'' + m/9*v'' + c*w' + k*w = u"
 "#;
 
 /// A rate that was there a while ago.
@@ -133,5 +175,8 @@ fn machine_code_simulates_what_the_interpreter_does() {
     assert_same_simulation(TWO, 10);
     assert_same_simulation(RIGID, 5);
     assert_same_simulation(THREE, 5);
+    assert_same_simulation(TURNED, 5);
+    assert_same_simulation(FOUR, 10);
+    assert_same_simulation(FIVE, 5);
     assert_same_simulation(DELAYED, 5);
 }

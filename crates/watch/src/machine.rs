@@ -9,6 +9,9 @@ use crate::sample::Sample;
 
 /// How far back what is delayed is remembered, over the longest delay when a machine is first seen: a delay may grow.
 const REACH: f64 = 2.0;
+/// How many times finer than the samples the grid of the inputs before a step may be: it is as fine as the step, and two samples may
+/// lie next to each other. A shorter step takes for a delayed input what it was a little later, for less than this share of a sample.
+const FINEST: usize = 16;
 
 /// Signals of an input at both ends of a step.
 #[derive(Debug, Clone, Copy)]
@@ -105,6 +108,7 @@ impl Machine {
         let Span { earlier, from, dt, before, after } = *span;
         let first = earlier.first().map_or(from, |s| s.t);
         let back = (self.reach.min(from - first).max(0.0) / dt).ceil() as usize;
+        let back = back.min(FINEST * earlier.len());
         let mut grid: Vec<Vec<f64>> = vec![Vec::with_capacity(back + 2); self.holds.len()];
         let mut next = earlier.partition_point(|s| s.t <= from - (back as f64 - 0.5) * dt);
         for k in (1..=back).rev() {
@@ -426,5 +430,28 @@ body = "m*x'' + c*x' + 0.4*k*x + 0.6*k*delay(x, 0.5*tau) = delay(u, tau) + k*del
             // (Linear in time: the same value wherever the samples are.)
             assert!((signals[1].at(s, s).0 - (t(8) + s - 0.3)).abs() < 1e-12);
         }
+    }
+
+    /// A sample a nanosecond after another asks for no grid of nanoseconds.
+    #[test]
+    fn a_tiny_step_asks_for_no_more_than_what_is_remembered() {
+        let model = Model::from_toml(LATE, "late.toml").unwrap();
+        let system = Arc::new(System::compile(&model).unwrap());
+        let machine =
+            Machine::new(model, system, Method::Rk4 { substeps: 1 }, vec![1], &[2.0, 0.6, 8.0, 0.13]);
+        let earlier: Vec<Sample> = (0..8)
+            .map(|k| Sample { t: 0.05 * f64::from(k), inputs: vec![1.0, 2.0], measured: vec![None] })
+            .collect();
+        let (before, after) = ([1.0, 2.0], [1.0, 2.0]);
+        let span = Span { earlier: &earlier, from: 0.4, dt: 1e-9, before: &before, after: &after };
+        assert_eq!(machine.signals(&span).1, 8 * FINEST);
+        let mut step = Step::default();
+        assert!(machine.step(
+            &[2.0, 0.6, 8.0, 0.13],
+            beginning(&[0.3, 0.1], &mut Vec::new()),
+            &span,
+            &mut step
+        ));
+        assert!((step.state[0] - 0.3).abs() < 1e-9, "{:?}", step.state);
     }
 }

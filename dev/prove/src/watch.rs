@@ -53,21 +53,11 @@ plate = "J*angle'' + b*angle' + c*sign(angle') + k*angle = torque"
 "#;
 
 /// The model of a machine whose torque acts late.
-const LATE_MODEL: &str = r#"
-name = "throttle"
-[inputs]
-torque = { unit = "N*m", hold = "zero" }
-[parameters]
-J = { value = 0.02, unit = "kg*m^2", fixed = true }
-b = { value = 0.03, unit = "N*m*s/rad" }
-c = { value = 0.08, unit = "N*m" }
-k = { value = 0.7, unit = "N*m/rad" }
-tau = { value = 0.05, unit = "s" }
-[states]
-angle = { unit = "rad" }
-[equations]
-plate = "J*angle'' + b*angle' + c*sign(angle') + k*angle = delay(torque, tau)"
-"#;
+fn late_model() -> String {
+    MODEL
+        .replace("[states]", "tau = { value = 0.05, unit = \"s\" }\n[states]")
+        .replace("= torque", "= delay(torque, tau)")
+}
 
 /// Steps of the machine from sample to sample.
 const SUBSTEPS: usize = 20;
@@ -106,8 +96,8 @@ struct Case {
 
 impl Case {
     fn model(&self) -> Result<Model> {
-        let text = if self.usual.late.is_some() { LATE_MODEL } else { MODEL };
-        Model::from_toml(text, "throttle.toml").context("the throttle's model")
+        let text = if self.usual.late.is_some() { late_model() } else { MODEL.to_owned() };
+        Model::from_toml(&text, "throttle.toml").context("the throttle's model")
     }
 }
 
@@ -610,6 +600,14 @@ mod tests {
         assert_eq!(most(1.0 / 6.0), 2);
         assert_eq!(most(0.0), 0);
         assert!(most(400.0).abs_diff(460) <= 2, "{}", most(400.0));
+    }
+
+    #[test]
+    fn a_machine_whose_torque_is_late_has_a_model_that_says_so() {
+        for case in CASES {
+            let system = greybox_model::System::compile(&case.model().unwrap()).unwrap();
+            assert_eq!(system.rhs.delays.len() == 1, case.usual.late.is_some(), "{}", case.name);
+        }
     }
 
     #[test]

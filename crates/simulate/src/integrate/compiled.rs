@@ -8,23 +8,25 @@ use std::sync::Arc;
 
 use greybox_jit::{Operand, Operation, Operations, Row, Rule, Rules, Tangents as Program, Values};
 use greybox_model::system::System;
-use greybox_model::tape::{Reg, Tangents};
+use greybox_model::tape::{Reg, Tangents, Tape};
 
 use super::Core;
 use super::stage::Stage;
 use super::tableau::Tableau;
 
 /// How many equations a program solves for the highest derivatives.
-const EQUATIONS: std::ops::RangeInclusive<usize> = 1..=2;
+const EQUATIONS: std::ops::RangeInclusive<usize> = 1..=4;
 
 /// What stands behind the registers of the tape, their modes and their rows.
-#[derive(Debug, Clone, Copy)]
+#[derive(Debug, Clone)]
 pub(super) struct Tail {
     registers: usize,
     switches: usize,
     nx: usize,
     nz: usize,
     stages: usize,
+    /// Rows of the mass matrix that may change places, in the order in which they do.
+    changes: Vec<(usize, usize)>,
 }
 
 impl Tail {
@@ -35,6 +37,7 @@ impl Tail {
             nx: system.nx,
             nz: system.nz,
             stages: tableau.b.len(),
+            changes: changes(&system.rhs, system.nz),
         }
     }
 
@@ -43,9 +46,14 @@ impl Tail {
         self.weight(self.stages)
     }
 
-    /// Modes: whether the rows of the mass matrix change places.
+    /// Modes: whether rows of the mass matrix change places.
     pub(super) fn modes(&self) -> usize {
-        self.switches + 1
+        self.switches + self.changes.len()
+    }
+
+    /// Rows behind those of the rates: the right sides of the equations, as they are and in their changed places.
+    pub(super) fn sides(&self) -> usize {
+        self.nz + 2 * self.changes.len()
     }
 
     fn factor(&self, i: usize) -> usize {
@@ -69,11 +77,6 @@ impl Tail {
     /// The row of the right side of an equation M z = −h.
     fn equation(&self, i: usize) -> Reg {
         (self.registers + (1 + self.stages) * self.nx + i) as Reg
-    }
-
-    /// The row in which it is solved.
-    fn solved(&self, i: usize) -> Reg {
-        self.equation(self.nz + i)
     }
 
     /// What the stages share: the rates of all of them and of the step's end, the state at both ends, the length of the step.
@@ -106,7 +109,9 @@ impl Tail {
     /// The factors of the mass matrix to where programs find them.
     pub(super) fn set_factors(&self, stage: &mut Stage, modes: &mut [i8]) {
         stage.regs[self.factor(0)..self.weight(0)].copy_from_slice(&stage.lu);
-        modes[self.switches] = i8::from(self.nz > 1 && stage.pivots[0] != 0);
+        for (mode, (k, p)) in modes[self.switches..].iter_mut().zip(&self.changes) {
+            *mode = i8::from(stage.pivots[*k] == *p);
+        }
     }
 
     /// The programs of a trial step: the stages behind the first, the state at the end, and the rates there and at the start. `None` where
@@ -188,25 +193,32 @@ impl Tail {
         let nz = self.nz;
         let register = |r: usize| Operand::Register(r as Reg);
         let z = |i: usize| register(system.highest() + i);
-        let factor = |i: usize| register(self.factor(i));
-        let side = |i: usize| Operation::Negative(register(system.rhs.outputs[nz * nz + i] as usize));
-        if nz == 1 {
-            program.push((z(0), side(0)));
-            program.push((z(0), Operation::Product(z(0), factor(0))));
-            return;
+        let factor = |i: usize, k: usize| register(self.factor(i * nz + k));
+        let term = Operand::Local(0);
+        let mut locals = 1..;
+        let mut local = || Operand::Local(locals.next().unwrap_or(0));
+        let mut sides: Vec<Operand> = (0..nz).map(|_| local()).collect();
+        for (i, side) in sides.iter().enumerate() {
+            let equation = register(system.rhs.outputs[nz * nz + i] as usize);
+            program.push((*side, Operation::Negative(equation)));
         }
-        let [first, second, term] = [0, 1, 2].map(Operand::Local);
-        let change = self.switches as u32;
-        program.push((first, side(0)));
-        program.push((second, side(1)));
-        program.push((z(0), Operation::Select(change, [first, first, second])));
-        program.push((z(1), Operation::Select(change, [second, second, first])));
-        program.push((term, Operation::Product(factor(2), z(0))));
-        program.push((z(1), Operation::Difference(z(1), term)));
-        program.push((z(1), Operation::Product(z(1), factor(3))));
-        program.push((term, Operation::Product(factor(1), z(1))));
-        program.push((z(0), Operation::Difference(z(0), term)));
-        program.push((z(0), Operation::Product(z(0), factor(0))));
+        for (change, (k, p)) in (self.switches as u32..).zip(&self.changes) {
+            let (above, below) = (sides[*k], sides[*p]);
+            (sides[*k], sides[*p]) = (local(), local());
+            program.push((sides[*k], Operation::Select(change, [above, above, below])));
+            program.push((sides[*p], Operation::Select(change, [below, below, above])));
+        }
+        let less = |program: &mut Operations, i: usize, k: usize, known: Operand| {
+            program.push((term, Operation::Product(factor(i, k), known)));
+            program.push((sides[i], Operation::Difference(sides[i], term)));
+        };
+        for k in 0..nz {
+            (k + 1..nz).for_each(|i| less(program, i, k, sides[k]));
+        }
+        for k in (0..nz).rev() {
+            program.push((z(k), Operation::Product(sides[k], factor(k, k))));
+            (0..k).for_each(|i| less(program, i, k, z(k)));
+        }
     }
 
     /// The programs for these leaves; `None` where something else is to be done too, or nothing is compiled.
@@ -272,22 +284,28 @@ impl Tail {
                 }
             }
         }
-        let factor = |i: usize| Operand::Register(self.factor(i) as Reg);
-        // What is solved for highest derivative j is the rate of this entry.
-        let rate = |j: usize| source.iter().position(|s| *s == system.highest() + j);
-        let rate = |j: usize| rate(j).map_or(self.solved(j), |r| self.dk(stage, r));
-        match nz {
-            1 => push(&mut rules, rate(0), Row::Scale(factor(0), self.equation(0))),
-            _ => {
-                let (first, second) = (Row::Copy(self.equation(0)), Row::Copy(self.equation(1)));
-                let change = self.switches as u32;
-                let (top, below) = (self.solved(0), self.solved(1));
-                rules.push((top, Rule::Select(change, [first, first, second])));
-                rules.push((below, Rule::Select(change, [second, second, first])));
-                push(&mut rules, below, Row::MinusScaled(below, factor(2), top));
-                push(&mut rules, rate(1), Row::Scale(factor(3), below));
-                push(&mut rules, top, Row::MinusScaled(top, factor(1), rate(1)));
-                push(&mut rules, rate(0), Row::Scale(factor(0), top));
+        let factor = |i: usize, k: usize| Operand::Register(self.factor(i * nz + k) as Reg);
+        let mut sides: Vec<Reg> = (0..nz).map(|i| self.equation(i)).collect();
+        let mut rows = (nz..).map(|i| self.equation(i));
+        let mut next = || rows.next().unwrap_or(0);
+        for (change, (k, p)) in (self.switches as u32..).zip(&self.changes) {
+            let (above, below) = (Row::Copy(sides[*k]), Row::Copy(sides[*p]));
+            (sides[*k], sides[*p]) = (next(), next());
+            rules.push((sides[*k], Rule::Select(change, [above, above, below])));
+            rules.push((sides[*p], Rule::Select(change, [below, below, above])));
+        }
+        for k in 0..nz {
+            for i in k + 1..nz {
+                push(&mut rules, sides[i], Row::MinusScaled(sides[i], factor(i, k), sides[k]));
+            }
+        }
+        for k in (0..nz).rev() {
+            // What is solved for highest derivative k is the rate of this entry.
+            let entry = source.iter().position(|s| *s == system.highest() + k);
+            let rate = entry.map_or(sides[k], |r| self.dk(stage, r));
+            push(&mut rules, rate, Row::Scale(factor(k, k), sides[k]));
+            for i in 0..k {
+                push(&mut rules, sides[i], Row::MinusScaled(sides[i], factor(i, k), rate));
             }
         }
         for (r, &from) in source.iter().enumerate().filter(|s| *s.1 < system.highest()) {
@@ -297,26 +315,45 @@ impl Tail {
     }
 }
 
+/// The rows that factors with partial pivoting may change, of a matrix whose entries are the first outputs: those that have something
+/// other than a constant zero in the pivot's column.
+fn changes(tape: &Tape, n: usize) -> Vec<(usize, usize)> {
+    let is_zero = |r: &Reg| tape.constant_value(*r) == Some(0.0);
+    let mut is_there: Vec<bool> = tape.outputs[..n * n].iter().map(|r| !is_zero(r)).collect();
+    let mut changes = Vec::new();
+    for k in 0..n {
+        let below: Vec<usize> = (k + 1..n).filter(|p| is_there[p * n + k]).collect();
+        changes.extend(below.iter().map(|p| (k, *p)));
+        // Each of these rows may have become any other of them, and has then had the pivot's taken from it.
+        for j in 0..n {
+            let any = is_there[k * n + j] || below.iter().any(|p| is_there[p * n + j]);
+            below.iter().chain([&k]).for_each(|p| is_there[p * n + j] = any);
+        }
+    }
+    changes
+}
+
 /// A register, as it is.
 fn same(register: usize) -> Operation {
     Operation::Product(Operand::Register(register as Reg), Operand::Constant(1.0))
 }
 
 impl Core<'_> {
-    /// A trial step of length `h` by its programs, where nothing sticks.
+    /// A trial step of length `h` by its programs.
     pub(super) fn compiled_trial(&mut self, values: &Values, h: f64, end: bool) {
-        let (tail, tableau, nx) = (self.tail, self.tableau, self.system.nx);
+        let (tableau, nx) = (self.tableau, self.system.nx);
+        let (stages, x, x1, length) = (self.tail.stages, self.tail.x(), self.tail.x1(), self.tail.length());
         let mid = self.s + 0.5 * h;
-        self.rates.f[tail.x()..tail.x1()].copy_from_slice(&self.x);
-        self.rates.f[tail.length()] = h;
-        for i in 1..tail.stages {
+        self.rates.f[x..x1].copy_from_slice(&self.x);
+        self.rates.f[length] = h;
+        for i in 1..stages {
             self.set_instant(i, self.s + tableau.c[i] * h, mid);
             self.compiled_stage(values, i - 1, i);
         }
-        let last = tail.stages;
+        let last = stages;
         let st = &mut self.stages[last];
         values.run(last - 1, &mut st.regs, &self.modes, &st.lambda, &mut self.rates.f);
-        self.x1.copy_from_slice(&self.rates.f[tail.x1()..][..nx]);
+        self.x1.copy_from_slice(&self.rates.f[x1..][..nx]);
         if end || !self.live.is_empty() {
             st.regs[System::STATES..][..nx].copy_from_slice(&self.x1);
         }
@@ -332,9 +369,19 @@ impl Core<'_> {
         self.compiled_stage(values, self.tail.stages + 1, 0);
     }
 
-    /// Program `which` at stage `b`, and the equations solved.
+    /// Program `which` at stage `b`, and what sticks is held.
     #[inline(always)]
     fn compiled_stage(&mut self, values: &Values, which: usize, b: usize) {
+        if self.sticking.is_empty() {
+            self.compiled_free(values, which, b);
+        } else {
+            self.eval_sticking(b, Some((values, which)));
+        }
+    }
+
+    /// Program `which` at stage `b`, and the equations solved, with the values of sticking signs as they stand.
+    #[inline(always)]
+    pub(super) fn compiled_free(&mut self, values: &Values, which: usize, b: usize) {
         let st = &mut self.stages[b];
         values.run(which, &mut st.regs, &self.modes, &st.lambda, &mut self.rates.f);
         if self.solves {
@@ -346,9 +393,9 @@ impl Core<'_> {
 
     /// The sensitivities' step that belongs to the trial step of length `h`, by its programs.
     pub(super) fn compiled_step(&mut self, step: &[Program], h: f64) {
-        let (tail, tableau) = (self.tail, self.tableau);
-        for i in 0..tail.stages {
-            let st = &mut self.stages[i];
+        let tableau = self.tableau;
+        for i in 0..self.tail.stages {
+            let (tail, st) = (&self.tail, &mut self.stages[i]);
             tail.set_factors(st, &mut self.modes);
             for (to, weight) in st.regs[tail.weight(0)..].iter_mut().zip(tableau.a[i]) {
                 *to = h * weight;
@@ -358,10 +405,50 @@ impl Core<'_> {
                 self.tangent_sticking(i);
             }
         }
-        let st = &mut self.stages[0];
+        let (tail, st) = (&self.tail, &mut self.stages[0]);
         for (to, weight) in st.regs[tail.weight(0)..].iter_mut().zip(tableau.b) {
             *to = h * weight;
         }
         step[tail.stages].run(&st.regs, &self.modes, &mut self.d);
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use greybox_model::Model;
+
+    use super::*;
+
+    /// The rows that may change places where these are the inertias of three equations.
+    fn changes_of(first: &str, second: &str, third: &str) -> Vec<(usize, usize)> {
+        let text = format!(
+            r#"
+[parameters]
+m = {{ value = 1.3, unit = "kg" }}
+k = {{ value = 4.0, unit = "N/m" }}
+[states]
+x = {{ unit = "m" }}
+y = {{ unit = "m" }}
+z = {{ unit = "m" }}
+[equations]
+first = "{first} + k*x = 0"
+second = "{second} + k*y = 0"
+third = "{third} + k*z = 0"
+"#
+        );
+        let system = System::compile(&Model::from_toml(&text, "m.toml").unwrap()).unwrap();
+        changes(&system.rhs, 3)
+    }
+
+    #[test]
+    fn rows_change_places_where_something_may_be_larger() {
+        let full = "m*x'' + m*y'' + m*z''";
+        assert_eq!(changes_of(full, full, full), [(0, 1), (0, 2), (1, 2)]);
+        // What stands apart stays where it is.
+        assert_eq!(changes_of("m*x'' + m*y''", "m*x'' + m*y''", "m*z''"), [(0, 1)]);
+        assert_eq!(changes_of("m*x''", "m*y'' + m*z''", "m*y'' + m*z''"), [(1, 2)]);
+        assert_eq!(changes_of("m*x''", "m*y''", "m*z''"), []);
+        // Taking the first row from the third puts something below the second pivot.
+        assert_eq!(changes_of("m*x'' + m*y''", "m*y'' + m*z''", "m*x'' + m*z''"), [(0, 2), (1, 2)]);
     }
 }

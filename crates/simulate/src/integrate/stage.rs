@@ -1,5 +1,6 @@
 //! One evaluation of the right-hand side.
 
+use greybox_jit::Values;
 use greybox_model::system::System;
 
 use super::{Core, locate};
@@ -112,15 +113,15 @@ impl Core<'_> {
         if !self.system.rhs.delays.is_empty() {
             self.eval_delays(b, s, mid);
         }
-        if !self.sticking.is_empty() {
-            self.eval_sticking(b);
-        } else if b == 0
+        if b == 0
             && let Some(values) = self.values.take()
         {
             self.compiled_start(&values);
             self.values = Some(values);
-        } else {
+        } else if self.sticking.is_empty() {
             self.eval_free(b);
+        } else {
+            self.eval_sticking(b, None);
         }
     }
 
@@ -172,11 +173,18 @@ impl Core<'_> {
         self.solve(b);
     }
 
-    /// The equations again with another value of the sticking sign `k`, not solved.
-    fn set_sign(&mut self, b: usize, k: usize, lambda: f64) {
+    /// The right-hand side of stage `b` again, where the values of these sticking signs have changed: by its program, or what depends
+    /// on them.
+    fn eval_again(&mut self, b: usize, program: Option<(&Values, usize)>, changed: &[usize]) {
+        if let Some((values, which)) = program {
+            self.compiled_free(values, which, b);
+            return;
+        }
         let st = &mut self.stages[b];
-        st.lambda[k] = lambda;
-        self.system.rhs.eval_after(k, &mut st.regs, &mut self.modes, &st.lambda);
+        for &k in changed {
+            self.system.rhs.eval_after(k, &mut st.regs, &mut self.modes, &st.lambda);
+        }
+        self.solve(b);
     }
 
     /// Highest derivatives (into their registers) and ẋ of stage `b`, whose equations are evaluated.
@@ -215,8 +223,8 @@ impl Core<'_> {
         }
     }
 
-    /// The right-hand side while some signs stick: λ solves ġ = a + Bλ = 0.
-    fn eval_sticking(&mut self, b: usize) {
+    /// The right-hand side while some signs stick: λ solves ġ = a + Bλ = 0. By the program of the stage, where it has one.
+    pub(super) fn eval_sticking(&mut self, b: usize, program: Option<(&Values, usize)>) {
         let tape = &self.system.rhs;
         let nx = self.system.nx;
         let sticking = std::mem::take(&mut self.sticking);
@@ -224,21 +232,23 @@ impl Core<'_> {
         for &k in &sticking {
             self.stages[b].lambda[k] = 0.0;
         }
-        self.eval_free(b);
+        match program {
+            Some((values, which)) => self.compiled_free(values, which, b),
+            None => self.eval_free(b),
+        }
         let mut held = std::mem::take(&mut self.stages[b].held);
         held.resize(m, nx);
         let f0 = &mut held.f0;
         f0.iter_mut().zip(self.rates.stage(b)).for_each(|(f0, f)| *f0 = f);
         self.gradients(b, &sticking, &mut held);
         for (i, &k) in sticking.iter().enumerate() {
-            self.set_sign(b, k, 1.0);
-            self.solve(b);
+            // (Each is seen without the others.)
+            let before = i.saturating_sub(1);
+            self.stages[b].lambda[sticking[before]] = 0.0;
+            self.stages[b].lambda[k] = 1.0;
+            self.eval_again(b, program, &sticking[before..=i]);
             for ((p, f1), f0) in held.pull[i * nx..].iter_mut().zip(self.rates.stage(b)).zip(&held.f0) {
                 *p = f1 - f0;
-            }
-            // (The next one is seen without it.)
-            if i + 1 < m {
-                self.set_sign(b, k, 0.0);
             }
         }
         for i in 0..m {
@@ -252,10 +262,10 @@ impl Core<'_> {
         if held.ok {
             small::solve(&held.b, &held.pivots, m, &mut held.a, 1);
         }
-        for (i, &k) in sticking.iter().enumerate() {
-            self.set_sign(b, k, if held.ok { held.a[i] } else { 0.0 });
+        for (&k, a) in sticking.iter().zip(&held.a) {
+            self.stages[b].lambda[k] = if held.ok { *a } else { 0.0 };
         }
-        self.solve(b);
+        self.eval_again(b, program, &sticking);
         let st = &mut self.stages[b];
         if held.ok {
             // A velocity that is held does not change, not even by rounding: relative error control
