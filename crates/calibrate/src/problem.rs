@@ -706,7 +706,9 @@ impl Problem<'_> {
                 if gained > 1e-4 {
                     let decrease = (cost - value) / cost.max(1e-300);
                     point = trial;
-                    small = if decrease < limits.tolerance { small + 1 } else { 0 };
+                    // A small decrease that was foreseen is the end (MINPACK's test); one that was not may be a bad step.
+                    let foreseen = promised < limits.tolerance * cost && gained < 2.0;
+                    small = if decrease < limits.tolerance { small + 1 + usize::from(foreseen) } else { 0 };
                     cost = value;
                     damping = (2.0 * damping).min(1.0);
                     rows = simulated;
@@ -716,6 +718,10 @@ impl Problem<'_> {
                 }
                 if np == 0 {
                     damping *= 0.25;
+                } else if promised < limits.tolerance * cost {
+                    // A shorter step promises less still.
+                    otherwise = Ending::Converged;
+                    break;
                 }
             }
             if !accepted {

@@ -38,6 +38,8 @@ pub struct System {
     pub mass_is_fixed: bool,
     /// Whether a measurement needs the highest derivatives (an accelerometer).
     pub output_needs_z: bool,
+    /// Whether a measurement needs an input.
+    pub output_needs_inputs: bool,
 }
 
 /// Why a model could not be compiled. A [`Model`] made by `Model::from_toml` always compiles; one
@@ -151,6 +153,8 @@ impl System {
             });
             found
         });
+        let needs_input = |e: &Expr| model.inputs.iter().any(|i| e.mentions(&i.name));
+        let output_needs_inputs = model.measurements.iter().any(|m| needs_input(&m.expr));
         let mass_is_fixed = rhs.outputs[..nz * nz].iter().all(|&r| rhs.is_fixed(r));
         Ok(System {
             nx,
@@ -164,6 +168,7 @@ impl System {
             output,
             mass_is_fixed,
             output_needs_z,
+            output_needs_inputs,
         })
     }
 

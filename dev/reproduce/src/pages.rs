@@ -8,7 +8,7 @@ use greybox_dev::book;
 
 use super::Outcome;
 
-const PAGE: &str = "reproduction.md";
+pub(crate) const PAGE: &str = "reproduction.md";
 const MEASURED: &str = "<!-- Written by cargo xtask reproduce --write-docs: what is measured. -->";
 const STORY: &str = "<!-- Written by cargo xtask reproduce --write-docs: the story. -->";
 const SAMPLING: &str = "<!-- Written by cargo xtask reproduce --write-docs: points against dimension. -->";

@@ -427,6 +427,22 @@ fn judge(piece: &mut Piece, all: &[Measured]) {
         let name = format!("{name}, {share} points per function: largest error over that of many points");
         piece.checks.push(Check::new(name, found));
     }
+    let of_best = all.iter().map(|m| m.many.value / m.best).collect();
+    let pairs = all.iter().flat_map(|m| {
+        let richer = all.iter().find(|r| r.states == m.states && r.degree > m.degree);
+        richer.map(|r| [m.many.value / r.many.value, m.many.law / r.many.law])
+    });
+    let of_richer = pairs.flatten().collect();
+    for (name, ratios) in [
+        ("error of V with many points over that of the best weights", of_best),
+        ("errors of V and u at degree 4 over those at degree 6", of_richer),
+    ] as [(&str, Vec<f64>); 2]
+    {
+        let least = ratios.iter().copied().fold(f64::INFINITY, f64::min);
+        let largest = ratios.iter().copied().fold(0.0, f64::max);
+        piece.checks.push(Check::new(format!("{name}, least"), least));
+        piece.checks.push(Check::new(format!("{name}, largest"), largest));
+    }
     let wrong = all.iter().map(|m| m.grids_that_surprise()).sum::<usize>();
     piece.checks.push(Check::new(
         "grids for which fewer values than the degree suffice, or as many do not",

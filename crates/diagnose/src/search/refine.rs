@@ -46,7 +46,14 @@ impl Search<'_> {
         self.reconsider_pair(state);
         let mut index = 0;
         let mut relieved = 0;
+        // What was tried in place of the standing mechanisms: without one and the other of two, a law leads to the same.
+        let mut tried: Vec<Vec<Candidate>> = Vec::new();
+        let mut standing = state.candidates();
         while index < state.current.parts.len() && !self.is_spent() {
+            if state.candidates() != standing {
+                standing = state.candidates();
+                tried.clear();
+            }
             let at = index;
             index += 1;
             let Some(base) = self.without(&state.current, at, &state.scale, 12) else { continue };
@@ -72,13 +79,15 @@ impl Search<'_> {
             trials.retain(|(c, _)| open[*c] != part.candidate);
             if let Some(own) = open.iter().position(|c| *c == part.candidate) {
                 // The fit that stands, its part at the end like that of the others.
-                let mut standing = state.current.clone();
-                standing.parts.remove(at);
-                standing.parts.push(part.clone());
-                trials.push((own, standing));
+                let mut last = state.current.clone();
+                last.parts.remove(at);
+                last.parts.push(part.clone());
+                trials.push((own, last));
             }
             // Of those that fit as well: one that makes another mechanism superfluous.
-            if relieved < MOST_MECHANISMS && self.swap_and_drop(&base, state, &open, &trials, &part) {
+            if relieved < MOST_MECHANISMS
+                && self.swap_and_drop(&base, state, &open, (&trials, &mut tried), &part)
+            {
                 // From the first again: fewer mechanisms, other alternatives.
                 relieved += 1;
                 index = 0;
@@ -155,13 +164,14 @@ impl Search<'_> {
         }
     }
 
-    /// Takes over a trial that fits nearly as well as the standing one and lets another mechanism go.
+    /// Takes over a trial that fits nearly as well as the standing one and lets another mechanism go. What was `tried` so is not
+    /// tried again.
     fn swap_and_drop(
         &self,
         base: &FittedModel,
         state: &mut SearchState,
         open: &[Candidate],
-        trials: &[(usize, FittedModel)],
+        (trials, tried): (&[(usize, FittedModel)], &mut Vec<Vec<Candidate>>),
         standing: &MechanismTerm,
     ) -> bool {
         if state.current.parts.len() < 2 {
@@ -179,7 +189,13 @@ impl Search<'_> {
                 continue;
             }
             for index in 0..trial.parts.len() - 1 {
+                let mut left: Vec<Candidate> = trial.parts.iter().map(|p| p.candidate.clone()).collect();
+                left.remove(index);
+                if tried.iter().any(|t| is_same(t, &left)) {
+                    continue;
+                }
                 let Some(smaller) = self.without(trial, index, &state.scale, 12) else { continue };
+                tried.push(left);
                 let e = self.weigh(&smaller, &state.current, &state.scale);
                 if e.score > PARSIMONY || e.drop > 0.02 {
                     continue;

@@ -396,7 +396,9 @@ impl Core<'_> {
         let tableau = self.tableau;
         for i in 0..self.tail.stages {
             let (tail, st) = (&self.tail, &mut self.stages[i]);
-            tail.set_factors(st, &mut self.modes);
+            if !self.system.mass_is_fixed {
+                tail.set_factors(st, &mut self.modes);
+            }
             for (to, weight) in st.regs[tail.weight(0)..].iter_mut().zip(tableau.a[i]) {
                 *to = h * weight;
             }

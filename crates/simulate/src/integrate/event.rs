@@ -60,7 +60,8 @@ impl Core<'_> {
 
     /// Evaluates stage 0 anew (a signal may have jumped) and settles the modes there.
     pub(super) fn begin(&mut self, to: f64) {
-        let mid = 0.5 * (self.s + to);
+        // (That of a step to there, to the last bit: what the inputs do around it is looked up once.)
+        let mid = self.s + 0.5 * (to - self.s);
         self.eval(0, self.s, mid);
         if !self.begun {
             self.begun = true;

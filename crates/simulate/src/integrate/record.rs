@@ -62,8 +62,10 @@ impl Core<'_> {
         let out = &system.output;
         self.out_regs[System::TIME] = self.env.start + self.s;
         self.out_regs[System::STATES..System::STATES + nx].copy_from_slice(&self.x);
-        for (i, u) in self.env.inputs.iter().enumerate() {
-            self.out_regs[system.inputs() + i] = u.at(self.s, inside).0;
+        if system.output_needs_inputs {
+            for (i, u) in self.env.inputs.iter().enumerate() {
+                self.out_regs[system.inputs() + i] = u.at(self.s, inside).0;
+            }
         }
         if lanes > 0 {
             self.out_d[System::STATES * width..][..nx * width]
