@@ -884,7 +884,9 @@ fn thinned(signals: &Arc<SignalLanes>, n: usize) -> Arc<SignalLanes> {
     }
     let lanes = signals.lanes;
     let thin = |table: &Vec<f64>| -> Vec<f64> {
-        table.chunks(lanes.max(1)).step_by(n).flat_map(|row| row.iter().copied()).collect()
+        let samples = if signals.rows.is_empty() { table.len() / lanes.max(1) } else { signals.rows.len() };
+        let rows = (0..samples).step_by(n).map(|k| &table[signals.row(k) * lanes..][..lanes]);
+        if table.is_empty() { Vec::new() } else { rows.flatten().copied().collect() }
     };
     let all = |tables: &Vec<(usize, Vec<f64>)>| tables.iter().map(|(i, t)| (*i, thin(t))).collect();
     Arc::new(SignalLanes {
@@ -893,6 +895,7 @@ fn thinned(signals: &Arc<SignalLanes>, n: usize) -> Arc<SignalLanes> {
         force: thin(&signals.force),
         inputs: all(&signals.inputs),
         outputs: all(&signals.outputs),
+        rows: Vec::new(),
     })
 }
 

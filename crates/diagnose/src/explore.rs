@@ -36,7 +36,7 @@ use crate::marginal::log_sum;
 use crate::screen::{CandidateResponses, Gram, Scored, first_states, lanes, scored};
 use crate::search::{Search, carried};
 use crate::spectra::Spectra;
-use crate::trajectory::TrajectoryEval;
+use crate::trajectory::{Cover, TrajectoryEval};
 use crate::{ProgressListener, Stage};
 
 /// Probability from which a family of laws is named.
@@ -318,7 +318,7 @@ impl<'a, 'b> Explorer<'a, 'b> {
             TrajectoryEval::observed(FitPoint { setup, level: &level, scale: &scale, point: &point });
         let spectra =
             Spectra::new(FitPoint { setup, level: &level, scale: &scale, point: &point }, &along, &forces);
-        let lanes = lanes(setup, library, open, &along, &spectra);
+        let lanes = lanes(setup, library, open, &along, &spectra, &Cover::default());
         let blocks: Vec<_> = lanes.variants.iter().map(|v| v.columns.clone()).collect();
         let gram = innovations(&self.filter, at, &lanes.signals, &[], &lanes.columns, &blocks);
         let Some(mut gram) = gram else { return Vec::new() };
@@ -336,7 +336,7 @@ impl<'a, 'b> Explorer<'a, 'b> {
         let (along, forces) =
             TrajectoryEval::observed(FitPoint { setup, level: &level, scale, point: &point });
         let spectra = Spectra::new(FitPoint { setup, level: &level, scale, point: &point }, &along, &forces);
-        let lanes = lanes(setup, self.search.library, candidates, &along, &spectra);
+        let lanes = lanes(setup, self.search.library, candidates, &along, &spectra, &Cover::default());
         let total = totals(setup, &along);
         (0..candidates.len()).map(|c| self.prior_of(c, &lanes, &total)).collect()
     }

@@ -18,8 +18,9 @@ mod response;
 
 use gram::Projection;
 pub use gram::{Gram, Projected, gram, project};
+pub(crate) use response::lanes;
 pub use response::{
-    CandidateResponses, Component, Variant, effect, first_states, first_values, inner_scales, lanes, signals,
+    CandidateResponses, Component, Variant, effect, first_states, first_values, inner_scales, signals,
 };
 
 use std::ops::Range;
@@ -31,7 +32,7 @@ use crate::candidate::Candidate;
 use crate::library::Mechanism;
 use crate::marginal::log_marginal;
 use crate::spectra::Spectra;
-use crate::trajectory::TrajectoryEval;
+use crate::trajectory::{Cover, TrajectoryEval};
 
 /// Share of a column's sum of squares that the model's own parameters must leave over: a column with less is
 /// collinear with a parameter, and its coefficient would be rounding.
@@ -76,10 +77,10 @@ const PAIR_GAIN: f64 = 0.05;
 
 /// The columns of all candidates around a fit.
 fn lanes_at(at: FitPoint<'_>, library: &[Mechanism], candidates: &[Candidate]) -> CandidateResponses {
-    let FitPoint { setup, .. } = at;
+    let FitPoint { setup, level, .. } = at;
     let (along, forces) = TrajectoryEval::observed(at);
     let spectra = Spectra::new(at, &along, &forces);
-    lanes(setup, library, candidates, &along, &spectra)
+    lanes(setup, library, candidates, &along, &spectra, &Cover::of(setup, level))
 }
 
 /// The same with the products of each variant's own responses.
@@ -523,7 +524,68 @@ pub fn scored(
 
 #[cfg(test)]
 mod tests {
+    use std::sync::Arc;
+
+    use greybox_calibrate::{Data, Point, Setup, free_parameters};
+    use greybox_model::Model;
+    use greybox_recording::{Channel, Recording};
+    use greybox_simulate::Method;
+
     use super::*;
+    use crate::candidate::candidates;
+    use crate::place::places;
+
+    /// Where the segments see a part of the recording, what the laws do there is all that is kept, and the products are the same.
+    #[test]
+    fn laws_are_kept_where_segments_see_them() {
+        let text = r#"
+[inputs]
+f = { unit = "N" }
+[states]
+x = { unit = "m" }
+[parameters]
+m = { value = 1.1, unit = "kg" }
+c = { value = 0.5, unit = "N s/m" }
+k = { value = 38.0, unit = "N/m" }
+[equations]
+mass = "m*x'' + c*x' + k*x = f"
+"#;
+        let model = Model::from_toml(text, "m.toml").unwrap();
+        let time: Vec<f64> = (0..2400).map(|k| 0.01 * f64::from(k)).collect();
+        let column = |name: &str, unit: &str, value: &dyn Fn(f64) -> f64| Channel {
+            name: name.into(),
+            unit: Some(unit.into()),
+            values: time.iter().map(|t| value(*t)).collect(),
+        };
+        let f = column("f", "N", &|t| 20.0 * (4.0 * t).sin() + 9.0 * (7.3 * t).cos());
+        let x = column("x", "m", &|t| 0.5 * (4.0 * t - 0.3).sin() + 0.2 * (7.3 * t).sin());
+        let recording = Recording::from_columns("r", time.clone(), vec![f, x]).unwrap();
+        let data = Arc::new(Data::new(&model, &[recording]).unwrap());
+        let library = crate::built_in().unwrap();
+        let all = candidates(&model, &library, &places(&model));
+        for method in [Method::Rk4 { substeps: 1 }, Method::Rk4Stride { samples: 4 }] {
+            let mut setup = Setup::new(&model, data.clone(), free_parameters(&model)).unwrap();
+            setup.method = method;
+            let level = setup.windows(60, 480);
+            let values = setup.values();
+            let point = Point { starts: setup.starts(&level, &values), parameters: values };
+            let scale = setup.data.spread.clone();
+            let at = FitPoint { setup: &setup, level: &level, scale: &scale, point: &point };
+            let (along, forces) = TrajectoryEval::observed(at);
+            let spectra = Spectra::new(at, &along, &forces);
+            let of = |cover: &Cover| {
+                let lanes = lanes(&setup, &library, &all, &along, &spectra, cover);
+                let blocks = lanes.variants.iter().map(|v| v.columns.clone()).collect();
+                let gram = gram(at, &lanes.signals, &lanes.columns, blocks);
+                let inner: Vec<_> = lanes.variants.iter().map(|v| (v.candidate, v.inner.clone())).collect();
+                (inner, lanes.signals[0].force.len(), gram)
+            };
+            let (whole, part) = (of(&Cover::default()), of(&Cover::of(&setup, &level)));
+            assert_eq!(whole.0, part.0);
+            assert!(whole.0.len() > 50 && 4 * part.1 < whole.1, "{} {} {}", whole.0.len(), part.1, whole.1);
+            assert_eq!((whole.2.gr, whole.2.jg, whole.2.gg), (part.2.gr, part.2.jg, part.2.gg), "{method:?}");
+        }
+    }
 
     /// Leaving a parameter out of the inner products is leaving it out of every row, with what it did in the residual.
     #[test]

@@ -1,6 +1,6 @@
 //! Expressions of the model evaluated along given states, sample by sample.
 
-use greybox_calibrate::{FitPoint, Setup};
+use greybox_calibrate::{FitPoint, PieceData, Segmentation, Setup};
 use greybox_model::tape::{Column, LeafKind, Tape};
 use greybox_model::{Expr, Func};
 
@@ -201,6 +201,16 @@ impl<'a> TrajectoryEval<'a> {
     /// `[expr][piece][sample]`; `None` when an expression mentions anything else. Every function is
     /// evaluated pointwise, with sign(0) = 0.
     pub fn eval(&self, exprs: &[Expr], extra: &[(&str, f64)]) -> Option<Vec<Vec<Vec<f64>>>> {
+        self.eval_on(&Cover::default(), exprs, extra)
+    }
+
+    /// [`eval`](Self::eval) at the samples of a cover alone, one after the other.
+    pub(crate) fn eval_on(
+        &self,
+        cover: &Cover,
+        exprs: &[Expr],
+        extra: &[(&str, f64)],
+    ) -> Option<Vec<Vec<Vec<f64>>>> {
         let model = &self.setup.model;
         let system = &self.setup.system;
         let base = system.delayed();
@@ -276,28 +286,85 @@ impl<'a> TrajectoryEval<'a> {
         let mut out = vec![Vec::with_capacity(self.states.len()); exprs.len()];
         for (i, piece) in self.setup.data.pieces.iter().enumerate() {
             let time: Vec<f64> = (0..piece.len).map(|k| piece.start + k as f64 * piece.dt).collect();
-            let columns = tape.eval_batch(piece.len, &|leaf| {
+            let series = |leaf: usize| -> Option<&[f64]> {
                 if leaf == 0 {
-                    Column::Series(&time)
+                    Some(&time)
                 } else if leaf < 1 + system.nx {
-                    Column::Series(&self.states[i][leaf - 1])
+                    Some(&self.states[i][leaf - 1])
                 } else if leaf < system.inputs() {
-                    highest.get(i).map_or(Column::Value(0.0), |z| Column::Series(&z[leaf - system.highest()]))
+                    highest.get(i).map(|z| &*z[leaf - system.highest()])
                 } else if leaf < system.parameters() {
-                    Column::Series(&piece.inputs[leaf - system.inputs()])
-                } else if leaf < base {
-                    Column::Value(self.parameters.get(leaf - system.parameters()).copied().unwrap_or(0.0))
-                } else if leaf < base + extra.len() {
-                    Column::Value(extra[leaf - base].1)
+                    Some(&piece.inputs[leaf - system.inputs()])
                 } else {
-                    Column::Series(&shifted[leaf - base - extra.len()][i])
+                    leaf.checked_sub(base + extra.len()).map(|delayed| &*shifted[delayed][i])
                 }
+            };
+            let value = |leaf: usize| {
+                let parameter = self.parameters.get(leaf.wrapping_sub(system.parameters()));
+                leaf.checked_sub(base).map_or_else(|| parameter.copied().unwrap_or(0.0), |own| extra[own].1)
+            };
+            let picked: Vec<Option<Vec<f64>>> =
+                (0..base + extra.len() + delays.len()).map(|leaf| cover.pick(i, series(leaf)?)).collect();
+            let len = cover.samples(i).map_or(piece.len, <[u32]>::len);
+            let columns = tape.eval_batch(len, &|leaf| match (&picked[leaf], series(leaf)) {
+                (Some(picked), _) => Column::Series(picked),
+                (None, Some(series)) => Column::Series(series),
+                (None, None) => Column::Value(value(leaf)),
             });
             for (o, c) in out.iter_mut().zip(columns) {
                 o.push(c);
             }
         }
         Some(out)
+    }
+}
+
+/// The samples that a simulation of some segments sees, those behind the segments among them; of a piece that most of them see, and
+/// without segments, all.
+#[derive(Debug, Clone, Default)]
+pub(crate) struct Cover {
+    /// Per piece, ascending.
+    samples: Vec<Option<Vec<u32>>>,
+}
+
+/// Share of a piece from which all of it is covered.
+const MOSTLY: f64 = 0.5;
+
+impl Cover {
+    /// Of the segments of a level.
+    pub(crate) fn of(setup: &Setup, level: &Segmentation) -> Cover {
+        let of = |(p, piece): (usize, &PieceData)| {
+            let mut seen = vec![false; piece.len];
+            for segment in level.segments.iter().filter(|s| s.piece == p) {
+                seen[segment.range.start..(segment.range.end + 1).min(piece.len)].fill(true);
+            }
+            let samples: Vec<u32> = (0..).zip(&seen).filter(|s| *s.1).map(|s| s.0).collect();
+            ((samples.len() as f64) < MOSTLY * piece.len as f64).then_some(samples)
+        };
+        Cover { samples: setup.data.pieces.iter().enumerate().map(of).collect() }
+    }
+
+    /// The samples of a piece; `None`: all of them.
+    pub(crate) fn samples(&self, piece: usize) -> Option<&[u32]> {
+        self.samples.get(piece)?.as_deref()
+    }
+
+    /// What a series of a whole piece is at its samples; `None`: it is wanted whole.
+    pub(crate) fn pick(&self, piece: usize, series: &[f64]) -> Option<Vec<f64>> {
+        Some(self.samples(piece)?.iter().map(|k| series[*k as usize]).collect())
+    }
+
+    /// For each sample of a piece of so many the row of a table that has a row for each of its samples; of one that it does not
+    /// cover, the row before. Empty where all are covered.
+    pub(crate) fn rows(&self, piece: usize, len: usize) -> Vec<u32> {
+        let Some(samples) = self.samples(piece) else { return Vec::new() };
+        let mut rows = Vec::with_capacity(len);
+        for k in 0..len as u32 {
+            let next = rows.last().map_or(0, |last: &u32| last + 1);
+            let is_next = samples.get(next as usize) == Some(&k);
+            rows.push(if is_next { next } else { next.saturating_sub(1) });
+        }
+        rows
     }
 }
 
@@ -335,6 +402,15 @@ mod tests {
     use greybox_model::Model;
 
     use super::*;
+
+    #[test]
+    fn a_sample_that_is_not_covered_has_the_row_before() {
+        let cover = Cover { samples: vec![Some(vec![2, 3, 6]), None] };
+        assert_eq!(cover.rows(0, 8), [0, 0, 0, 1, 1, 1, 2, 2]);
+        assert_eq!(cover.pick(0, &[9.0, 8.0, 7.0, 6.0, 5.0, 4.0, 3.0, 2.0]), Some(vec![7.0, 6.0, 3.0]));
+        assert!(cover.rows(1, 8).is_empty() && cover.pick(1, &[1.0]).is_none());
+        assert!(Cover::default().rows(3, 8).is_empty());
+    }
 
     #[test]
     fn a_delay_within_a_delay_delays_twice() {

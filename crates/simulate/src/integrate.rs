@@ -168,12 +168,23 @@ pub struct SignalLanes {
     pub lanes: usize,
     /// Weight of each lane's force in each equation, `equations × lanes`.
     pub weights: Vec<f64>,
-    /// The forces, `samples × lanes` (empty: none).
+    /// The forces, `rows × lanes` (empty: none).
     pub force: Vec<f64>,
-    /// Changes of inputs: (input, `samples × lanes`).
+    /// Changes of inputs: (input, `rows × lanes`).
     pub inputs: Vec<(usize, Vec<f64>)>,
-    /// Changes of outputs: (channel, `samples × lanes`).
+    /// Changes of outputs: (channel, `rows × lanes`).
     pub outputs: Vec<(usize, Vec<f64>)>,
+    /// The row of each sample (empty: a row for each). Tables need rows for what is simulated alone: those of a stretch and of the
+    /// sample behind it, one after the other.
+    pub rows: Vec<u32>,
+}
+
+impl SignalLanes {
+    /// The row of a sample.
+    #[inline]
+    pub fn row(&self, sample: usize) -> usize {
+        self.rows.get(sample).map_or(sample, |row| *row as usize)
+    }
 }
 
 impl Seeds {
@@ -974,9 +985,9 @@ fn locate(s: f64, inside: f64, dt: f64, len: usize) -> (usize, f64) {
 }
 
 #[inline]
-fn lerp(table: &[f64], k: usize, w: f64, len: usize, count: usize, out: &mut [f64]) {
-    let a = &table[k * count..][..count];
-    let b = &table[(k + 1).min(len - 1) * count..][..count];
+fn lerp(table: &[f64], [a, b]: [usize; 2], w: f64, count: usize, out: &mut [f64]) {
+    let a = &table[a * count..][..count];
+    let b = &table[b * count..][..count];
     for ((o, a), b) in out.iter_mut().zip(a).zip(b) {
         *o = a + w * (b - a);
     }

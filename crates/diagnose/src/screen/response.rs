@@ -12,7 +12,7 @@ use crate::candidate::Candidate;
 use crate::library::{Mechanism, Scale};
 use crate::place::Place;
 use crate::spectra::Spectra;
-use crate::trajectory::TrajectoryEval;
+use crate::trajectory::{Cover, TrajectoryEval};
 
 /// One candidate with one choice of its inner parameters, as columns of the regression.
 pub struct Variant {
@@ -110,20 +110,22 @@ pub fn inner_scales(
         .collect()
 }
 
-/// Builds the lanes of all candidates along given states; `spectra` proposes angular frequencies.
-pub fn lanes(
+/// Builds the lanes of all candidates along given states, for what simulates the samples of a cover; `spectra` proposes angular
+/// frequencies.
+pub(crate) fn lanes(
     setup: &Setup,
     library: &[Mechanism],
     candidates: &[Candidate],
     along: &TrajectoryEval<'_>,
     spectra: &Spectra<'_>,
+    cover: &Cover,
 ) -> CandidateResponses {
     let made: Vec<Vec<(Variant, Vec<Vec<Component>>)>> = candidates
         .par_iter()
         .enumerate()
         .map(|(index, candidate)| {
             let mechanism = &library[candidate.mechanism];
-            variants(setup, mechanism, candidate, index, along, spectra)
+            variants(setup, mechanism, (candidate, index), along, spectra, cover)
         })
         .collect();
     let mut components: Vec<Component> = Vec::new();
@@ -139,11 +141,16 @@ pub fn lanes(
         variant.columns = from..columns.len();
         variants.push(variant);
     }
-    CandidateResponses { signals: signals(setup, &components), columns, variants }
+    CandidateResponses { signals: signals_on(setup, &components, cover), columns, variants }
 }
 
 /// What a simulation adds, one lane for each component; per piece.
 pub fn signals(setup: &Setup, components: &[Component]) -> Vec<Arc<SignalLanes>> {
+    signals_on(setup, components, &Cover::default())
+}
+
+/// The same of components that are known at the samples of a cover.
+fn signals_on(setup: &Setup, components: &[Component], cover: &Cover) -> Vec<Arc<SignalLanes>> {
     let (count, nz) = (components.len(), setup.system.nz);
     setup
         .data
@@ -151,15 +158,17 @@ pub fn signals(setup: &Setup, components: &[Component]) -> Vec<Arc<SignalLanes>>
         .iter()
         .enumerate()
         .map(|(p, piece)| {
+            let len = cover.samples(p).map_or(piece.len, <[u32]>::len);
             let mut lanes = SignalLanes {
                 lanes: count,
                 weights: vec![0.0; nz * count],
-                force: vec![0.0; piece.len * count],
+                force: vec![0.0; len * count],
+                rows: cover.rows(p, piece.len),
                 ..SignalLanes::default()
             };
             let put = |tables: &mut Vec<(usize, Vec<f64>)>, of: usize, l: usize, series: &[f64]| {
                 let at = tables.iter().position(|t| t.0 == of).unwrap_or_else(|| {
-                    tables.push((of, vec![0.0; piece.len * count]));
+                    tables.push((of, vec![0.0; len * count]));
                     tables.len() - 1
                 });
                 for (k, v) in series.iter().enumerate() {
@@ -193,24 +202,24 @@ pub fn effect(
     along: &TrajectoryEval<'_>,
     values: &[f64],
 ) -> Option<Vec<Component>> {
-    Law::new(setup, mechanism, candidate, along)?.components(values)
+    Law::new(setup, mechanism, candidate, along, &Cover::default())?.components(values)
 }
 
 /// The columns of a candidate for every choice of its inner parameters.
 fn variants(
     setup: &Setup,
     mechanism: &Mechanism,
-    candidate: &Candidate,
-    index: usize,
+    (candidate, index): (&Candidate, usize),
     along: &TrajectoryEval<'_>,
     spectra: &Spectra<'_>,
+    cover: &Cover,
 ) -> Vec<(Variant, Vec<Vec<Component>>)> {
     let mut out = Vec::new();
     let Some(scales) = inner_scales(mechanism, candidate, along, setup) else { return out };
     if mechanism.reversals > 0 && reversals(candidate, along) < mechanism.reversals {
         return out;
     }
-    let Some(law) = Law::new(setup, mechanism, candidate, along) else { return out };
+    let Some(law) = Law::new(setup, mechanism, candidate, along, cover) else { return out };
     for inner in grid(mechanism, candidate, &scales, spectra) {
         let count = mechanism.linear.len();
         let column = |linear: &[f64], inner: &[f64]| law.components(&mechanism.values(linear, inner)?);
@@ -275,6 +284,8 @@ struct Law<'a> {
     mechanism: &'a Mechanism,
     candidate: &'a Candidate,
     along: &'a TrajectoryEval<'a>,
+    /// Where it is wanted.
+    cover: &'a Cover,
     /// The law less what it stands in for, the reaction; parameters marked.
     change: Vec<Expr>,
     marked: Vec<String>,
@@ -289,6 +300,7 @@ impl<'a> Law<'a> {
         mechanism: &'a Mechanism,
         candidate: &'a Candidate,
         along: &'a TrajectoryEval<'a>,
+        cover: &'a Cover,
     ) -> Option<Law<'a>> {
         let model = &setup.model;
         // The file's own names may also be names of the model: mark them.
@@ -311,11 +323,11 @@ impl<'a> Law<'a> {
             for (e, equation) in model.equations.iter().enumerate() {
                 let slope = equation.residual().derivative(name, 0).simplify();
                 if slope != Expr::Num(0.0) {
-                    slopes.push((e, along.eval(&[slope], &[])?.pop()?));
+                    slopes.push((e, along.eval_on(cover, &[slope], &[])?.pop()?));
                 }
             }
         }
-        Some(Law { setup, mechanism, candidate, along, change, marked, memory, slopes })
+        Some(Law { setup, mechanism, candidate, along, cover, change, marked, memory, slopes })
     }
 
     /// What the law does at these values of its own parameters.
@@ -323,8 +335,14 @@ impl<'a> Law<'a> {
         let changes: Vec<Vec<Vec<f64>>> = match &self.memory {
             Some(recall) => {
                 let mut law = recall.law(self.setup, values)?;
+                for series in &mut law {
+                    for (p, series) in series.iter_mut().enumerate() {
+                        *series = self.cover.pick(p, series).unwrap_or_else(|| std::mem::take(series));
+                    }
+                }
                 if self.mechanism.on.replaces() {
-                    let base = self.along.eval(&[self.candidate.base(&self.setup.model)], &[])?.pop()?;
+                    let base = self.candidate.base(&self.setup.model);
+                    let base = self.along.eval_on(self.cover, &[base], &[])?.pop()?;
                     for (l, b) in law[0].iter_mut().flatten().zip(base.iter().flatten()) {
                         *l -= b;
                     }
@@ -334,7 +352,7 @@ impl<'a> Law<'a> {
             None => {
                 let extra: Vec<(&str, f64)> =
                     self.marked.iter().map(String::as_str).zip(values.iter().copied()).collect();
-                self.along.eval(&self.change, &extra)?
+                self.along.eval_on(self.cover, &self.change, &extra)?
             }
         };
         let mut changes = changes.into_iter();

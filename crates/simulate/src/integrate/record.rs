@@ -32,6 +32,7 @@ impl Core<'_> {
             let first = self.seeds.parameters.len() + self.seeds.initial.len();
             let count = self.seeds.signals.lanes;
             let k = ((self.s / self.env.dt).round() as usize).min(self.env.len.saturating_sub(1));
+            let k = self.seeds.signals.row(k);
             for (c, change) in &self.seeds.signals.outputs {
                 for (l, v) in change[k * count..(k + 1) * count].iter().enumerate() {
                     self.result.dy[((first + l) * ny + c) * n + row] += v;
@@ -74,8 +75,9 @@ impl Core<'_> {
             let count = self.seeds.signals.lanes;
             for (i, change) in &self.seeds.signals.inputs {
                 let (k, w) = locate(self.s, inside, self.env.dt, self.env.len);
+                let rows = self.signal_rows(k);
                 let to = &mut self.out_d[(system.inputs() + i) * width + first..][..count];
-                lerp(change, k, w, self.env.len, count, to);
+                lerp(change, rows, w, count, to);
             }
         }
         if !out.delays.is_empty() {

@@ -205,7 +205,8 @@ impl Core<'_> {
         long.forces.extend(env.forces.iter().map(|force| weights.of(&force.samples[from..=to])));
         let signals = &seeds.signals;
         let count = signals.lanes;
-        let rows = from * count..(to + 1) * count;
+        let first = signals.row(from);
+        let rows = first * count..(first + intervals + 1) * count;
         if !signals.force.is_empty() {
             long.lane_force.resize(3 * count, 0.0);
             weights.of_rows(&signals.force[rows.clone()], count, &mut long.lane_force);

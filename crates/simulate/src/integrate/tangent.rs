@@ -94,12 +94,13 @@ impl Core<'_> {
             let first = self.seeds.parameters.len() + self.seeds.initial.len();
             let count = self.seeds.signals.lanes;
             let (k, w) = locate(st.s, st.mid, self.env.dt, self.env.len);
+            let rows = self.signal_rows(k);
             for (j, (i, change)) in self.seeds.signals.inputs.iter().enumerate() {
                 let row = &mut self.d[(system.inputs() + i) * width + first..][..count];
                 if self.long.active {
                     self.long.lane_input(j, st.s, self.env.dt, row);
                 } else {
-                    lerp(change, k, w, self.env.len, count, row);
+                    lerp(change, rows, w, count, row);
                 }
             }
         }
@@ -108,6 +109,11 @@ impl Core<'_> {
         }
         let st = &self.stages[b];
         system.rhs.tangent(&self.tangents, &st.regs, &self.modes, width, &mut self.d);
+    }
+
+    /// The rows of the signals at sample `k` and at the next.
+    pub(super) fn signal_rows(&self, k: usize) -> [usize; 2] {
+        [k, (k + 1).min(self.env.len - 1)].map(|k| self.seeds.signals.row(k))
     }
 
     /// Tangents of the delayed values of stage `b`.
@@ -197,8 +203,7 @@ impl Core<'_> {
             return;
         }
         let (k, w) = locate(st.s, st.mid, self.env.dt, self.env.len);
-        let a = &signals.force[k * count..][..count];
-        let c = &signals.force[(k + 1).min(self.env.len - 1) * count..][..count];
+        let [a, c] = self.signal_rows(k).map(|row| &signals.force[row * count..][..count]);
         for i in 0..self.system.nz {
             let weights = &signals.weights[i * count..][..count];
             let row = &mut self.d[self.at_b + i * self.width + first..][..count];
