@@ -10,6 +10,7 @@
 mod case;
 mod control;
 mod instructions;
+mod long;
 pub(crate) mod page;
 mod peak;
 mod peer;
@@ -51,8 +52,11 @@ pub struct Arguments {
     /// Instead, identify recordings of 10⁴, 10⁵ … up to so many samples, in blocks
     #[arg(long, value_name = "SAMPLES", conflicts_with_all = ["peers", "only"])]
     scale: Option<usize>,
+    /// Instead, diagnose recordings of 10³, 10⁴ … up to so many samples
+    #[arg(long, value_name = "SAMPLES", conflicts_with_all = ["peers", "only", "scale"])]
+    long: Option<usize>,
     /// Instead, count the instructions of every row with valgrind and hold them against dev/bench/instructions.json
-    #[arg(long, conflicts_with_all = ["peers", "scale"])]
+    #[arg(long, conflicts_with_all = ["peers", "scale", "long"])]
     instructions: bool,
     /// With --instructions: accept the counts
     #[arg(long, requires = "instructions", conflicts_with = "only")]
@@ -60,7 +64,7 @@ pub struct Arguments {
     /// One row in this process, for --instructions
     #[arg(long, value_name = "NAME", hide = true)]
     count_one: Option<String>,
-    /// Write the table of docs/src/speed.md that --peers or --scale makes
+    /// Write the table of docs/src/speed.md that --peers, --scale or --long makes
     #[arg(long, conflicts_with = "only")]
     write_docs: bool,
 }
@@ -140,12 +144,15 @@ pub fn run(root: &Path, arguments: &Arguments) -> Result<Ending> {
     if let Some(most) = arguments.scale {
         return scale(root, &target, most, arguments);
     }
+    if let Some(most) = arguments.long {
+        return long(root, &target, most, arguments);
+    }
     if arguments.instructions {
         let good = instructions::run(root, &target, &all, &arguments.only, arguments.write)?;
         return Ok(if good { Ending::Done } else { Ending::Missed });
     }
     if arguments.write_docs && !arguments.peers {
-        bail!("--write-docs needs --peers or --scale");
+        bail!("--write-docs needs --peers, --scale or --long");
     }
     let python = if arguments.peers {
         Some(greybox_dev::python::environment(
@@ -199,6 +206,18 @@ fn scale(root: &Path, target: &Path, most: usize, arguments: &Arguments) -> Resu
         page::write_scale(root, &lengths)?;
     }
     Ok(if scale::is_met(&lengths) { Ending::Done } else { Ending::Missed })
+}
+
+/// `--long`.
+fn long(root: &Path, target: &Path, most: usize, arguments: &Arguments) -> Result<Ending> {
+    let lengths = long::measure(root, target, most)?;
+    if let Some(path) = &arguments.json {
+        write_json(path, &lengths)?;
+    }
+    if arguments.write_docs {
+        page::write_long(root, &lengths)?;
+    }
+    Ok(if long::is_met(&lengths) { Ending::Done } else { Ending::Missed })
 }
 
 fn write_json(path: &Path, value: &impl Serialize) -> Result<()> {

@@ -5,7 +5,7 @@ use std::path::Path;
 
 use anyhow::Result;
 
-use super::{Report, duration, scale};
+use super::{Report, duration, long, scale};
 use greybox_dev::book;
 
 /// The page.
@@ -14,6 +14,9 @@ const NAME: &str = "speed.md";
 const BEGIN: &str = "<!-- Made by `cargo xtask bench --peers --write-docs`; do not edit. -->";
 /// Marker of the table of cost against length.
 const SCALE: &str = "<!-- Made by `cargo xtask bench --scale --write-docs`; do not edit. -->";
+
+/// Marker of the table of a diagnosis's cost against length.
+const LONG: &str = "<!-- Made by `cargo xtask bench --long --write-docs`; do not edit. -->";
 
 /// Puts the table between the markers.
 pub(super) fn write(root: &Path, report: &Report) -> Result<()> {
@@ -24,6 +27,11 @@ pub(super) fn write(root: &Path, report: &Report) -> Result<()> {
 pub(crate) fn write_scale(root: &Path, lengths: &[scale::Length]) -> Result<()> {
     book::put_table(root, NAME, SCALE, &scale::table(lengths))?;
     book::put_file(root, "speed-scale.svg", &scale::plot(lengths)?)
+}
+
+/// The same of a diagnosis.
+pub(crate) fn write_long(root: &Path, lengths: &[long::Length]) -> Result<()> {
+    book::put_table(root, NAME, LONG, &long::table(lengths))
 }
 
 fn table(report: &Report) -> String {
@@ -58,6 +66,6 @@ mod tests {
 
     #[test]
     fn the_page_has_the_markers_of_its_tables() {
-        assert!([BEGIN, SCALE].iter().all(|begin| book::has_table(&greybox_dev::root(), NAME, begin)));
+        assert!([BEGIN, SCALE, LONG].iter().all(|begin| book::has_table(&greybox_dev::root(), NAME, begin)));
     }
 }
