@@ -94,7 +94,7 @@ fn forces_and_signals_have_their_sensitivities() {
             weights: vec![0.7, 0.0],
             force: side_by_side(&force, &none),
             inputs: vec![(0, side_by_side(&none, &change))],
-            outputs: vec![],
+            ..SignalLanes::default()
         }),
         ..Seeds::default()
     };
