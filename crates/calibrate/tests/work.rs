@@ -98,3 +98,21 @@ fn a_fit_does_not_depend_on_how_its_start_was_simulated() {
         }
     }
 }
+
+/// At the minimum, the first step promises nothing and gains nothing: there is nothing that a second could add.
+#[test]
+fn a_fit_that_begins_at_its_end_takes_one_step() {
+    let (free, level) = oscillator();
+    let fit = |parameters: Vec<f64>, starts: Vec<Vec<f64>>, tolerance: f64| {
+        let limits = Limits { iterations: 50, tolerance };
+        free.fit(&level, &free.data.sigma, &[Point { parameters, starts }], limits)
+    };
+    let far: Vec<f64> = free.values().iter().map(|v| 3.0 * v).collect();
+    let starts = free.starts(&level, &far);
+    let first = fit(far, starts, 1e-9);
+    assert!(first.ending == Ending::Converged && first.iterations > 3, "{first:?}");
+    let Point { parameters, starts } = first.point;
+    let again = fit(parameters, starts, 1e-4);
+    assert_eq!((again.ending, again.iterations), (Ending::Converged, 1));
+    assert!((again.cost / first.cost - 1.0).abs() < 1e-4);
+}
