@@ -578,6 +578,10 @@ impl Problem<'_> {
     /// implementation and theory*, 1978), bounds by projection. A parameter is scaled by the largest norm that its
     /// column has had: where the model does not feel it for a while, its step stays bounded. The region grows and
     /// shrinks by how much of the decrease that the linear model promised came true.
+    ///
+    /// It has converged when a step decreases the cost F by less than the tolerance τ, ΔF < τ F, as was promised (MINPACK's test,
+    /// Moré, Garbow and Hillstrom, ANL-80-74, 1980: promised < τ F and ΔF / promised < 2), when two in a row do unforeseen, and
+    /// when a step fails and promised less than τ F: a shorter one promises less still.
     pub fn fit(&self, point: Point, limits: Limits) -> Fit {
         self.fit_from(point, None, limits)
     }
