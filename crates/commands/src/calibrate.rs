@@ -105,7 +105,7 @@ fn report(loaded: &LoadedModel, calibration: &Calibration, findings: Vec<contrac
     };
     let floor = data.sigma.iter().zip(&data.spread).map(|(sigma, spread)| sigma / spread);
     Report {
-        greybox: Producer { version: env!("CARGO_PKG_VERSION").to_owned(), seed: 0 },
+        greybox: Producer::this(0),
         model: ModelId { name: loaded.model.name.clone(), file: loaded.file.clone() },
         parameters: parameters(&loaded.model, &calibration.parameters),
         fit: contract::Fit {

@@ -242,7 +242,7 @@ pub fn control(
     };
     stage("writing the report");
     let files = files(request);
-    let producer = Producer { version: env!("CARGO_PKG_VERSION").into(), seed: request.seed };
+    let producer = Producer::this(request.seed);
     let page = convert::page(&ControlSources {
         model_file: &loaded.file,
         model,

@@ -308,7 +308,7 @@ pub fn conclude(
     }
     let summary: Summary = merge::conclude(
         statistics,
-        Producer { version: env!("CARGO_PKG_VERSION").to_owned(), seed },
+        Producer::this(seed),
         ModelId { name: name.to_owned(), file: file.to_owned() },
     );
     Ok(Conclusion {

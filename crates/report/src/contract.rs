@@ -82,13 +82,42 @@ pub struct Report {
     pub findings: Vec<Finding>,
 }
 
+/// Version of the documents that this program writes. It goes up when a key changes its name or its meaning; keys of earlier
+/// versions are still read.
+///
+/// | version | change |
+/// |---|---|
+/// | 2 | `schema` itself; `subsets[].left` is `residual_share`, `findings[].mend` is `help` |
+pub const SCHEMA: u32 = 2;
+
 /// The program that wrote the report.
 #[derive(Debug, Clone, PartialEq, Eq, Default, Serialize, Deserialize, JsonSchema)]
 pub struct Producer {
     /// Version of greybox, e.g. `0.1.0`.
     pub version: String,
+    /// Version of the document; 0 where it states none, as before version 2.
+    #[serde(default)]
+    pub schema: u32,
     /// Seed of every random choice; the same seed and inputs give the same report.
     pub seed: u64,
+}
+
+impl Producer {
+    /// This program, with the seed of a run.
+    #[must_use]
+    pub fn this(seed: u64) -> Producer {
+        Producer { version: env!("CARGO_PKG_VERSION").to_owned(), schema: SCHEMA, seed }
+    }
+
+    /// # Errors
+    /// [`ReportError::Newer`] for a document of a later version than this program knows.
+    pub(crate) fn check(&self) -> Result<(), ReportError> {
+        if self.schema > SCHEMA {
+            let Producer { version, schema, .. } = self;
+            return Err(ReportError::Newer { version: version.clone(), schema: *schema });
+        }
+        Ok(())
+    }
 }
 
 /// Which model was examined.
@@ -143,9 +172,9 @@ pub struct Subset {
     pub mechanisms: Vec<usize>,
     /// Residual sum of squares, noise included, over that of the calibrated model, 0 to 1; the parameters are refitted
     /// with these mechanisms.
-    #[serde(with = "number")]
+    #[serde(with = "number", alias = "left")]
     #[schemars(schema_with = "number_schema")]
-    pub left: f64,
+    pub residual_share: f64,
 }
 
 /// One piece of missing physics.
@@ -722,9 +751,12 @@ impl Report {
     /// Reads a report; `null` numbers become NaN and keys that are not known are skipped.
     ///
     /// # Errors
-    /// [`ReportError::Json`] with line and column where the text is not JSON or misses a promised key.
+    /// [`ReportError::Json`] with line and column where the text is not JSON or misses a promised key, [`ReportError::Newer`]
+    /// where it is of a later version than [`SCHEMA`].
     pub fn from_json(text: &str) -> Result<Self, ReportError> {
-        Ok(serde_json::from_str(text)?)
+        let report: Self = serde_json::from_str(text)?;
+        report.greybox.check()?;
+        Ok(report)
     }
 }
 

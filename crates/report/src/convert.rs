@@ -37,7 +37,7 @@ pub fn report(diagnosis: &Diagnosis, sources: &Sources<'_>) -> Report {
     let reach = reach(d);
     let plan = remainder_plan(d, &reach);
     let mut report = Report {
-        greybox: Producer { version: env!("CARGO_PKG_VERSION").to_string(), seed: d.seed },
+        greybox: Producer::this(d.seed),
         model: ModelId { name: d.nominal.name.clone(), file: sources.model_file.to_string() },
         samples: Samples { train: d.train.data.samples(), holdout: d.holdout.data.samples() },
         verdict: match d.verdict {
@@ -60,7 +60,7 @@ pub fn report(diagnosis: &Diagnosis, sources: &Sources<'_>) -> Report {
         subsets: d
             .subsets
             .iter()
-            .map(|s| Subset { mechanisms: s.mechanisms.clone(), left: s.left })
+            .map(|s| Subset { mechanisms: s.mechanisms.clone(), residual_share: s.left })
             .collect(),
         remainder: Remainder {
             significant: d.remainder.significant,

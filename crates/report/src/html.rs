@@ -654,7 +654,7 @@ fn subsets(report: &Report) -> Vec<[String; 3]> {
             n if n == titles.len() => "All".to_owned(),
             _ => s.mechanisms.iter().map(named).collect::<Vec<_>>().join(", "),
         };
-        [escape(&what), s.mechanisms.len().to_string(), format::percent(s.left)]
+        [escape(&what), s.mechanisms.len().to_string(), format::percent(s.residual_share)]
     };
     report.subsets.iter().map(row).collect()
 }

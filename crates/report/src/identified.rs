@@ -280,9 +280,12 @@ impl IdentifyReport {
     /// Reads a report; `null` numbers become NaN and keys that are not known are skipped.
     ///
     /// # Errors
-    /// [`ReportError::Json`] with line and column where the text is not JSON or misses a promised key.
+    /// [`ReportError::Json`] with line and column where the text is not JSON or misses a promised key, [`ReportError::Newer`]
+    /// where it is of a later version than [`SCHEMA`](crate::contract::SCHEMA).
     pub fn from_json(text: &str) -> Result<Self, ReportError> {
-        Ok(serde_json::from_str(text)?)
+        let report: Self = serde_json::from_str(text)?;
+        report.greybox.check()?;
+        Ok(report)
     }
 }
 

@@ -71,6 +71,17 @@ pub enum ReportError {
     /// The JSON text is malformed or misses a promised key; the source names line and column.
     #[error("report.json: {0}")]
     Json(#[from] serde_json::Error),
+    /// A later version wrote it.
+    #[error(
+        "report.json: greybox {version} wrote it with schema {schema}, and this version reads schemas up to {}",
+        contract::SCHEMA
+    )]
+    Newer {
+        /// Version of greybox that wrote it.
+        version: String,
+        /// Version of the document.
+        schema: u32,
+    },
     /// The page could not be rendered.
     #[error("report.html: {0}")]
     Html(#[from] askama::Error),

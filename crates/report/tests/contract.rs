@@ -1,7 +1,9 @@
 //! `report.json` against its schema, and the schema against its checked-in copy.
 #![allow(clippy::unwrap_used, reason = "helpers of tests panic like the tests themselves")]
 
-use greybox_report::contract::{Fit, FitSet, Interval, Location, Names, Ordered, Score, Verdict, schema};
+use greybox_report::contract::{
+    Fit, FitSet, Interval, Location, Names, Ordered, SCHEMA, Score, Subset, Verdict, schema,
+};
 use greybox_report::{Report, sentence};
 
 #[path = "common/schema.rs"]
@@ -38,6 +40,24 @@ fn findings_of_earlier_versions_are_read() {
         r#"{"severity": "warning", "code": "clipping", "message": "clipped", "mend": "turn it down"}"#;
     let read: greybox_report::contract::Finding = serde_json::from_str(finding).unwrap();
     assert_eq!(read.help.as_deref(), Some("turn it down"));
+}
+
+/// So had that of a subset's residual; reports before the second schema state none.
+#[test]
+fn subsets_of_earlier_versions_are_read() {
+    let read: Subset = serde_json::from_str(r#"{"mechanisms": [0], "left": 0.25}"#).unwrap();
+    assert_eq!(read, Subset { mechanisms: vec![0], residual_share: 0.25 });
+}
+
+#[test]
+fn a_report_of_a_later_schema_is_refused() {
+    let mut report = sample::page().report;
+    assert_eq!(report.greybox.schema, SCHEMA);
+    report.greybox.schema = SCHEMA + 1;
+    let error = Report::from_json(&report.to_json().unwrap()).unwrap_err().to_string();
+    assert!(error.contains(&format!("schema {}", SCHEMA + 1)), "{error}");
+    report.greybox.schema = 0;
+    assert_eq!(Report::from_json(&report.to_json().unwrap()).unwrap(), report);
 }
 
 /// The promised keys, in the words of the design; renaming a field must fail here.

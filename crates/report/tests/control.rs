@@ -49,7 +49,7 @@ fn page() -> ControlPage {
     let widened = |by: f64| theta.iter().map(|v| v + by).collect::<Vec<f64>>();
     ControlPage {
         title: "Controller of Arm".into(),
-        producer: Producer { version: "0.1.0".into(), seed: 7 },
+        producer: Producer { version: "0.1.0".into(), ..Producer::this(7) },
         model: ModelId { name: "Arm".into(), file: "arm.toml".into() },
         verdict: Verdict::Settles,
         method: LawKind::Lqr,

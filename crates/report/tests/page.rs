@@ -73,7 +73,7 @@ fn what_fewer_mechanisms_would_leave_stands_in_a_table() {
         .mechanisms
         .push(greybox_report::contract::Mechanism { kind: "dead_zone".to_owned(), ..first });
     page.report.subsets = [(vec![], 1.0), (vec![0], 0.0412), (vec![1], 0.73), (vec![0, 1], 0.001)]
-        .map(|(mechanisms, left)| Subset { mechanisms, left })
+        .map(|(mechanisms, left)| Subset { mechanisms, residual_share: left })
         .to_vec();
     let html = page.to_html().unwrap();
     for (name, number, left) in [

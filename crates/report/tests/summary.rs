@@ -42,7 +42,7 @@ fn parts() -> Vec<Statistics> {
 
 fn summary() -> Summary {
     let model = ModelId { name: "Rotary flexible link".into(), file: "link.toml".into() };
-    conclude(reduce(parts()).unwrap(), Producer { version: "0.1.0".into(), seed: 3 }, model)
+    conclude(reduce(parts()).unwrap(), Producer { version: "0.1.0".into(), ..Producer::this(3) }, model)
 }
 
 fn bytes(statistics: &Statistics) -> String {

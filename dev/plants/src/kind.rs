@@ -314,4 +314,20 @@ impl Kind {
             _ => &[],
         }
     }
+
+    /// For an effect outside the library: the kind among its terms without a name that, beside a damper of the machine's own,
+    /// is exactly this law. `None` where no term is.
+    pub fn term(self) -> Option<&'static str> {
+        Some(match self {
+            DisplacementDamping => "position_dependent_damping",
+            PositionFriction => "position_dependent_friction",
+            ProductCoupling => "product_coupling",
+            TiringActuator => "fading_input",
+            QuinticStiffness => "quintic_stiffness",
+            EddyBrake => "eddy_current_damping",
+            MaxwellElement => "maxwell_element",
+            OneWayDamper => "asymmetric_damping",
+            _ => return None,
+        })
+    }
 }

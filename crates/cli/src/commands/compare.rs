@@ -102,14 +102,10 @@ fn read(path: &Path) -> Result<Report, Failure> {
     let file = if path.is_dir() { path.join("report.json") } else { path.to_owned() };
     let help = "name a folder that `greybox diagnose` wrote, or its report.json";
     let text = loading::text(&file).map_err(|failure| failure.help(help))?;
-    Report::from_json(&text)
-        .map_err(|e| Failure::file(&file, format!("not a diagnosis report: {}", cause(&e))).help(help))
-}
-
-/// What the JSON lacks; the file has another name than the reader thinks.
-fn cause(error: &ReportError) -> String {
-    match error {
-        ReportError::Json(json) => json.to_string(),
-        other => other.to_string(),
-    }
+    // (The file may have another name than the error says.)
+    Report::from_json(&text).map_err(|error| match error {
+        ReportError::Json(json) => Failure::file(&file, format!("not a diagnosis report: {json}")).help(help),
+        newer => Failure::file(&file, newer.to_string())
+            .help("update greybox, or read it with the version that wrote it"),
+    })
 }

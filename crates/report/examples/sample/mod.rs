@@ -409,7 +409,7 @@ pub(crate) fn page() -> Page {
     let (train_fit, test_fit) = (fit_of(&[&train.recording]), fit_of(&[&test.recording]));
     let floor = |state: usize| NOISE[state] / spread(&train.recording.channels[state].measured);
     let mut report = Report {
-        greybox: Producer { version: env!("CARGO_PKG_VERSION").to_owned(), seed: 1 },
+        greybox: Producer::this(1),
         model: ModelId {
             name: "Rotary flexible link, linear nominal".to_owned(),
             file: "link.toml".to_owned(),

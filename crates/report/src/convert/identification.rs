@@ -43,7 +43,7 @@ pub fn report(found: &Identification, sources: &Sources<'_>) -> IdentifyReport {
     let variables = variables(&found.model, sources);
     let units = units_stated(&variables);
     let mut report = IdentifyReport {
-        greybox: Producer { version: env!("CARGO_PKG_VERSION").to_owned(), seed: found.seed },
+        greybox: Producer::this(found.seed),
         model: ModelId { name: found.model.name.clone(), file: MODEL_FILE.to_owned() },
         summary: Vec::new(),
         equations: found

@@ -61,6 +61,8 @@ pub(crate) struct Truth {
     pub(crate) effects: Vec<TruthEffect>,
     /// Outside the library: kinds a fair judge accepts.
     pub(crate) relatives: &'static [&'static str],
+    /// Outside the library: the term without a name that is this law.
+    pub(crate) term: Option<&'static str>,
     /// Channels that nothing pulls back: their free runs drift.
     pub(crate) drifting: Vec<String>,
     /// RMS of the measurement noise, by channel.
@@ -1110,6 +1112,10 @@ fn truth(
         relatives: match slot.left {
             Left::Effect(k) if k.is_outside() => k.relatives(),
             _ => &[],
+        },
+        term: match slot.left {
+            Left::Effect(k) if k.is_outside() => k.term(),
+            _ => None,
         },
         drifting: family.drifting().iter().map(|&c| family.states()[c].0.to_owned()).collect(),
         noise: (0..measured.len())

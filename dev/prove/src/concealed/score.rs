@@ -37,6 +37,8 @@ pub(crate) struct Score {
     pub(crate) iou: Option<f64>,
     /// Outside the library: unexplained, or an accepted relative named.
     pub(crate) outside: Option<bool>,
+    /// Outside the library, where a term without a name is the law: the improved model holds it, in its equation.
+    pub(crate) term: Option<bool>,
     /// Outside the library: what the improved model rests on, or the gate at which a closure was rejected.
     pub(crate) answer: Option<String>,
     /// Outside the library: a kind that is no relative, named with confidence of 0.9 or more.
@@ -68,6 +70,7 @@ impl Score {
             family: effect.then_some(false),
             equation: effect.then_some(false),
             outside: (truth.class == "outside").then_some(false),
+            term: truth.term.map(|_| false),
             seconds,
             ..Score::default()
         }
@@ -109,6 +112,10 @@ pub(crate) fn judge(truth: &Truth, report: &Report, oracle: Option<&Oracle>, sec
         "outside" => {
             score.detected = said;
             score.answer = Some(answer(report));
+            score.term = truth.term.map(|term| {
+                let mut held = report.mechanisms.iter().chain(&report.candidates);
+                held.any(|m| m.kind == term && truth.effects.iter().any(|e| equation_fits(e, m)))
+            });
             let near = report.mechanisms.iter().all(|m| truth.relatives.contains(&m.kind.as_str()));
             score.outside =
                 Some(report.verdict == Verdict::Unexplained || (!report.mechanisms.is_empty() && near));
@@ -362,6 +369,7 @@ mod tests {
             masks: vec![],
             effects,
             relatives: &[],
+            term: None,
             drifting: vec![],
             noise: vec![],
             parameters: vec![],
@@ -446,6 +454,27 @@ mod tests {
         let wrong = scored(&outside, &found(&["coulomb_friction"]));
         assert_eq!((wrong.outside, wrong.confidently_wrong), (Some(false), Some(true)));
         assert_eq!(scored(&outside, &report("consistent", &[], "theta")).outside, Some(false));
+    }
+
+    /// The term counts among what is proposed, in the equation where the law acts; where no term is the law nothing is asked.
+    #[test]
+    fn a_term_is_held_in_its_equation() {
+        let mut outside = truth("outside", vec![left_out(Kind::QuinticStiffness, "axis")]);
+        outside.term = Kind::QuinticStiffness.term();
+        let proposed = |kind: &str| {
+            let mut proposed = found(&[kind]);
+            (proposed.verdict, proposed.candidates) =
+                (Verdict::Unexplained, proposed.mechanisms.split_off(0));
+            proposed
+        };
+        let term = |truth: &Truth, report: &Report| scored(truth, report).term;
+        assert_eq!(term(&outside, &proposed("quintic_stiffness")), Some(true));
+        assert_eq!(term(&outside, &proposed("cubic_stiffness")), Some(false));
+        assert_eq!(term(&outside, &report("unexplained", &[], "theta")), Some(false));
+        outside.effects[0].equations = vec!["hub".to_owned()];
+        assert_eq!(term(&outside, &proposed("quintic_stiffness")), Some(false));
+        outside.term = Kind::LockingSpring.term();
+        assert_eq!(term(&outside, &proposed("quintic_stiffness")), None);
     }
 
     #[test]

@@ -31,6 +31,7 @@ pub(crate) struct Figures {
     pub(crate) outside: Option<f64>,
     pub(crate) confidently_wrong: Option<f64>,
     pub(crate) outside_held_out: Option<f64>,
+    pub(crate) outside_term: Option<f64>,
     pub(crate) seconds_median: Option<f64>,
     pub(crate) seconds_worst: Option<f64>,
     pub(crate) failures: Option<f64>,
@@ -72,7 +73,7 @@ fn is_near(f: &Finished) -> bool {
     f.score.holdout.is_some_and(|r| r <= bound)
 }
 
-const GOALS: [Goal; 17] = [
+const GOALS: [Goal; 18] = [
     Goal {
         name: "detected",
         what: "effects detected",
@@ -172,6 +173,14 @@ const GOALS: [Goal; 17] = [
         shown: percent,
     },
     Goal {
+        name: "outside_term",
+        what: "outside: the law itself, where a term is it",
+        get: |f| f.outside_term,
+        low: 0.8,
+        high: MUCH,
+        shown: percent,
+    },
+    Goal {
         name: "seconds_median",
         what: "time, median",
         get: |f| f.seconds_median,
@@ -244,6 +253,7 @@ impl Figures {
             outside: share(all().filter_map(|s| s.outside)),
             confidently_wrong: share(all().filter_map(|s| s.confidently_wrong)),
             outside_held_out: share(of("outside").map(is_near)),
+            outside_term: share(all().filter_map(|s| s.term)),
             seconds_median: median(all().map(|s| s.seconds).collect()),
             seconds_worst: all().map(|s| s.seconds).reduce(f64::max),
             failures: share(all().map(|s| s.failure.is_some())),
@@ -384,16 +394,17 @@ fn outside(finished: &[Finished]) -> String {
     let kind = |f: &Finished| f.truth.effects.first().map_or("", |e| e.kind);
     cases.sort_by_key(|f| (kind(f), f.truth.index));
     let mut text = format!(
-        "{:<32} {:<12} {:<8} {:>11}  {}\n",
-        "outside, by law", "system", "honest", "held-out", "answer"
+        "{:<32} {:<12} {:<8} {:<8} {:>11}  {}\n",
+        "outside, by law", "system", "honest", "term", "held-out", "answer"
     );
     for f in cases {
-        let honest = if f.score.outside == Some(true) { "yes" } else { "no" };
+        let shown = |flag: Option<bool>| flag.map_or("-", |yes| if yes { "yes" } else { "no" });
+        let (honest, term) = (shown(f.score.outside), shown(f.score.term));
         let held = f.score.holdout.map_or("-".to_owned(), |r| format!("{r:.2}"));
         let answer = f.score.answer.as_deref().unwrap_or("failed");
         let _ = writeln!(
             text,
-            "{:<32} {:<12} {honest:<8} {held:>11}  {answer}",
+            "{:<32} {:<12} {honest:<8} {term:<8} {held:>11}  {answer}",
             kind(f).trim_start_matches("outside_"),
             f.truth.system
         );
