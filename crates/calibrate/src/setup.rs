@@ -613,8 +613,8 @@ impl Setup {
         self.with_problem(level, scale, |problem| {
             let is_only = points.len() == 1 && limits.iterations > 0;
             let simulated = points.iter().map(|p| (problem.rows(p, is_only, None), p));
-            let priced = simulated.map(|(rows, p)| (problem.cost_of(&rows, p), rows, p));
-            let Some((_, rows, point)) = priced.min_by(|a, b| a.0.total_cmp(&b.0)) else {
+            let evaluated = simulated.map(|(rows, p)| (problem.cost_of(&rows, p), rows, p));
+            let Some((_, rows, point)) = evaluated.min_by(|a, b| a.0.total_cmp(&b.0)) else {
                 return problem.fit(Point { parameters: self.values(), starts: Vec::new() }, limits);
             };
             let best = self.with_fresh_starts(problem, &rows, point.clone());
@@ -674,12 +674,13 @@ impl Setup {
         most: usize,
     ) -> Vec<Point> {
         self.with_problem(level, scale, |problem| {
-            let mut priced: Vec<(f64, Point)> = points.into_iter().map(|p| (problem.cost(&p), p)).collect();
-            priced.retain(|p| p.0.is_finite());
-            priced.sort_by(|a, b| a.0.total_cmp(&b.0));
-            priced.dedup_by(|a, b| a.0 == b.0);
-            priced.truncate(most);
-            priced.into_iter().map(|p| p.1).collect()
+            let mut evaluated: Vec<(f64, Point)> =
+                points.into_iter().map(|p| (problem.cost(&p), p)).collect();
+            evaluated.retain(|p| p.0.is_finite());
+            evaluated.sort_by(|a, b| a.0.total_cmp(&b.0));
+            evaluated.dedup_by(|a, b| a.0 == b.0);
+            evaluated.truncate(most);
+            evaluated.into_iter().map(|p| p.1).collect()
         })
     }
 

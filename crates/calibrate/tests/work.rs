@@ -73,7 +73,7 @@ fn a_part_of_the_work_ends_alone_and_with_the_whole() {
     assert!(ending(Work::part_of(&over, 2 * cost)).1 < cost / 2);
 }
 
-/// A point that is alone is simulated once, with its derivatives; one beside another is priced first. The fit is the same.
+/// A point that is alone is simulated once, with its derivatives; one beside another is evaluated first. The fit is the same.
 #[test]
 fn a_fit_does_not_depend_on_how_its_start_was_simulated() {
     let (free, level) = oscillator();

@@ -20,7 +20,7 @@ const PARTS: usize = 50;
 const ALIKE: f64 = 0.8;
 
 /// By this factor, a motion is too large or too small for parameters that are known roughly.
-const FAR: f64 = 5.0;
+const MANY_TIMES: f64 = 5.0;
 
 /// A simulation that goes this many times beyond the range of the measurement has left it.
 const BEYOND: f64 = 100.0;
@@ -250,7 +250,7 @@ fn sized(measurement: &Measurement, stated: bool, ratio: f64) -> Option<Finding>
                 .to_owned(),
         ));
     }
-    if (1.0 / FAR..FAR).contains(&ratio) {
+    if (1.0 / MANY_TIMES..MANY_TIMES).contains(&ratio) {
         return None;
     }
     let message = format!("It moves {times} times as far as the model as given says on this recording.");

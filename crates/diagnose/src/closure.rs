@@ -22,7 +22,7 @@ use rayon::prelude::*;
 
 use crate::Stage;
 use crate::candidate::Candidate;
-use crate::evidence::{Evidence, least_effective_sample_ratio, price};
+use crate::evidence::{Evidence, least_effective_sample_ratio, penalty};
 use crate::fitted::{FittedModel, Found, Law, MechanismTerm, SelectedTerm, WHITE, is_same, laws, next_scale};
 use crate::library::Shape;
 use crate::place::own_coordinates;
@@ -343,17 +343,18 @@ impl Search<'_> {
         let positions: Vec<usize> = held.iter().map(|h| h.position).collect();
         let inflation = Uncertainty::inflation(model, scale, &positions).factor;
         let information = model.fit.count.iter().sum::<usize>() as f64 / inflation;
-        let price = |c: &Candidate| {
+        let penalty = |c: &Candidate| {
             let law = &self.library[c.mechanism];
             let parameters = law.parameters().count() as f64;
             let ranked = UNDECIDED * f64::from(law.rank);
-            inflation * (price(parameters, information) + 2.0 * law.surcharge + ranked)
+            inflation * (penalty(parameters, information) + 2.0 * law.surcharge + ranked)
         };
-        let together = reselect(model.at(scale), self.library, terms, &held, &price)?;
+        let together = reselect(model.at(scale), self.library, terms, &held, &penalty)?;
         let other = self.exchanged(model, terms, &positions, &together, scale)?;
         // (First order may have promised too much.)
-        let cost =
-            |model: &FittedModel| model.rss() + model.parts.iter().map(|p| price(&p.candidate)).sum::<f64>();
+        let cost = |model: &FittedModel| {
+            model.rss() + model.parts.iter().map(|p| penalty(&p.candidate)).sum::<f64>()
+        };
         (cost(&other) < cost(model) && self.admissible(&other, scale))
             .then(|| self.known_alone(other, odds(terms.len()), scale))
     }

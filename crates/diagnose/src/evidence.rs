@@ -5,7 +5,7 @@
 //!
 //! ```text
 //! N_eff = Σ n_c κ_c,   κ_c = 1 / (1 + 2 Σ_k ρ_c(k))      (until ρ < 0.05)
-//! score = Σ n_c κ_c ln(RSS_old/RSS_new) − price(k, N_eff) − 2·surcharge,   price ≈ k ln N_eff
+//! score = Σ n_c κ_c ln(RSS_old/RSS_new) − penalty(k, N_eff) − 2·surcharge,   penalty ≈ k ln N_eff
 //! ```
 //!
 //! Consistency is judged on ten folds of contiguous blocks: leaving fold k out moves the parameters, to
@@ -17,7 +17,7 @@
 //!
 //! ```text
 //! c = tr(V⁻¹ S) / tr(V⁻¹ S₀),  at least 1      (Godambe, Ann. Math. Stat. 31, 1960)
-//! robust = (ν + γ) ln(1 + Σ n_c ln(RSS_old/RSS_new) / (c ν)) − price(k, n/c) − 2·surcharge
+//! robust = (ν + γ) ln(1 + Σ n_c ln(RSS_old/RSS_new) / (c ν)) − penalty(k, n/c) − 2·surcharge
 //! ```
 //!
 //! the ratio of likelihoods adjusted by c (Chandler and Bate, Biometrika 94, 2007). S is that of stationary noise
@@ -46,9 +46,9 @@ pub struct Folds {
 /// Comparison of a richer model with a simpler one.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Evidence {
-    /// Log-likelihood gain less the price of complexity.
+    /// Log-likelihood gain less the penalty of complexity.
     pub score: f64,
-    /// The same at Akaike's price, two for each parameter.
+    /// The same at Akaike's penalty, two for each parameter.
     pub akaike: f64,
     /// Relative drop of the residual sum of squares.
     pub drop: f64,
@@ -232,14 +232,14 @@ pub struct Smoothness {
 }
 
 impl Smoothness {
-    fn price(self, inflation: f64) -> f64 {
+    fn penalty(self, inflation: f64) -> f64 {
         self.squares / inflation + self.certainty
     }
 }
 
-/// Price of `k` parameters: BIC's ln N for each, no less than AIC's 2, and on little information more, by the
+/// Penalty of `k` parameters: BIC's ln N for each, no less than AIC's 2, and on little information more, by the
 /// small-sample factor N/(N − k − 1) (Hurvich and Tsai 1989), three at most.
-pub(crate) fn price(k: f64, information: f64) -> f64 {
+pub(crate) fn penalty(k: f64, information: f64) -> f64 {
     let n = information.max(2.0);
     k * n.ln().max(2.0) * n / (n - k - 1.0).max(n / 3.0)
 }
@@ -281,7 +281,7 @@ pub fn robust(old: &ComparedModel, new: &ComparedModel, count: &[usize], inflati
         false => gain,
     };
     let cost =
-        |side: &ComparedModel| price(side.parameters, information) + side.shapes.price(inflation.factor);
+        |side: &ComparedModel| penalty(side.parameters, information) + side.shapes.penalty(inflation.factor);
     let dearer = cost(new) - cost(old);
     reported - dearer - 2.0 * (new.surcharge - old.surcharge)
 }
@@ -303,7 +303,7 @@ pub fn weigh(
     let changes = || old_folds.blocks.iter().zip(&new_folds.blocks).map(|(a, b)| a - b);
     let all: f64 = changes().map(f64::abs).sum();
     Evidence {
-        score: gain + price(old.parameters, effective) - price(new.parameters, effective),
+        score: gain + penalty(old.parameters, effective) - penalty(new.parameters, effective),
         akaike: gain + 2.0 * (old.parameters - new.parameters),
         drop: 1.0 - after / before.max(1e-300),
         cross_validation_gain: fallen / old_folds.sse.iter().sum::<f64>().max(1e-300),
@@ -317,7 +317,7 @@ pub fn weigh(
 
 #[cfg(test)]
 mod tests {
-    use super::{ComparedModel, Folds, Inflation, Smoothness, price, robust, weigh};
+    use super::{ComparedModel, Folds, Inflation, Smoothness, penalty, robust, weigh};
 
     fn side(rss: f64, parameters: f64) -> ComparedModel {
         ComparedModel { rss: vec![rss], parameters, surcharge: 0.0, shapes: Smoothness::default() }
@@ -331,7 +331,7 @@ mod tests {
         let e = weigh((&side(1010.0, 1.0), &simple), (&side(1000.0, 3.0), &rich), &[n], &[1.0], false);
         let gain = 1000.0 * 1.01_f64.ln();
         assert!((e.akaike - (gain - 4.0)).abs() < 1e-9, "{}", e.akaike);
-        assert!((e.score - (gain - price(3.0, 1000.0) + price(1.0, 1000.0))).abs() < 1e-9, "{}", e.score);
+        assert!((e.score - (gain - penalty(3.0, 1000.0) + penalty(1.0, 1000.0))).abs() < 1e-9, "{}", e.score);
         // Two parameters for a gain of ten: BIC refuses what Akaike accepts.
         assert!(e.score < 0.0 && e.akaike > 0.0);
     }
@@ -348,21 +348,21 @@ mod tests {
             )
         };
         let gain = 1000.0 * 1.2_f64.ln();
-        let student = |gain: f64, n: f64| 40.0 * (1.0 + gain / 39.0).ln() - price(1.0, n);
+        let student = |gain: f64, n: f64| 40.0 * (1.0 + gain / 39.0).ln() - penalty(1.0, n);
         assert!((of(1.0, 39.0) - student(gain, 1000.0)).abs() < 1e-9);
         let slow = of(20.0, 39.0);
         assert!((slow - student(gain / 20.0, 50.0)).abs() < 1e-9 && slow < 6.0, "{slow}");
         // Of much freedom, Student's ratio is that of a normal.
         let [many, all] = [1e7, f64::INFINITY].map(|freedom| of(1.0, freedom));
         assert!(
-            (all - (gain - price(1.0, 1000.0))).abs() < 1e-9 && (many - all).abs() < 0.01,
+            (all - (gain - penalty(1.0, 1000.0))).abs() < 1e-9 && (many - all).abs() < 0.01,
             "{many} {all}"
         );
-        // Of three strengths Student's ratio has three dimensions; a prior's price falls with what the residual is worth.
+        // Of three strengths Student's ratio has three dimensions; a prior's penalty falls with what the residual is worth.
         let three = Inflation { factor: 2.0, freedom: 39.0, parameters: 3.0 };
         let shaped =
             ComparedModel { shapes: Smoothness { squares: 8.0, certainty: 5.0 }, ..side(1000.0, 1.0) };
-        let expected = 42.0 * (1.0 + gain / 78.0).ln() - price(1.0, 500.0) - (4.0 + 5.0);
+        let expected = 42.0 * (1.0 + gain / 78.0).ln() - penalty(1.0, 500.0) - (4.0 + 5.0);
         assert!((robust(&side(1200.0, 0.0), &shaped, &[1000], three) - expected).abs() < 1e-9);
         // What is worse is no better for it, and a surcharge is paid.
         let plain = Inflation { factor: 1.0, freedom: 39.0, parameters: 1.0 };
@@ -375,12 +375,12 @@ mod tests {
     #[test]
     fn parameters_cost_as_bic_says_and_more_where_little_is_known() {
         // Much information: k ln N, to the factor N/(N − k − 1).
-        assert!((price(3.0, 1e5) / (3.0 * 1e5_f64.ln()) - 1.0).abs() < 1e-4);
-        assert!(price(0.0, 50.0).abs() < 1e-300);
+        assert!((penalty(3.0, 1e5) / (3.0 * 1e5_f64.ln()) - 1.0).abs() < 1e-4);
+        assert!(penalty(0.0, 50.0).abs() < 1e-300);
         // Hurvich and Tsai's factor at N = 20, k = 4: 20/15.
-        assert!((price(4.0, 20.0) - 4.0 * 20_f64.ln() * 20.0 / 15.0).abs() < 1e-12);
+        assert!((penalty(4.0, 20.0) - 4.0 * 20_f64.ln() * 20.0 / 15.0).abs() < 1e-12);
         // Below e² samples AIC's 2, and the factor three at most.
-        assert!((price(2.0, 6.0) - 2.0 * 2.0 * 6.0 / 3.0).abs() < 1e-12);
-        assert!((price(5.0, 6.0) - 5.0 * 2.0 * 3.0).abs() < 1e-12);
+        assert!((penalty(2.0, 6.0) - 2.0 * 2.0 * 6.0 / 3.0).abs() < 1e-12);
+        assert!((penalty(5.0, 6.0) - 5.0 * 2.0 * 3.0).abs() < 1e-12);
     }
 }

@@ -41,8 +41,8 @@ use crate::{ProgressListener, Stage};
 
 /// Probability from which a family of laws is named.
 const NAMED: f64 = 0.95;
-/// Difference of two logarithms of evidence up to which the data do not decide.
-const UNDECIDED: f64 = 1.5;
+/// Difference of two logarithms of evidence up to which the data do not decide. (A score is twice such a logarithm.)
+const UNDECIDED: f64 = 0.5 * crate::search::UNDECIDED;
 /// Hypotheses of each number of laws that are followed.
 const BEAM: usize = 2;
 /// Most laws.
@@ -65,7 +65,7 @@ const SHARE_OF_WORK: u64 = 4;
 const PROMISING: f64 = 1.0;
 /// Departure of a parameter from what is stated, in units of its prior, from which candidates are also tried where it is
 /// stated: a calibrated parameter may stand in for what is missing.
-const FAR: f64 = 1.0;
+const FAR_FROM_STATED: f64 = 1.0;
 /// The least value of an inner parameter that its prior reaches, over its highest.
 const LEAST: f64 = 1e-3;
 /// Segments along which candidates are evaluated.
@@ -288,7 +288,8 @@ impl<'a, 'b> Explorer<'a, 'b> {
     /// The same hypothesis where the machine's parameters are as stated, if some are far from it.
     fn as_stated(&self, h: &Hypothesis) -> Option<Hypothesis> {
         let at = h.at();
-        let far = self.machine.free.iter().any(|f| f.prior.at(at.parameters[f.index]).0.abs() > FAR);
+        let far =
+            self.machine.free.iter().any(|f| f.prior.at(at.parameters[f.index]).0.abs() > FAR_FROM_STATED);
         if !far || !h.parts.is_empty() {
             return None;
         }

@@ -377,7 +377,7 @@ pub(crate) struct Held {
 /// Which terms do the work of those that are `held` at the least cost:
 ///
 /// ```text
-/// min over S of  Σ_{i ∈ S} price(i) + min over c, δ of ‖r + Σ_{held} vⱼ gⱼ − Σ_{i ∈ S} cᵢ gᵢ − J δ‖²
+/// min over S of  Σ_{i ∈ S} penalty(i) + min over c, δ of ‖r + Σ_{held} vⱼ gⱼ − Σ_{i ∈ S} cᵢ gᵢ − J δ‖²
 /// ```
 ///
 /// with the residual r over its scale, the responses g of all candidates of one column, the held values v, and the
@@ -390,7 +390,7 @@ pub(crate) fn reselect(
     library: &[Mechanism],
     candidates: &[Candidate],
     held: &[Held],
-    price: &(dyn Fn(&Candidate) -> f64 + Sync),
+    penalty: &(dyn Fn(&Candidate) -> f64 + Sync),
 ) -> Option<Together> {
     struct Told {
         cost: f64,
@@ -415,7 +415,7 @@ pub(crate) fn reselect(
         let columns: Vec<usize> = chosen.iter().map(|&v| variants[v].columns.start).collect();
         let positive: Vec<bool> = chosen.iter().flat_map(|&v| all.positive(&variants[v])).collect();
         let (coefficients, gain) = all.regress(&columns, &positive, LEAST_RIDGE)?;
-        let paid: f64 = chosen.iter().map(|&v| price(&candidates[variants[v].candidate])).sum();
+        let paid: f64 = chosen.iter().map(|&v| penalty(&candidates[variants[v].candidate])).sum();
         Some(Told { cost: paid - gain * all.rr, coefficients, gain })
     };
     let mut best = (reported(&chosen)?, chosen.clone());

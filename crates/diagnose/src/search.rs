@@ -56,7 +56,7 @@ const PAIR_SAMPLES: usize = 500;
 /// Fall of the cost from which another hold of an input is considered once more is known of the machine.
 pub(crate) const SAME_HOLD: f64 = 0.002;
 /// Residual over noise from which a model is far from the noise.
-const FAR: f64 = 2.0;
+const FAR_FROM_NOISE: f64 = 2.0;
 /// Ratio of sums of squares at which a whitened estimate simulates no longer what it is fitted to.
 const FORGETS: f64 = 1.5;
 /// Fewest samples from which a mechanism with states of its own is looked for.
@@ -580,7 +580,7 @@ impl SearchState {
     /// How many near-equals of other kinds are fitted as well: none where the model is far off, and the order of
     /// what it lacks matters more than which of two comes first.
     fn near_equals(&self) -> usize {
-        if self.current.setup.noise.is_some() || self.misfit() < FAR { MORE } else { 0 }
+        if self.current.setup.noise.is_some() || self.misfit() < FAR_FROM_NOISE { MORE } else { 0 }
     }
 
     fn rescale(&mut self) {

@@ -91,13 +91,13 @@ impl Reduced {
 
     /// n ln(RSS/n + floor) + c k + surcharges + \[an even term is chosen\] · c_e, with k chosen optional
     /// terms. The floor keeps a noise-free record from paying for terms that only fix rounding.
-    fn criterion(&self, solution: &Solution, price: &Price<'_>) -> f64 {
+    fn criterion(&self, solution: &Solution, penalty: &Penalty<'_>) -> f64 {
         let n = self.samples;
-        let Roles { kept, even, surcharge, .. } = price.roles;
+        let Roles { kept, even, surcharge, .. } = penalty.roles;
         let chosen = solution.columns.iter().filter(|c| !kept.contains(c)).count();
         let broken = solution.columns.iter().any(|c| even.contains(c));
         n * (solution.rss / n + self.floor).max(1e-300).ln()
-            + price.term * chosen as f64
+            + penalty.term * chosen as f64
             + solution.columns.iter().filter_map(|c| surcharge.get(*c)).sum::<f64>()
             + if broken { BROKEN_SYMMETRY } else { 0.0 }
     }
@@ -113,14 +113,14 @@ impl Reduced {
             .collect()
     }
 
-    /// The choice of terms: first with Schwarz's price ln n a term, then halfway from there to the price
+    /// The choice of terms: first with Schwarz's penalty ln n a term, then halfway from there to the penalty
     /// that the sizes of the terms found imply,
     ///
     /// ```text
     /// c = ½ ln n + ½ ln(1 + t²) at the lower quartile of |t|,   within   2 ln q ≤ c ≤ ln n + ln q .
     /// ```
     ///
-    /// Schwarz's price takes one row's worth of information as prior, whatever the noise. ln(1 + t²) is what a
+    /// Schwarz's penalty takes one row's worth of information as prior, whatever the noise. ln(1 + t²) is what a
     /// normal prior as wide as the effects costs a coefficient (the empirical-Bayes g-prior of George & Foster,
     /// Biometrika 87, 2000; a quartile, because sizes spread over decades): where true terms stand a hundred
     /// standard errors clear of the noise, one at three is doubted; where they are barely visible, it is
@@ -131,8 +131,8 @@ impl Reduced {
         let schwarz = self.samples.ln();
         let looked_at = (roles.optional.len().max(2) as f64).ln();
         let (least, most) = (2.0 * looked_at, schwarz + looked_at);
-        let mut solution = self.search(&Price { roles, term: schwarz });
-        let mut price = schwarz;
+        let mut solution = self.search(&Penalty { roles, term: schwarz });
+        let mut penalty = schwarz;
         for _ in 0..4 {
             let mut sizes: Vec<f64> = self
                 .t_squared(&solution)
@@ -150,32 +150,32 @@ impl Reduced {
             let quartile = sizes[i] + w * (sizes[(i + 1).min(sizes.len() - 1)] - sizes[i]);
             let implied = (1.0 + quartile.exp()).ln();
             let middle = (0.5 * (implied + schwarz)).max(least).min(most);
-            if (middle - price).abs() < 1e-9 {
+            if (middle - penalty).abs() < 1e-9 {
                 break;
             }
-            price = middle;
-            solution = self.search(&Price { roles, term: price });
+            penalty = middle;
+            solution = self.search(&Penalty { roles, term: penalty });
         }
         solution
     }
 
     /// The best choice found by backward elimination followed by single additions, removals and
     /// exchanges until none improves the criterion; from all terms and from the odd ones alone.
-    fn search(&self, price: &Price<'_>) -> Solution {
-        let Roles { optional, even, .. } = price.roles;
+    fn search(&self, penalty: &Penalty<'_>) -> Solution {
+        let Roles { optional, even, .. } = penalty.roles;
         let odd: Vec<usize> = optional.iter().copied().filter(|c| !even.contains(c)).collect();
-        let all = self.search_from(optional, price);
+        let all = self.search_from(optional, penalty);
         if odd.len() == optional.len() {
             return all;
         }
-        let symmetric = self.search_from(&odd, price);
-        if self.criterion(&symmetric, price) <= self.criterion(&all, price) { symmetric } else { all }
+        let symmetric = self.search_from(&odd, penalty);
+        if self.criterion(&symmetric, penalty) <= self.criterion(&all, penalty) { symmetric } else { all }
     }
 
     /// Backward from `start`, then locally among all optional columns.
-    fn search_from(&self, start: &[usize], price: &Price<'_>) -> Solution {
-        let Roles { kept, optional: allowed, .. } = price.roles;
-        let value = |s: &Solution| self.criterion(s, price);
+    fn search_from(&self, start: &[usize], penalty: &Penalty<'_>) -> Solution {
+        let Roles { kept, optional: allowed, .. } = penalty.roles;
+        let value = |s: &Solution| self.criterion(s, penalty);
         let with = |columns: &mut Vec<usize>| {
             columns.sort_unstable();
             columns.dedup();
@@ -245,7 +245,7 @@ pub(crate) struct Roles {
     pub optional: Vec<usize>,
     /// Terms that keep their sign when all variables change theirs.
     pub even: Vec<usize>,
-    /// What a column costs beyond the price of a term.
+    /// What a column costs beyond the penalty of a term.
     pub surcharge: Vec<f64>,
 }
 
@@ -271,7 +271,7 @@ impl Roles {
 }
 
 /// What a choice costs.
-struct Price<'a> {
+struct Penalty<'a> {
     roles: &'a Roles,
     /// A term.
     term: f64,
@@ -303,7 +303,7 @@ mod tests {
 
     #[test]
     fn a_term_at_three_is_believed_among_its_likes_and_doubted_among_giants() {
-        // 40 000 rows: Schwarz's price is 10.6, so t = 2.9 alone would never do.
+        // 40 000 rows: Schwarz's penalty is 10.6, so t = 2.9 alone would never do.
         let chosen = |t: &[f64]| orthogonal(t, 40_000.0, 0.0).choose(&roles(t.len())).columns;
         assert_eq!(chosen(&[4.0, 3.9, 2.9, 0.3]), [0, 1, 2]);
         assert_eq!(chosen(&[900.0, 700.0, 800.0, 2.9]), [0, 1, 2]);
@@ -341,9 +341,9 @@ mod tests {
             samples: 1000.0,
             floor: 0.0,
         };
-        let price = |surcharge: Vec<f64>| Roles { surcharge, ..roles(2) };
-        assert_eq!(reduced.choose(&price(vec![0.0, 2.0])).columns, [0]);
-        assert_eq!(reduced.choose(&price(vec![2.0, 0.0])).columns, [1]);
+        let penalty = |surcharge: Vec<f64>| Roles { surcharge, ..roles(2) };
+        assert_eq!(reduced.choose(&penalty(vec![0.0, 2.0])).columns, [0]);
+        assert_eq!(reduced.choose(&penalty(vec![2.0, 0.0])).columns, [1]);
     }
 
     #[test]

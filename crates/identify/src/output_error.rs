@@ -363,7 +363,7 @@ fn block_grams(projected: &[Projected], np: usize, share: f64, blocks: usize) ->
 }
 
 impl Refined {
-    /// −2 ln likelihood with Schwarz's price for every parameter; smaller is better.
+    /// −2 ln likelihood with Schwarz's penalty for every parameter; smaller is better.
     pub(crate) fn score(&self) -> f64 {
         let data = &self.setup.data;
         let total: f64 = self.fit.count.iter().sum::<usize>() as f64;

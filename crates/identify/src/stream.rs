@@ -33,7 +33,7 @@ const SETTLED: f64 = 0.1;
 const HEAD: usize = 500;
 
 /// Independent samples that count in the choice of terms at most: what does not lower the mean square of the residual
-/// by the price of a term over so many is left out, however sure it is. With 10⁸ samples every model is wrong in
+/// by the penalty of a term over so many is left out, however sure it is. With 10⁸ samples every model is wrong in
 /// detail.
 const MOST: f64 = 1e6;
 

@@ -28,7 +28,7 @@ pub(super) struct Beside<'h> {
     /// How much the likelihood overstates what the samples tell.
     inflation: f64,
     /// ln N.
-    price: f64,
+    penalty: f64,
     /// Of the innovations, the sensitivities and the laws' effects, and the shapes.
     gram: Gram,
     /// The column of each law's effect, behind those of the parameters.
@@ -73,7 +73,7 @@ impl<'h> Beside<'h> {
             sizes.fold(f64::INFINITY, f64::min)
         };
         let shapes = groups.into_iter().map(|g| (width(&g), g)).collect();
-        Some(Beside { h, inflation, price: (candidates.max(1) as f64).ln(), gram, effects, shapes })
+        Some(Beside { h, inflation, penalty: (candidates.max(1) as f64).ln(), gram, effects, shapes })
     }
 
     /// The inner products with some laws left out, and with the priors of the parameters that stay.
@@ -115,14 +115,14 @@ impl<'h> Beside<'h> {
             let (gg, gr) = gram.projected(index);
             group.evidence(&gg, &gr, 1.0 / self.inflation, *width)
         });
-        let shapes = log_sum(&gains.collect::<Vec<_>>()) - self.price;
+        let shapes = log_sum(&gains.collect::<Vec<_>>()) - self.penalty;
         Some(shapes + self.laws(&gram, without) - self.laws(&self.without(&[]), &[]))
     }
 
     /// ln of the evidence of the laws that stay, up to what is the same for all of them.
     fn laws(&self, gram: &Gram, without: &[usize]) -> f64 {
         let stays = |a: usize| without.iter().all(|law| !self.h.own(*law).contains(&a));
-        self.h.integral(self.inflation, stays) + without.len() as f64 * self.price
+        self.h.integral(self.inflation, stays) + without.len() as f64 * self.penalty
             - 0.5 * gram.remaining() / self.inflation
     }
 }

@@ -6,8 +6,8 @@ use rayon::prelude::*;
 use super::compare::{by_likelihood, calibrated_rss};
 use super::fit::transfer;
 use super::{
-    BEST, FAR, FINALISTS, FIRST_STEPS, LAST_STEPS, LEAST_SHARE, MORE_STEPS, MOST_MECHANISMS, PAIR_SAMPLES,
-    PAIRS, PARSIMONY, SHORT_LIST, STARTS, Search, SearchState, UNDECIDED, limits,
+    BEST, FAR_FROM_NOISE, FINALISTS, FIRST_STEPS, LAST_STEPS, LEAST_SHARE, MORE_STEPS, MOST_MECHANISMS,
+    PAIR_SAMPLES, PAIRS, PARSIMONY, SHORT_LIST, STARTS, Search, SearchState, UNDECIDED, limits,
 };
 use crate::Stage;
 use crate::candidate::Candidate;
@@ -175,7 +175,7 @@ impl Search<'_> {
             let fitted = FittedModel { setup: stated.clone(), ..current.clone() };
             out.push(self.refit(&fitted, &state.scale, 10));
         }
-        if current.setup.noise.is_none() && current.misfit(&state.scale) > FAR {
+        if current.setup.noise.is_none() && current.misfit(&state.scale) > FAR_FROM_NOISE {
             let nominal = self.nominal.values();
             let moved = current.setup.free.iter().any(|f| {
                 let (was, is) = (nominal[f.index], current.fit.point.parameters[f.index]);
@@ -532,7 +532,8 @@ impl Search<'_> {
             // As good in every channel, or within what a likelihood can tell. Far above the noise each
             // parameter more must buy its share: there, any flexible law follows what another law lacks.
             let surplus = self.complexity(&a.1) - self.complexity(&b.1);
-            let slack = if a.1.misfit(scale) > FAR { SHARE_PER_PARAMETER * surplus } else { 0.0 }.max(0.02);
+            let slack = if a.1.misfit(scale) > FAR_FROM_NOISE { SHARE_PER_PARAMETER * surplus } else { 0.0 }
+                .max(0.02);
             let simpler = surplus > 0.0 && (near(slack) || a.2.score - b.2.score < PARSIMONY);
             let tie = self.complexity(&b.1) == self.complexity(&a.1)
                 && (near(0.005) || (likelihood && a.2.score - b.2.score < SAME_SCORE))
