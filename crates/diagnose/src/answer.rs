@@ -54,7 +54,7 @@ impl Answer {
             || {
                 rayon::join(
                     || alone.as_ref().map(|alone| (alone.limited, baseline_of(alone))),
-                    || has_parts.then(|| polish(&found.improved, &found.scale, judge)),
+                    || has_parts.then(|| polish(search, &found.improved, &found.scale, judge)),
                 )
             },
         );
@@ -67,7 +67,7 @@ impl Answer {
         if found.improved.parts.is_empty() && baseline.polished.fitted.misfit(&found.scale) > MISFIT {
             for rejected in std::mem::take(&mut found.rejected).into_iter().rev() {
                 found.improved = rejected;
-                let polished = polish(&found.improved, &found.scale, judge);
+                let polished = polish(search, &found.improved, &found.scale, judge);
                 let polished = defend(search, &mut found, polished, &baseline, judge, false);
                 if !polished.fitted.parts.is_empty() {
                     (named, proposed) = (false, Some(polished));
@@ -90,9 +90,17 @@ impl Answer {
             let scale = residual_scale(&polished.fitted, &found.scale);
             Judged::of(search, found, &polished.fitted, &scale, (&baseline.polished.fitted, named), library)
         };
+        let mut judged = judged_of(&found, &polished, &|_| named);
+        // What is not named is a proposal, and predicts what it was not fitted to, as any other.
+        if named && judged.verdict != Verdict::MissingPhysics {
+            let parts = polished.fitted.parts.len();
+            polished = defend(search, &mut found, polished, &baseline, judge, false);
+            if polished.fitted.parts.len() < parts {
+                judged = judged_of(&found, &polished, &|_| false);
+            }
+        }
         let scale = residual_scale(&polished.fitted, &found.scale);
         let scores = judge.scores(&polished.fitted.setup, &polished.fitted.fit.point.parameters, &scale);
-        let mut judged = judged_of(&found, &polished, &|_| named);
         // Where more than noise is left, every model of the machine errs, and output errors do not compare them.
         let errs = !leaves_noise(&scores, &polished.origin, &scale);
         let names = judged.verdict == Verdict::MissingPhysics;

@@ -103,7 +103,7 @@ impl Baseline {
         let own = residual_scale(fitted, &found.scale);
         let measured = Point { parameters: nominal.to_vec(), starts: setup.starts(&fitted.level, nominal) };
         let points = [fitted.fit.point.clone(), measured];
-        let mut polished = best_horizon(fitted, &points, &own, &found.scale, judge);
+        let mut polished = best_horizon(fitted, &points, &own, &found.scale, judge, &|_| true);
         // A fit to segments may simulate the whole worse than what it began with.
         if judge.misfit(setup, nominal, &own)
             < judge.misfit(setup, &polished.fitted.fit.point.parameters, &own)
@@ -168,13 +168,14 @@ pub(crate) fn leaves_noise(scores: &[Score], fitted: &FittedModel, scale: &[f64]
 }
 
 /// A model refitted at growing horizons from each of these points of its level: of all fits, and the model as it is, the
-/// one that is judged best.
+/// one that is judged best among those that are allowed.
 fn best_horizon(
     fitted: &FittedModel,
     points: &[Point],
     own: &[f64],
     scale: &[f64],
     judge: &Judge,
+    is_allowed: &(dyn Fn(&Point) -> bool + Sync),
 ) -> WholeRecordFit {
     let setup = &fitted.setup;
     let misfit = |point: &Point| judge.misfit(setup, &point.parameters, own);
@@ -186,7 +187,7 @@ fn best_horizon(
         rayon::join(|| misfit(&fitted.fit.point), || points.par_iter().map(grown).collect());
     let mut best = (as_it_is, None);
     for (quality, horizon) in grown.into_iter().flatten() {
-        if quality < best.0 {
+        if quality < best.0 && is_allowed(&horizon.fit.point) {
             best = (quality, Some(horizon));
         }
     }
@@ -194,7 +195,7 @@ fn best_horizon(
         Some(Horizon { level, mut fit }) => {
             if fit.ending == Ending::Limit {
                 let further = setup.fit(&level, own, std::slice::from_ref(&fit.point), FURTHER);
-                if misfit(&further.point) <= best.0 {
+                if misfit(&further.point) <= best.0 && is_allowed(&further.point) {
                     fit = further;
                 }
             }
@@ -204,8 +205,15 @@ fn best_horizon(
     }
 }
 
-/// The improved model refitted at growing horizons.
-pub(crate) fn polish(fitted: &FittedModel, scale: &[f64], judge: &Judge) -> WholeRecordFit {
+/// The improved model refitted at growing horizons, its laws as they are required to be.
+pub(crate) fn polish(
+    search: &Search<'_>,
+    fitted: &FittedModel,
+    scale: &[f64],
+    judge: &Judge,
+) -> WholeRecordFit {
     let own = residual_scale(fitted, scale);
-    best_horizon(fitted, std::slice::from_ref(&fitted.fit.point), &own, scale, judge)
+    let is_allowed =
+        |point: &Point| fitted.parts.iter().all(|p| search.allows(p, &fitted.setup, &point.parameters));
+    best_horizon(fitted, std::slice::from_ref(&fitted.fit.point), &own, scale, judge, &is_allowed)
 }

@@ -45,7 +45,7 @@ pub(crate) fn defend(
             .into_par_iter()
             .filter_map(|i| {
                 let smaller = search.smaller(&found.improved, i, &found.scale)?;
-                let polished = polish(&smaller, &found.scale, judge);
+                let polished = polish(search, &smaller, &found.scale, judge);
                 let scale = residual_scale(&polished.fitted, &found.scale);
                 let of = &polished.fitted;
                 let misfit = judge.misfit(&of.setup, &of.fit.point.parameters, &scale);
@@ -132,6 +132,10 @@ impl<'a> Gates<'a> {
         if let Some(part) = search.undetermined(&polished.origin, &widths) {
             return Failure::at(Gate::Determined, vec![part]);
         }
+        let parameters = &fitted.fit.point.parameters;
+        if let Some(part) = fitted.parts.iter().position(|p| !search.allows(p, &fitted.setup, parameters)) {
+            return Failure::at(Gate::Determined, vec![part]);
+        }
         if self.judge.criterion.misfit(&scores).total_cmp(&self.baseline.misfit).is_gt() {
             return Failure::at(Gate::Training, Vec::new());
         }
@@ -179,7 +183,7 @@ mod tests {
         };
         let gate = |model: FittedModel, baseline: &Baseline| {
             let gates = Gates::of_a_closure(&search, calibrated, baseline, &judge);
-            gates.failure(&polish(&model, scale, &judge), scale).map(|failure| failure.gate)
+            gates.failure(&polish(&search, &model, scale, &judge), scale).map(|failure| failure.gate)
         };
         let as_it_is = |model: FittedModel, baseline: &Baseline| {
             let gates = Gates::of_a_closure(&search, calibrated, baseline, &judge);
@@ -189,6 +193,9 @@ mod tests {
         assert_eq!(gate(law.clone(), &baseline()), None);
         assert_eq!(gate(with("step_disturbance", &[0.5, 10.0], 20), &baseline()), Some(Gate::Clock));
         assert_eq!(gate(with("cubic_damping", &[0.01], 20), &baseline()), Some(Gate::Determined));
+        // A static friction below that in motion.
+        let required = with("stribeck_friction", &[0.2, 0.1, 0.5], 0);
+        assert_eq!(as_it_is(required, &baseline()), Some(Gate::Determined));
         let closer = Baseline { misfit: f64::NEG_INFINITY, ..baseline() };
         assert_eq!(gate(law.clone(), &closer), Some(Gate::Training));
         let lenient = Baseline { misfit: f64::INFINITY, ..baseline() };
@@ -206,6 +213,15 @@ mod tests {
         // A calibrated model that predicts better.
         let folds = baseline().errors(&judge).len();
         let better = Baseline { errors: OnceCell::from(vec![-50.0; folds]), ..baseline() };
-        assert_eq!(gate(law, &better), Some(Gate::CrossValidation));
+        assert_eq!(gate(law.clone(), &better), Some(Gate::CrossValidation));
+        // What leaves no more than noise stays where a round named it, and goes where it is a proposal.
+        let stands = |named: bool| {
+            let mut found = Found { improved: law.clone(), ..nothing(&search) };
+            let polished = polish(&search, &law, scale, &judge);
+            let defended = defend(&search, &mut found, polished, &better, &judge, named);
+            assert_eq!(found.improved.parts.len(), defended.fitted.parts.len());
+            defended.fitted.parts.len()
+        };
+        assert_eq!((stands(true), stands(false)), (1, 0));
     }
 }

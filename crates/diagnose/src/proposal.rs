@@ -71,7 +71,7 @@ pub struct Correlated {
 pub enum Gate {
     /// No law acts at certain times of a single recording.
     Clock,
-    /// The recordings determine its coefficients.
+    /// The recordings determine its coefficients, and these are what its laws require of them.
     Determined,
     /// It simulates the training recordings no worse than the calibrated model.
     Training,
@@ -141,7 +141,7 @@ impl Proposal {
         let (ranges, outside) = ranges(&variables, train, held_out);
         let data = &improved.setup.data;
         let errors = calibrated.iter().copied().zip(own.iter().copied());
-        let folds = validate::folds(data).into_iter().zip(errors);
+        let folds = validate::judged(data).into_iter().zip(errors);
         let folds = folds.map(|(left_out, errors)| Fold::of(data, &left_out, errors));
         // (The changes of a shape's slope are no figures of their own.)
         let formulas = proposed.iter().filter(|part| library[part.candidate.mechanism].shape.is_none());

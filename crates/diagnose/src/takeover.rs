@@ -74,7 +74,7 @@ impl Closed {
         let mut found = found;
         loop {
             search.listener.stage(Stage::Simulating);
-            let polished = polish(&found.improved, &found.scale, judge);
+            let polished = polish(search, &found.improved, &found.scale, judge);
             let Some(failure) = gates.failure(&polished, &found.scale) else {
                 return Ok(Closed::new(found, polished, judge));
             };
@@ -154,7 +154,7 @@ pub(crate) fn explored(
         return None;
     }
     let mut adopted = adopt(search, found, likeliest, &posterior.beliefs)?;
-    let own = polish(&adopted.improved, &adopted.scale, judge);
+    let own = polish(search, &adopted.improved, &adopted.scale, judge);
     let own = defend(search, &mut adopted, own, baseline, judge, false);
     let (parts, standing) = (&own.fitted.parts, &polished.fitted.parts);
     let known = |part: &MechanismTerm| standing.iter().any(|p| p.candidate == part.candidate);
@@ -246,7 +246,7 @@ mod tests {
         let judge = Judge::of(&found.calibrated, &residual_scale(&found.calibrated, &found.scale));
         let baseline = Baseline::of(&found, &search.nominal().values(), &judge);
         let closure = search.closure(&found, &found.calibrated, &mut Visited::default()).unwrap();
-        let polished = polish(&closure.improved, &closure.scale, &judge);
+        let polished = polish(&search, &closure.improved, &closure.scale, &judge);
         let closed = Closed::new(closure, polished, &judge);
         assert!(closed.leaves_noise);
         for has_names in [false, true] {

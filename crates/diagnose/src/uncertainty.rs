@@ -38,6 +38,8 @@ pub(crate) struct Uncertainty {
     blocks: Estimated,
     /// Ratio of the second variance to the first from which the second counts.
     surplus: f64,
+    /// The parameters that change no sample and have no prior: nothing is known of them.
+    unseen: Vec<bool>,
 }
 
 /// A covariance and the degrees of freedom that it was estimated with.
@@ -70,6 +72,8 @@ struct Linearised<'a> {
     priors: Vec<f64>,
     /// Rows of H⁻¹.
     inverse: Vec<Vec<f64>>,
+    /// Whether H has nothing on the diagonal.
+    unseen: Vec<bool>,
 }
 
 impl Linearised<'_> {
@@ -82,7 +86,8 @@ impl Linearised<'_> {
         let at = &fitted.fit.point.parameters;
         let priors: Vec<f64> = setup.free.iter().map(|f| f.prior.precision(at[f.index])).collect();
         priors.iter().enumerate().for_each(|(i, prior)| h[i * np + i] += prior);
-        Linearised { fitted, segments, priors, inverse: inverse(&h, np) }
+        let unseen = (0..np).map(|i| h[i * np + i] == 0.0).collect();
+        Linearised { fitted, segments, priors, inverse: inverse(&h, np), unseen }
     }
 
     /// How many of these parameters the residual decides: their number less what their priors do (MacKay, *Bayesian
@@ -200,7 +205,7 @@ impl Uncertainty {
         let blocks = Estimated { covariance: model.covariance(&meat), freedom };
         let surplus =
             ChiSquared::new(freedom).map_or(1.0, |chi| chi.inverse_cdf(1.0 - CHANCE) / freedom).max(1.0);
-        Uncertainty { np, stationary, blocks, surplus }
+        Uncertainty { np, stationary, blocks, surplus, unseen: model.unseen.clone() }
     }
 
     /// tr(V⁻¹ S)/tr(V⁻¹ S₀) of the parameters θ at these positions among those that are free: S is the part of their covariance
@@ -248,8 +253,12 @@ impl Uncertainty {
         (0..t * t).map(|i| model.inverse[positions[i / t]][positions[i % t]]).collect()
     }
 
-    /// Half width of the 95 % interval of a figure with this gradient in the free parameters.
+    /// Half width of the 95 % interval of a figure with this gradient in the free parameters; infinite where it depends on one
+    /// that no sample shows.
     pub(crate) fn width(&self, gradient: &[f64]) -> f64 {
+        if self.unseen.iter().zip(gradient).any(|(unseen, g)| *unseen && *g != 0.0) {
+            return f64::INFINITY;
+        }
         let width = self.stationary.width(gradient);
         if self.blocks.variance(gradient) > self.surplus * self.stationary.variance(gradient) {
             width.max(self.blocks.width(gradient))
@@ -411,6 +420,23 @@ y = "b*f"
         let estimate = fitted.fit.point.parameters[0];
         let width = Uncertainty::of(&fitted, &[0.1]).widths()[0];
         (estimate, width, Uncertainty::inflation(&fitted, &[0.1], &[0]))
+    }
+
+    /// A dead zone wider than its input ever is changes no sample, and its prior says nothing: nothing is known of it.
+    #[test]
+    fn a_parameter_that_no_sample_shows_is_not_known() {
+        let text = LINE.replace("b = {", "gap = { value = 3.0 }\nb = {");
+        let text = text.replace("\"b*f\"", "\"b*f + deadzone(f, gap)\"");
+        let model = Model::from_toml(&text, "model.toml").unwrap();
+        let f: Vec<f64> = (0..200).map(sine).collect();
+        let y: Vec<f64> = f.iter().enumerate().map(|(k, f)| 2.0 * f + 0.1 * sine(7 * k as i32)).collect();
+        let mut fitted = fit(&model, &[("f", &f), ("y", &y)], &[3.0, 2.0]);
+        let gap = fitted.setup.free.iter().position(|f| f.index == 0).unwrap();
+        fitted.setup.free[gap].prior = greybox_calibrate::Prior::Flat;
+        let known = Uncertainty::of(&fitted, &[0.1]);
+        let widths = known.widths();
+        assert!(widths[gap].is_infinite() && (0.0..0.1).contains(&widths[1 - gap]), "{widths:?}");
+        assert!(known.width(&[0.0, 0.0]) == 0.0);
     }
 
     /// Share of 400 intervals of b that hold it.

@@ -6,6 +6,9 @@
 //! Athanasopoulos, *Forecasting: Principles and Practice*, section 5.10). The parameters are refitted without the fold, which
 //! is then simulated from a state estimated on its first quarter (Stone, *Cross-validatory choice and assessment of
 //! statistical predictions*, J. R. Stat. Soc. B 36, 1974; contiguous folds since neighbouring samples tell of each other).
+//!
+//! Two or three folds are too few to tell a gain from chance: Student's quantile of one degree of freedom is 6.3. Each is then
+//! judged in contiguous parts, so that two recordings say no less than the four blocks of a single one.
 
 use std::ops::Range;
 
@@ -60,8 +63,36 @@ pub(crate) fn folds(data: &Data) -> Vec<Fold> {
         .collect()
 }
 
-/// The mean over the channels of ln(RMS error / spread) on each fold, left out of the fit; infinite where the simulation
-/// diverges.
+/// What is judged of the training data: the folds, or their parts where there are fewer than a single recording has blocks.
+pub(crate) fn judged(data: &Data) -> Vec<Fold> {
+    let folds = folds(data);
+    let count = (FOLDS - 1).div_ceil(folds.len().max(1));
+    folds.iter().flat_map(|fold| parts(fold, count)).collect()
+}
+
+/// A fold in contiguous parts of as many samples each, none of them shorter than what is fitted.
+fn parts(fold: &Fold, count: usize) -> Vec<Fold> {
+    let total: usize = fold.iter().map(|(_, range)| range.len()).sum();
+    let count = count.min(total / SHORTEST).max(1);
+    let part = |k: usize| {
+        let wanted = k * total / count..(k + 1) * total / count;
+        let mut before = 0;
+        let mut part = Fold::new();
+        for (piece, range) in fold {
+            let from = wanted.start.clamp(before, before + range.len()) - before;
+            let to = wanted.end.clamp(before, before + range.len()) - before;
+            if to > from {
+                part.push((*piece, range.start + from..range.start + to));
+            }
+            before += range.len();
+        }
+        part
+    };
+    (0..count).map(part).collect()
+}
+
+/// The mean over the channels of ln(RMS error / spread) on each of the parts that are [judged], left out of the fit with the
+/// fold that it is of; infinite where the simulation diverges.
 pub(crate) fn errors(fitted: &FittedModel, scale: &[f64], criterion: Criterion, window: f64) -> Vec<f64> {
     let setup = &fitted.setup;
     let run = setup.free_run(&fitted.fit.point.parameters, scale);
@@ -69,9 +100,11 @@ pub(crate) fn errors(fitted: &FittedModel, scale: &[f64], criterion: Criterion, 
         Criterion::FreeRun => f64::INFINITY,
         Criterion::Windowed => window,
     };
-    folds(&setup.data)
+    let folds = folds(&setup.data);
+    let count = (FOLDS - 1).div_ceil(folds.len().max(1));
+    folds
         .par_iter()
-        .map(|fold| {
+        .flat_map_iter(|fold| {
             let level = without(setup, fold, longest(&fitted.level));
             let parameters = if level.segments.is_empty() || setup.free.is_empty() {
                 fitted.fit.point.parameters.clone()
@@ -79,28 +112,44 @@ pub(crate) fn errors(fitted: &FittedModel, scale: &[f64], criterion: Criterion, 
                 let point: Point = setup.stitch(&fitted.level, &fitted.fit.point, &level, scale);
                 setup.fit(&level, scale, &[point], REFIT).point.parameters
             };
-            let ny = setup.system.ny;
-            let (mut squares, mut counts) = (vec![0.0; ny], vec![0usize; ny]);
-            for (piece, range) in fold {
-                let y = setup.restarted(*piece, range.clone(), &run.x[*piece], &parameters, window);
-                for c in 0..ny {
-                    let measured = &setup.data.pieces[*piece].measured[c][range.clone()];
-                    for (m, s) in measured.iter().zip(&y[c * range.len()..(c + 1) * range.len()]) {
-                        if !m.is_nan() {
-                            squares[c] += (m - s).powi(2);
-                            counts[c] += 1;
-                        }
-                    }
-                }
-            }
-            let of = |c: usize| {
-                let mean = squares[c] / counts[c].max(1) as f64;
-                0.5 * (mean / setup.data.spread[c].powi(2)).max(f64::MIN_POSITIVE).ln()
-            };
-            let seen: Vec<usize> = (0..ny).filter(|&c| counts[c] > 0).collect();
-            seen.iter().map(|&c| of(c)).sum::<f64>() / seen.len().max(1) as f64
+            let simulated: Vec<(usize, Range<usize>, Vec<f64>)> = fold
+                .iter()
+                .map(|(piece, range)| {
+                    let y = setup.restarted(*piece, range.clone(), &run.x[*piece], &parameters, window);
+                    (*piece, range.clone(), y)
+                })
+                .collect();
+            parts(fold, count).into_iter().map(move |part| error(setup, &part, &simulated))
         })
         .collect()
+}
+
+/// The mean over the channels of ln(RMS error / spread) on a part of stretches that were simulated.
+fn error(setup: &Setup, part: &Fold, simulated: &[(usize, Range<usize>, Vec<f64>)]) -> f64 {
+    let ny = setup.system.ny;
+    let (mut squares, mut counts) = (vec![0.0; ny], vec![0usize; ny]);
+    for (piece, range) in part {
+        let holds = |s: &&(usize, Range<usize>, Vec<f64>)| {
+            s.0 == *piece && s.1.start <= range.start && range.end <= s.1.end
+        };
+        let Some((_, whole, y)) = simulated.iter().find(holds) else { continue };
+        let (from, n) = (range.start - whole.start, whole.len());
+        for c in 0..ny {
+            let measured = &setup.data.pieces[*piece].measured[c][range.clone()];
+            for (m, s) in measured.iter().zip(&y[c * n + from..c * n + from + range.len()]) {
+                if !m.is_nan() {
+                    squares[c] += (m - s).powi(2);
+                    counts[c] += 1;
+                }
+            }
+        }
+    }
+    let of = |c: usize| {
+        let mean = squares[c] / counts[c].max(1) as f64;
+        0.5 * (mean / setup.data.spread[c].powi(2)).max(f64::MIN_POSITIVE).ln()
+    };
+    let seen: Vec<usize> = (0..ny).filter(|&c| counts[c] > 0).collect();
+    seen.iter().map(|&c| of(c)).sum::<f64>() / seen.len().max(1) as f64
 }
 
 fn longest(level: &Segmentation) -> usize {
@@ -191,13 +240,16 @@ const CHANCE: f64 = 0.05;
 
 #[cfg(test)]
 mod tests {
+    use std::sync::Arc;
+
     use super::*;
     use greybox_model::Model;
     use greybox_recording::{Channel, Recording};
 
+    const LAG: &str = "[states]\nx = {}\n[parameters]\na = { value = 1, unit = \"1/s\" }\n[equations]\nlag = \"x' + a*x = 0\"\n";
+
     /// Recordings of so many samples each.
     fn data(samples: &[usize]) -> Data {
-        let model = "[states]\nx = {}\n[parameters]\na = { value = 1, unit = \"1/s\" }\n[equations]\nlag = \"x' + a*x = 0\"\n";
         let recording = |(i, &n): (usize, &usize)| {
             let values = (0..n).map(|k| (0.1 * k as f64).sin()).collect();
             let channel = Channel { name: "x".into(), unit: None, values };
@@ -205,7 +257,7 @@ mod tests {
             Recording::from_columns(&format!("{i}.csv"), time, vec![channel]).unwrap()
         };
         let recordings: Vec<Recording> = samples.iter().enumerate().map(recording).collect();
-        Data::new(&Model::from_toml(model, "lag.toml").unwrap(), &recordings).unwrap()
+        Data::new(&Model::from_toml(LAG, "lag.toml").unwrap(), &recordings).unwrap()
     }
 
     #[test]
@@ -224,6 +276,36 @@ mod tests {
         let many = folds(&data(&[30; 7]));
         assert_eq!(many.len(), FOLDS);
         assert_eq!(many[1], [(1, 0..30), (6, 0..30)]);
+    }
+
+    /// Two recordings are judged in four parts, as a single one is in four blocks; four and more as they are.
+    #[test]
+    fn few_recordings_are_judged_in_parts() {
+        assert_eq!(judged(&data(&[400, 40])), [[(0, 0..200)], [(0, 200..400)], [(1, 0..20)], [(1, 20..40)]]);
+        assert_eq!(judged(&data(&[400])), folds(&data(&[400])));
+        assert_eq!(judged(&data(&[30; 3])).len(), 6);
+        for many in [4, 7] {
+            assert_eq!(judged(&data(&vec![30; many])), folds(&data(&vec![30; many])));
+        }
+        // A part is never shorter than what is fitted.
+        assert_eq!(judged(&data(&[100, 12])), [[(0, 0..50)], [(0, 50..100)], [(1, 0..12)]]);
+        // Of several pieces by samples.
+        let fold: Fold = vec![(3, 10..20), (5, 0..30)];
+        assert_eq!(parts(&fold, 2), [vec![(3, 10..20), (5, 0..10)], vec![(5, 10..30)]]);
+    }
+
+    /// Errors of a fold's parts are those of its one simulation.
+    #[test]
+    fn a_part_is_judged_by_the_simulation_of_its_fold() {
+        let data = Arc::new(data(&[40]));
+        let model = Model::from_toml(LAG, "lag.toml").unwrap();
+        let setup = Setup::new(&model, data.clone(), Vec::new()).unwrap();
+        let measured = &data.pieces[0].measured[0];
+        let simulated: Vec<f64> = (0..40).map(|k| measured[k] + if k < 20 { 0.1 } else { 0.4 }).collect();
+        let whole = [(0, 0..40, simulated)];
+        let of = |range: Range<usize>| error(&setup, &vec![(0, range)], &whole) + data.spread[0].ln();
+        assert!((of(0..20) - 0.1f64.ln()).abs() < 1e-12 && (of(20..40) - 0.4f64.ln()).abs() < 1e-12);
+        assert!((of(0..40) - 0.5 * 0.085f64.ln()).abs() < 1e-12);
     }
 
     /// Four folds of a room's temperature gained by a constant alone, and not in another month: gains that are positive

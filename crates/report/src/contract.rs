@@ -323,7 +323,7 @@ pub struct ClosureRejected {
 pub enum Gate {
     /// No law acts at certain times of a single recording.
     Clock,
-    /// The recordings determine its coefficients.
+    /// The recordings determine its coefficients, and these are what its laws require of them.
     Determined,
     /// It simulates the training recordings no worse than the calibrated model.
     Training,

@@ -63,14 +63,16 @@ pub fn significant(value: f64, digits: usize) -> String {
 }
 
 /// A value with its 95 % interval: `0.115 ± 0.004` where the interval is symmetric about the value, else
-/// `0.115 (0.101 … 0.160)`, and the value alone where there is no interval.
+/// `0.115 (0.101 … 0.160)`, and the value alone where there is no interval. `0.115 (not determined)` where an end of the
+/// interval is not finite: the recordings say nothing of it.
 ///
 /// The half width keeps one significant digit, two where the first is 1 or 2; the value ends at the same
 /// decimal place (at most six significant digits).
 pub fn with_interval(value: f64, ci95: Option<Interval>) -> String {
-    let Some(ci) = ci95.filter(|ci| ci.low.is_finite() && ci.high.is_finite()) else {
-        return number(value);
-    };
+    let Some(ci) = ci95 else { return number(value) };
+    if !(ci.low.is_finite() && ci.high.is_finite()) {
+        return format!("{} (not determined)", number(value));
+    }
     let half = ci.half_width();
     if !value.is_finite() || half <= 0.0 {
         return number(value);
@@ -321,7 +323,8 @@ mod tests {
         assert_eq!(with_interval(-0.5, ci(-0.9, -0.1)), "−0.5 ± 0.4");
         assert_eq!(with_interval(2.0, ci(2.0 - 3e-9, 2.0 + 3e-9)), "2.00000 ± 3 × 10⁻⁹");
         assert_eq!(with_interval(2.0, ci(2.0, 2.0)), "2.00");
-        assert_eq!(with_interval(2.0, ci(f64::NAN, 2.1)), "2.00");
+        assert_eq!(with_interval(2.0, ci(f64::NAN, 2.1)), "2.00 (not determined)");
+        assert_eq!(with_interval(2.0, None), "2.00");
         assert_eq!(with_interval(f64::NAN, ci(1.0, 2.0)), "–");
         assert_eq!(with_interval(2.0, None), "2.00");
         assert_eq!(with_interval(1234.0, ci(1234.0 - 56.0, 1234.0 + 56.0)), "1234 ± 56");

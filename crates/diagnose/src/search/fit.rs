@@ -191,7 +191,7 @@ impl Search<'_> {
     }
 
     /// Whether a mechanism's requirements on its parameters hold at these values of the model's.
-    pub(super) fn allows(&self, part: &MechanismTerm, setup: &Setup, parameters: &[f64]) -> bool {
+    pub(crate) fn allows(&self, part: &MechanismTerm, setup: &Setup, parameters: &[f64]) -> bool {
         let mechanism = &self.library[part.candidate.mechanism];
         let value = |n: &str| {
             let i = mechanism.parameters().position(|p| p == n)?;

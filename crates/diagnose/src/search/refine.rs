@@ -268,18 +268,20 @@ impl Search<'_> {
         }
     }
 
-    /// Puts a law in the place of its refinement where the data do not show the refinement's parts, and the law fits
-    /// as well.
+    /// Puts a law in the place of its refinement where it fits as well. It begins with the refinement's parameters: from
+    /// elsewhere, as one alternative among many, it may not get there.
     pub(super) fn simplify(&self, state: &mut SearchState) {
         for index in 0..state.current.parts.len() {
             let MechanismTerm { candidate: refinement, instance, .. } = state.current.parts[index].clone();
             let mechanism = &self.library[refinement.mechanism];
-            if mechanism.refines.is_empty() || !self.is_undetermined(&state.current, index, &state.scale) {
+            if mechanism.refines.is_empty() {
                 continue;
             }
             let Some(simpler) = self.simpler(&state.current, index, &state.scale) else { continue };
             let over = self.weigh(&simpler, &state.current, &state.scale);
-            if over.score >= LEAST_SCORE {
+            // What the data do not show must earn its place as any mechanism; what they show, as any of two laws.
+            let undetermined = self.is_undetermined(&state.current, index, &state.scale);
+            if over.score >= if undetermined { LEAST_SCORE } else { PARSIMONY } {
                 continue;
             }
             let Some(base) = self.without(&simpler, index, &state.scale, 12) else { continue };
