@@ -56,10 +56,9 @@ fn main() -> Result<(), Box<dyn Error>> {
         }
         let phase = family.margins.map_or(f64::NAN, |m| m.phase.worst.to_degrees());
         println!(
-            "{name:10}  {} of {} other arms settle, worst after {:.3} s, error {:.2} counts, phase margin {phase:.1}°",
+            "{name:10}  {} of {} other arms settle; worst error {:.2} counts, phase margin {phase:.1}°",
             family.settled,
             family.members,
-            family.settling.worst,
             family.final_error.worst / COUNT
         );
     }

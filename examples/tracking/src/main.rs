@@ -20,16 +20,24 @@ fn friction(t: f64) -> Friction {
     Friction { viscous: 0.002 + DRIFT * t, coulomb: 0.05 + failed }
 }
 
-/// The drive over 600 s; after each sample the time, the estimate, its deviations and an alarm, if there is one.
-fn run(seed: u32) -> Result<Vec<(f64, Friction, Friction, Option<Change>)>, RecursiveError> {
+/// What is known after a sample.
+struct Known {
+    t: f64,
+    friction: Friction,
+    deviation: Friction,
+    change: Option<Change>,
+}
+
+/// The drive over 600 s.
+fn run(seed: u32) -> Result<Vec<Known>, RecursiveError> {
     let believed = [friction(0.0), Friction { viscous: 1e-3, coulomb: 0.03 }];
     let mut tracker = Tracker::new(DRIVE, 60.0, believed, MEMORY, 86_400.0)?;
     let (mut speed, mut torque, mut noise) = (60.0, 0.0, Noise(seed));
     let mut out = Vec::new();
     for sample in 0..30_000 {
         let t = DRIVE.step * f64::from(sample);
-        let alarm = tracker.update(speed + DRIVE.noise * noise.next(), torque);
-        out.push((t, tracker.friction(), tracker.deviation(), alarm));
+        let change = tracker.update(speed + DRIVE.noise * noise.next(), torque);
+        out.push(Known { t, friction: tracker.friction(), deviation: tracker.deviation(), change });
         // The speed control knows nothing of what changes.
         let wanted = 60.0 + 30.0 * (0.5 * t).sin() + 10.0 * (1.3 * t).sin();
         torque = 0.17 + 0.05 * (wanted - speed);
@@ -57,8 +65,8 @@ impl Noise {
 
 fn main() -> Result<(), RecursiveError> {
     println!("time   viscous, mN m s/rad     true   Coulomb, mN m    true");
-    for (sample, (t, found, deviation, alarm)) in run(7)?.into_iter().enumerate() {
-        if let Some(Change { direction, ago }) = alarm {
+    for (sample, Known { t, friction: found, deviation, change }) in run(7)?.into_iter().enumerate() {
+        if let Some(Change { direction, ago }) = change {
             println!("{t:.0} s: the friction torque went {direction:?}, {ago:.0} s ago");
         }
         if sample % 2500 == 2499 {
@@ -87,8 +95,7 @@ mod tests {
         let (mut lags, mut squares, mut errors) = (0.0, 0.0, 0.0);
         for seed in 0..20 {
             let out = run(seed).unwrap();
-            let alarms: Vec<(f64, Change)> =
-                out.iter().filter_map(|(t, .., alarm)| Some((*t, (*alarm)?))).collect();
+            let alarms: Vec<(f64, Change)> = out.iter().filter_map(|k| Some((k.t, k.change?))).collect();
             let [(t, change)] = alarms[..] else { panic!("{alarms:?}") };
             assert_eq!(change.direction, Direction::Up);
             assert!(
@@ -97,14 +104,14 @@ mod tests {
             );
 
             let settled = &out[7500..20_000];
-            for (t, found, deviation, _) in settled {
+            for Known { t, friction: found, deviation, .. } in settled {
                 let behind = friction(*t).viscous - found.viscous;
                 lags += behind / DRIFT / settled.len() as f64 / 20.0;
                 squares +=
                     ((behind - DRIFT * MEMORY) / deviation.viscous).powi(2) / settled.len() as f64 / 20.0;
             }
-            let (t, found, ..) = out[21_250];
-            errors += (found.coulomb - friction(t).coulomb).powi(2) / 20.0;
+            let later = &out[21_250];
+            errors += (later.friction.coulomb - friction(later.t).coulomb).powi(2) / 20.0;
         }
         // What drifts is followed one memory later, and scatters by half of the variance of what may move.
         assert!((0.75..1.35).contains(&(lags / MEMORY)), "{lags} s");
