@@ -115,11 +115,13 @@ mod tests {
         let model = Model::from_toml(ARM, "arm.toml").unwrap();
         let (law, output) = designed(&model).unwrap();
         let code = code(&law, &output).unwrap();
-        let point = |k: i32| vec![0.3 * f64::from(k), 0.5 - f64::from(k), 0.0, 0.4 * f64::from(k) - 0.5];
-        let points: Vec<Vec<f64>> = (0..6).map(point).collect();
+        // Within the limits, where the disturbance is taken off.
+        let point = |k: f64| vec![0.45 * k - 0.6, 0.5 - 0.3 * k, 0.2 * k, 0.4 * k - 0.5];
+        let points: Vec<Vec<f64>> = (0..6).map(|k| point(f64::from(k))).collect();
         for vector in code.law.vectors(&points).unwrap() {
-            let [theta, rate, _, r] = vector.arguments[..] else { panic!("{vector:?}") };
-            assert!((vector.outputs[0] - law.command(&[theta, rate], r)).abs() < 1e-12, "{vector:?}");
+            let [theta, rate, disturbance, r] = vector.arguments[..] else { panic!("{vector:?}") };
+            let wanted = law.command(&[theta, rate], r) - disturbance;
+            assert!(wanted.abs() < 11.0 && (vector.outputs[0] - wanted).abs() < 1e-12, "{vector:?}");
         }
         let text = code.code(Language::C99).unwrap();
         assert!(text.contains("double observer_step(observer_memory *memory, const double measured[1]"));
