@@ -300,6 +300,54 @@ fn output_feedback_gives_code_that_repeats_the_loop() {
     assert!(code == Some(2) && err.contains("--feedback output"), "{err}");
 }
 
+#[test]
+fn an_option_of_another_method_or_observer_is_refused() {
+    let folder = tempfile::tempdir().unwrap();
+    std::fs::write(folder.path().join("arm.toml"), MODEL).unwrap();
+    for (given, belongs) in [
+        ("--degree 6", "--method hjb"),
+        ("--bounded", "--method hjb"),
+        ("--lambda 20 --method hjb", "--method smc"),
+        ("--rate 20", "--method smc"),
+        ("--eta 3", "--method smc"),
+        ("--compensate-friction", "--method smc"),
+        ("--feedback output --bandwidth 30", "--observer eso"),
+        ("--feedback output --observer eso --disturbance 1", "--observer kalman"),
+    ] {
+        let given: Vec<&str> = given.split(' ').collect();
+        let (code, _, err) =
+            greybox(folder.path(), &[&["control", "arm.toml", "--out", "o"][..], &given].concat());
+        assert!(code == Some(2) && err.contains(&format!("add `{belongs}`")), "{given:?}: {err}");
+    }
+}
+
+/// A delay of the loop counts in its margins, and one beyond the delay margin leaves none.
+#[test]
+fn the_delay_of_the_loop_counts_in_the_margins() {
+    let folder = tempfile::tempdir().unwrap();
+    std::fs::write(folder.path().join("arm.toml"), MODEL).unwrap();
+    let margins = |delay: &str, out: &str| {
+        let settings = "--size theta=0.4 --size theta'=4 --input-size 5 --limit 10 --dt 0.002 --members 3 --feedback output --json";
+        let settings: Vec<&str> = settings.split(' ').chain(["--delay", delay, "--out", out]).collect();
+        let (code, text, err) = greybox(folder.path(), &[&["control", "arm.toml"][..], &settings].concat());
+        assert_eq!(code, Some(0), "{err}");
+        let report: serde_json::Value = serde_json::from_str(&text).unwrap();
+        let of = |at: &serde_json::Value| at["delay"].as_f64().unwrap();
+        let check = &report["checks"][0];
+        (
+            of(&check["margins"]),
+            of(&check["with_observer"]["margins"]),
+            of(&report["family"]["margins"]["delay"]["worst"].clone()),
+        )
+    };
+    let (state, output, _) = margins("0", "a");
+    let late = margins("0.004", "b");
+    assert!((state - late.0 - 0.004).abs() < 1e-9 && (output - late.1 - 0.004).abs() < 1e-9, "{late:?}");
+    let beyond = margins(&format!("{}", 1.5 * output), "c");
+    assert_eq!((beyond.1, beyond.2), (0.0, 0.0));
+    assert!(beyond.0 > 0.0, "{beyond:?}");
+}
+
 /// The code of an integral action at rest repeats the loop too: its memory is that of the simulated law.
 #[test]
 fn integral_action_at_rest_is_in_the_code() {

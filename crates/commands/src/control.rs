@@ -261,6 +261,7 @@ pub fn control(
         file: &loaded.file,
         controller: &controller,
         output: output.as_ref(),
+        delay: request.delay,
         run: &run,
         family: family.as_ref(),
     };

@@ -92,7 +92,7 @@ pub struct ClosedLoop<'a> {
     integration: Integration,
     delays: bool,
     pub(crate) output: Option<OutputFeedback>,
-    delay: f64,
+    pub(crate) delay: f64,
     seed: u64,
 }
 

@@ -308,7 +308,7 @@ impl Figures<'_> {
 }
 
 impl ClosedLoop<'_> {
-    /// The worst margins over the set points on the law's plant with these values of the loop's parameters.
+    /// The worst margins over the set points, with the loop's delay, on the law's plant with these values of the loop's parameters.
     fn margins_with(&self, parameters: &[f64]) -> Option<Margins> {
         let own = self.controller().plant();
         let value = |(name, value): &(String, f64)| {
@@ -317,8 +317,8 @@ impl ClosedLoop<'_> {
         let values: Vec<f64> = own.parameters().iter().map(value).collect();
         let plant = own.with_parameters(&values).ok()?;
         let all = match &self.output {
-            Some(output) => output.margins_with(self.controller(), &plant),
-            None => self.controller().margins_with(&plant),
+            Some(output) => output.margins_late(self.controller(), &plant, self.delay),
+            None => self.controller().margins_late(&plant, self.delay),
         };
         all.into_iter().reduce(|a, b| Some(a?.worse(b?)))?
     }

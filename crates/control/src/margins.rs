@@ -12,6 +12,9 @@ const POINTS: usize = 2000;
 const LOWEST: f64 = 1e-6;
 /// Halvings of an interval in which a border is crossed.
 const HALVINGS: usize = 50;
+/// Relative difference of L(1) and L at the lowest frequency up to which L(1) is a crossing: with an integrator in the loop
+/// there is none.
+const SETTLED: f64 = 1e-3;
 
 /// Margins of the loop L(z) cut at the command, z = e^{jω dt}: from the crossings of its frequency response (K. J.
 /// Åström and R. M. Murray, *Feedback Systems*, 2008, section 9.3). They belong to a loop that is stable.
@@ -109,15 +112,28 @@ impl OpenLoop {
         (sum.re.is_finite() && sum.im.is_finite()).then_some(-sum)
     }
 
-    /// [`Margins::NONE`] where the closed loop is unstable; none where a number is not finite.
-    pub(crate) fn margins_if_stable(&self, sizes: &[f64], dt: f64) -> Option<Margins> {
-        Some(if self.radius(sizes)? < 1.0 { self.margins(dt) } else { Margins::NONE })
+    /// [`Margins::NONE`] where the closed loop, with a further delay of `late` seconds, is unstable; none where a number is
+    /// not finite.
+    pub(crate) fn margins_if_stable(&self, sizes: &[f64], dt: f64, late: f64) -> Option<Margins> {
+        if self.radius(sizes)? >= 1.0 {
+            return Some(Margins::NONE);
+        }
+        let without = self.margins(dt, 0.0);
+        Some(match late {
+            0.0 => without,
+            late if late < without.delay => self.margins(dt, late),
+            _ => Margins::NONE,
+        })
     }
 
-    pub(crate) fn margins(&self, dt: f64) -> Margins {
+    /// Of L(e^{jω dt}) e^{−jω `late`}.
+    pub(crate) fn margins(&self, dt: f64, late: f64) -> Margins {
         let nyquist = std::f64::consts::PI / dt;
         let reduced = self.reduced();
-        let at = |omega: f64| reduced.response(Complex::from_polar(1.0, omega * dt));
+        let at = |omega: f64| {
+            let own = reduced.response(Complex::from_polar(1.0, omega * dt))?;
+            Some(own * Complex::from_polar(1.0, -omega * late))
+        };
         let omega = |k: usize| nyquist * LOWEST.powf(1.0 - k as f64 / (POINTS - 1) as f64);
         let mut margins = Margins {
             gain: f64::INFINITY,
@@ -126,6 +142,22 @@ impl OpenLoop {
             delay: f64::INFINITY,
             sensitivity: 0.0,
         };
+        let cross = |margins: &mut Margins, l: Complex<f64>| {
+            let factor = 1.0 / l.norm();
+            if factor >= 1.0 {
+                margins.gain = margins.gain.min(factor);
+            } else {
+                margins.lower_gain = margins.lower_gain.max(factor);
+            }
+        };
+        // At z = 1 L is real: where the plant alone is unstable, less gain may cross there.
+        if let (Some(still), Some(low)) = (at(0.0), at(omega(0)))
+            && still.re < 0.0
+            && (still - low).norm() <= SETTLED * low.norm()
+        {
+            cross(&mut margins, still);
+            margins.sensitivity = 1.0 / (still + 1.0).norm();
+        }
         let mut before: Option<(f64, Complex<f64>)> = None;
         for k in 0..POINTS {
             let omega = omega(k);
@@ -136,12 +168,7 @@ impl OpenLoop {
                     (value(l_low) * value(l) < 0.0).then(|| crossing((low, omega), &at, value)).flatten()
                 };
                 if let Some((_, l)) = crossed(&|l| l.im).filter(|(_, l)| l.re < 0.0) {
-                    let factor = 1.0 / l.norm();
-                    if factor >= 1.0 {
-                        margins.gain = margins.gain.min(factor);
-                    } else {
-                        margins.lower_gain = margins.lower_gain.max(factor);
-                    }
+                    cross(&mut margins, l);
                 }
                 if let Some((omega, l)) = crossed(&|l| l.norm() - 1.0) {
                     let lag = (l.arg() + std::f64::consts::PI).rem_euclid(std::f64::consts::TAU);
@@ -149,14 +176,9 @@ impl OpenLoop {
                     margins.delay = margins.delay.min(lag / omega);
                 }
             }
-            // At the Nyquist frequency L is real: a crossing of the axis lies at the end of the scan.
-            if k + 1 == POINTS && l.re < 0.0 {
-                let factor = 1.0 / l.norm();
-                if factor >= 1.0 {
-                    margins.gain = margins.gain.min(factor);
-                } else {
-                    margins.lower_gain = margins.lower_gain.max(factor);
-                }
+            // At the Nyquist frequency L is real, but for a delay: a crossing of the axis lies at the end of the scan.
+            if k + 1 == POINTS && l.re < 0.0 && late == 0.0 {
+                cross(&mut margins, l);
             }
             before = Some((omega, l));
         }
@@ -193,7 +215,7 @@ mod tests {
     fn an_integrator_has_the_margins_of_the_book() {
         let (dt, k): (f64, f64) = (0.01, 20.0);
         let open = OpenLoop { a: dmatrix![1.0], b: dmatrix![dt], c: dmatrix![-k] };
-        let m = open.margins(dt);
+        let m = open.margins(dt, 0.0);
         // |L| = 1 at 2 sin(θ/2) = k dt; the phase there is −π/2 − θ/2.
         let theta = 2.0 * (0.5 * k * dt).asin();
         let phase = 0.5 * std::f64::consts::PI - 0.5 * theta;
@@ -202,6 +224,38 @@ mod tests {
         // At the Nyquist frequency L = −k dt/2.
         assert!((m.gain - 2.0 / (k * dt)).abs() < 1e-6 && m.lower_gain == 0.0);
         assert!((m.sensitivity - 1.0 / (1.0 - 0.5 * k * dt)).abs() < 1e-6);
+    }
+
+    /// A further delay takes its phase, and its time off the delay margin; beyond that the loop is unstable.
+    #[test]
+    fn a_further_delay_takes_its_part_of_the_margins() {
+        let (dt, k): (f64, f64) = (0.01, 20.0);
+        let open = OpenLoop { a: dmatrix![1.0], b: dmatrix![dt], c: dmatrix![-k] };
+        let (own, late) = (open.margins(dt, 0.0), open.margins_if_stable(&[1.0], dt, 0.02).unwrap());
+        assert!((own.delay - late.delay - 0.02).abs() < 1e-9, "{own:?} {late:?}");
+        // |L| = 1 at the frequency where it was.
+        let omega = own.phase / own.delay;
+        assert!((own.phase - late.phase - 0.02 * omega).abs() < 1e-9);
+        assert!(late.gain < own.gain);
+        let beyond = open.margins_if_stable(&[1.0], dt, 1.001 * own.delay).unwrap();
+        assert_eq!(beyond, Margins::NONE);
+        // The same delay in whole samples, as states.
+        let two = dmatrix![1.0, 0.0, dt; 0.0, 0.0, 0.0; 0.0, 1.0, 0.0];
+        let states = OpenLoop { a: two, b: dmatrix![0.0; 1.0; 0.0], c: dmatrix![-k, 0.0, 0.0] };
+        let states = states.margins(dt, 0.0);
+        assert!((states.phase - late.phase).abs() < 1e-6 && (states.gain / late.gain - 1.0).abs() < 1e-6);
+    }
+
+    /// x′ − x = u, u = −k x: without feedback enough it runs away. L(1) = −k, whatever the sample time.
+    #[test]
+    fn an_unstable_plant_needs_a_least_gain() {
+        let (dt, k): (f64, f64) = (0.01, 2.5);
+        let open = OpenLoop { a: dmatrix![dt.exp()], b: dmatrix![dt.exp() - 1.0], c: dmatrix![-k] };
+        let m = open.margins(dt, 0.0);
+        assert!((m.lower_gain - 0.4).abs() < 1e-9, "{m:?}");
+        assert!((0.9..1.1).contains(&m.sensitivity) && m.gain > 50.0);
+        let least = |factor: f64| OpenLoop { c: &open.c * factor, ..open.clone() }.radius(&[1.0]).unwrap();
+        assert!(least(0.41) < 1.0 && least(0.39) > 1.0);
     }
 
     /// A loop in badly chosen units, with a late command (a subdiagonal of ones): its response is that of the plain solve.

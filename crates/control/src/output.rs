@@ -320,7 +320,7 @@ impl OutputFeedback {
             let dt = controller.dt();
             return Err(ControlError::UnstableOutput { set_point, dt, radius: spectral_radius });
         }
-        Ok(OutputCheck { set_point, spectral_radius, margins: open.margins(controller.dt()) })
+        Ok(OutputCheck { set_point, spectral_radius, margins: open.margins(controller.dt(), 0.0) })
     }
 
     /// Margins of law and observer, as they are, on another plant ([`Plant::with_parameters`]), in the order of the
@@ -329,12 +329,20 @@ impl OutputFeedback {
     /// not finite, or the plant has other states.
     #[must_use]
     pub fn margins_with(&self, controller: &Controller, plant: &Plant) -> Vec<Option<Margins>> {
+        self.margins_late(controller, plant, 0.0)
+    }
+
+    /// The same with a further delay of the loop, s, that neither law nor observer knows of ([`LoopOptions`]'s `delay`).
+    ///
+    /// [`LoopOptions`]: crate::LoopOptions
+    #[must_use]
+    pub fn margins_late(&self, controller: &Controller, plant: &Plant, late: f64) -> Vec<Option<Margins>> {
         let of = |check: &crate::check::Check| {
             if plant.symbols() != controller.plant().symbols() {
                 return None;
             }
             match self.open_loop(controller, plant, check.set_point, &check.equilibrium) {
-                Ok(open) => open.margins_if_stable(&vec![1.0; open.a.nrows()], controller.dt()),
+                Ok(open) => open.margins_if_stable(&vec![1.0; open.a.nrows()], controller.dt(), late),
                 Err(ControlError::LongDelay { .. }) => Some(Margins::NONE),
                 Err(_) => None,
             }
@@ -469,6 +477,12 @@ impl Controller {
     /// ```
     #[must_use]
     pub fn margins_with(&self, plant: &Plant) -> Vec<Option<Margins>> {
+        self.margins_late(plant, 0.0)
+    }
+
+    /// The same with a further delay of the loop, s, that the law does not know of.
+    #[must_use]
+    pub fn margins_late(&self, plant: &Plant, late: f64) -> Vec<Option<Margins>> {
         let of = |check: &crate::check::Check| {
             // A law of the state alone is none where the command is late.
             if plant.input_delay() > 0.0 || plant.symbols() != self.plant.symbols() {
@@ -479,7 +493,7 @@ impl Controller {
             let held = stability::held(&tangent, self.dt(), self.plant.sizes(), self.plant.input_size())?;
             let gain = self.frictionless_gain(&at.state, check.set_point);
             let c = DMatrix::from_row_slice(1, plant.order(), &gain);
-            OpenLoop { a: held.a, b: held.b, c }.margins_if_stable(self.plant.sizes(), self.dt())
+            OpenLoop { a: held.a, b: held.b, c }.margins_if_stable(self.plant.sizes(), self.dt(), late)
         };
         self.checks().iter().map(of).collect()
     }

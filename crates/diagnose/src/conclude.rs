@@ -269,7 +269,10 @@ fn what_remains(
         Some(variable) => Discrepancy { variable: Some((variable, left.gain)), ..left },
         None => left,
     });
-    let left = remainder(improved, discrepancy, significant, still);
+    let mut left = remainder(improved, discrepancy, significant, still);
+    // An equation of a law's own state is none of the machine.
+    let of_the_machine = &search.nominal().model.equations;
+    left.location.equations.retain(|name| of_the_machine.iter().any(|e| e.name == *name));
     Remainder { share_of_residual: (all + left.share_of_residual).min(1.0), ..left }
 }
 

@@ -167,9 +167,14 @@ impl Fold {
             (time(range.start), time(range.end))
         });
         let window = ends.reduce(|a, b| (a.0.min(b.0), a.1.max(b.1)));
+        let length =
+            |(piece, range): &(usize, std::ops::Range<usize>)| (data.pieces[*piece].recording, range.len());
+        let judged: usize = left_out.iter().map(|part| length(part).1).sum();
+        let of_it = left_out.first().map(|part| length(part).0);
+        let whole: usize = data.pieces.iter().filter(|p| Some(p.recording) == of_it).map(|p| p.len).sum();
         Fold {
+            window: window.filter(|_| recordings.len() == 1 && judged < whole),
             recordings,
-            window: window.filter(|_| data.recordings.len() == 1),
             calibrated: calibrated.exp(),
             improved: improved.exp(),
         }

@@ -159,10 +159,13 @@ fn a_memory_is_told_with_its_equation() {
     let candidate = found.candidates.iter().find(|c| c.kind == "maxwell_element").expect("a Maxwell element");
     assert_eq!(candidate.expression, "km*(x - z)");
     assert_eq!(candidate.states, [("z".to_owned(), "z' = wm*(x - z)".to_owned())]);
-    // Of two recordings each is predicted by the other.
+    // Of two recordings each is predicted by the other, and judged in halves.
     let proposal = found.proposal.unwrap();
-    assert_eq!(proposal.folds.len(), 2);
-    assert!(proposal.folds.iter().all(|fold| fold.window.is_none() && fold.improved < fold.calibrated));
+    let windows = proposal.folds.iter().map(|fold| fold.window.unwrap());
+    let wanted = [(0.0, 8.0), (8.0, 16.0), (0.0, 8.0), (8.0, 16.0)];
+    assert!(windows.zip(wanted).all(|(a, b)| (a.0 - b.0).abs() < 0.1 && (a.1 - b.1).abs() < 0.1));
+    assert_eq!(proposal.folds.len(), 4);
+    assert!(proposal.folds.iter().all(|fold| fold.improved < fold.calibrated));
 }
 
 #[test]

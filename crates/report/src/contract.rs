@@ -368,7 +368,7 @@ pub struct Range {
 pub struct Fold {
     /// File names of the recordings.
     pub recordings: Vec<String>,
-    /// The part that is left out, s from the start, of a single recording.
+    /// The part that is judged, s from the start, where it is not whole recordings.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub window_s: Option<Interval>,
     /// Of the calibrated model.

@@ -86,21 +86,21 @@ pub(crate) struct Arguments {
     )]
     hold: f64,
 
-    /// Degree of the value function (hjb)
-    #[arg(long, value_name = "EVEN", value_parser = even, default_value_t = 4, allow_negative_numbers = true)]
-    degree: u8,
+    /// Degree of the value function; 4 where none is given (hjb)
+    #[arg(long, value_name = "EVEN", value_parser = even, allow_negative_numbers = true)]
+    degree: Option<u8>,
 
     /// Hold the limits of the command by the cost, so that the law slows down in time; without this they clip it (hjb)
     #[arg(long)]
     bounded: bool,
 
-    /// Poles on the sliding surface are at −λ, 1/s (smc)
-    #[arg(long, value_name = "RATE", default_value_t = 10.0, allow_negative_numbers = true)]
-    lambda: f64,
+    /// Poles on the sliding surface are at −λ, 1/s; 10 where none is given (smc)
+    #[arg(long, value_name = "RATE", allow_negative_numbers = true)]
+    lambda: Option<f64>,
 
-    /// Pole towards the sliding surface, 1/s (smc)
-    #[arg(long, value_name = "RATE", default_value_t = 50.0, allow_negative_numbers = true)]
-    rate: f64,
+    /// Pole towards the sliding surface, 1/s; 50 where none is given (smc)
+    #[arg(long, value_name = "RATE", allow_negative_numbers = true)]
+    rate: Option<f64>,
 
     /// Reaching rate η in units of the command; ten input sizes where none is given (smc)
     #[arg(long, value_name = "VALUE", allow_negative_numbers = true)]
@@ -299,6 +299,41 @@ fn request(arguments: &Arguments) -> Result<Request, Failure> {
         ))
         .help("add `--feedback output`"));
     }
+    let of_a_method = [
+        ("--degree", Way::Hjb, arguments.degree.is_some()),
+        ("--bounded", Way::Hjb, arguments.bounded),
+        ("--lambda", Way::Smc, arguments.lambda.is_some()),
+        ("--rate", Way::Smc, arguments.rate.is_some()),
+        ("--eta", Way::Smc, arguments.eta.is_some()),
+        ("--compensate-friction", Way::Smc, arguments.compensate_friction),
+    ];
+    let name = |way: &dyn Fn() -> Option<clap::builder::PossibleValue>| {
+        way().map_or_else(String::new, |value| value.get_name().to_owned())
+    };
+    if let Some((option, method, _)) =
+        of_a_method.iter().find(|(_, method, given)| *given && *method != arguments.method)
+    {
+        let (own, other) =
+            (name(&|| arguments.method.to_possible_value()), name(&|| method.to_possible_value()));
+        return Err(Failure::input(format!(
+            "`{option}` belongs to `--method {other}`, and this law is `{own}`"
+        ))
+        .help(format!("leave it out, or add `--method {other}`")));
+    }
+    let of_an_observer = [
+        ("--disturbance", Observer::Kalman, arguments.disturbance.is_some()),
+        ("--bandwidth", Observer::Eso, arguments.bandwidth.is_some()),
+    ];
+    if let Some((option, observer, _)) =
+        of_an_observer.iter().find(|(_, observer, given)| *given && *observer != arguments.observer)
+    {
+        let (own, other) =
+            (name(&|| arguments.observer.to_possible_value()), name(&|| observer.to_possible_value()));
+        return Err(Failure::input(format!(
+            "`{option}` belongs to `--observer {other}`, and this observer is `{own}`"
+        ))
+        .help(format!("leave it out, or add `--observer {other}`")));
+    }
     Ok(Request {
         method: arguments.method.into(),
         input: arguments.input.clone(),
@@ -311,10 +346,10 @@ fn request(arguments: &Arguments) -> Result<Request, Failure> {
         limit: arguments.limit,
         dt: arguments.dt,
         hold: arguments.hold,
-        degree: arguments.degree,
+        degree: arguments.degree.unwrap_or(4),
         bounded: arguments.bounded,
-        lambda: arguments.lambda,
-        rate: arguments.rate,
+        lambda: arguments.lambda.unwrap_or(10.0),
+        rate: arguments.rate.unwrap_or(50.0),
         eta: arguments.eta,
         ignore_time_terms: arguments.ignore_time_terms,
         compensate_friction: arguments.compensate_friction,

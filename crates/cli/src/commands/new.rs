@@ -22,7 +22,7 @@ const TEMPLATES: [(&str, &str); 7] = [
     ("linear_axis", include_str!("../../templates/linear_axis.toml")),
 ];
 
-/// Write a commented model to start from: a servo, an axis, a pendulum, …
+/// Write a commented model to start from: a servo, a linear axis, a pendulum, …
 #[derive(Debug, Args)]
 #[command(after_help = "Examples:
   greybox new --list

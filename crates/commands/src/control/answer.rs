@@ -3,8 +3,8 @@
 use std::fmt::Write as _;
 
 use greybox_control::{
-    Controller, Integral, Margins, Method, Metrics, ObserverMethod, OutputFeedback, Plant, Pole, Run,
-    Tracking, TrackingError, observer,
+    Integral, Margins, Method, Metrics, ObserverMethod, OutputFeedback, Plant, Pole, Run, Tracking,
+    TrackingError, observer,
 };
 use greybox_report::{ControlPage, format, sentence};
 use serde_json::{Value, json};
@@ -34,7 +34,9 @@ pub(super) fn report(page: &ControlPage, designed: &Designed<'_>) -> Value {
             "sensitivity": m.sensitivity,
         })
     };
-    let full = controller.margins();
+    let full = controller.margins_late(plant, designed.delay);
+    let observed = output.map(|o| o.margins_late(controller, plant, designed.delay));
+    let observed = |k: usize| observed.as_ref()?.get(k)?.as_ref();
     let checks: Vec<Value> = controller
         .checks()
         .iter()
@@ -46,7 +48,7 @@ pub(super) fn report(page: &ControlPage, designed: &Designed<'_>) -> Value {
                 "poles": poles(&c.poles), "held_poles": poles(&c.held_poles), "spectral_radius": c.spectral_radius,
                 "stuck_poles": poles(&c.stuck_poles), "margins": full.get(k).and_then(Option::as_ref).map(margins),
                 "with_observer": output.and_then(|o| o.checks().get(k)).map(|c| json!({
-                    "spectral_radius": c.spectral_radius, "margins": margins(&c.margins),
+                    "spectral_radius": c.spectral_radius, "margins": observed(k).map(margins),
                 })),
             })
         })
@@ -136,13 +138,14 @@ fn metrics(m: &Metrics) -> Value {
     })
 }
 
-/// The worst margins over the set points, of the loop as it is fed back.
-fn worst_margins(controller: &Controller, output: Option<&OutputFeedback>) -> Option<Margins> {
-    let all: Vec<Margins> = match output {
-        Some(output) => output.checks().iter().map(|c| c.margins).collect(),
-        None => controller.margins().into_iter().flatten().collect(),
+/// The worst margins over the set points, of the loop as it is fed back, with its delay.
+fn worst_margins(designed: &Designed<'_>) -> Option<Margins> {
+    let Designed { controller, output, delay, .. } = *designed;
+    let all = match output {
+        Some(output) => output.margins_late(controller, controller.plant(), delay),
+        None => controller.margins_late(controller.plant(), delay),
     };
-    all.into_iter().reduce(Margins::worse)
+    all.into_iter().flatten().reduce(Margins::worse)
 }
 
 fn tracking_in_words(run: &Run, t: &Tracking) -> String {
@@ -216,8 +219,14 @@ pub(super) fn in_words(page: &ControlPage, designed: &Designed<'_>) -> String {
         };
         let _ = writeln!(text, "  {}; measured: {}{integral}", observer_in_words(output), sensors.join(", "));
     }
-    if let Some(m) = worst_margins(controller, output) {
-        let _ = writeln!(text, "  margins: {}", margins_in_words(&m));
+    match worst_margins(designed) {
+        Some(Margins::NONE) => {
+            let _ = writeln!(text, "  margins: none, the loop is unstable with the stated delay");
+        }
+        Some(m) => {
+            let _ = writeln!(text, "  margins: {}", margins_in_words(&m));
+        }
+        None => {}
     }
     if let Some(warning) = sentence::control::hunts(page) {
         let _ = writeln!(text, "  {warning}");

@@ -12,6 +12,8 @@ pub(super) struct Designed<'a> {
     pub(super) controller: &'a Controller,
     /// The observer, where the law is not given the full state.
     pub(super) output: Option<&'a OutputFeedback>,
+    /// Of the loop, beside the model's, s.
+    pub(super) delay: f64,
     pub(super) run: &'a Run,
     pub(super) family: Option<&'a Family>,
 }

@@ -67,8 +67,8 @@ pub fn page(sources: &ControlSources<'_>) -> ControlPage {
     };
     let pole = |p: &greybox_control::Pole| [p.re, p.im];
     let margins: Vec<Option<Margins>> = match sources.output {
-        Some(output) => output.checks().iter().map(|c| Some(c.margins)).collect(),
-        None => controller.margins(),
+        Some(output) => output.margins_late(controller, plant, sources.delay),
+        None => controller.margins_late(plant, sources.delay),
     };
     let set_points = controller.checks().iter().zip(margins).map(|(c, margins)| SetPoint {
         margins,
