@@ -91,18 +91,13 @@ impl Answer {
             Judged::of(search, found, &polished.fitted, &scale, (&baseline.polished.fitted, named), library)
         };
         let mut judged = judged_of(&found, &polished, &|_| named);
-        // What is not named is a proposal, and predicts what it was not fitted to, as any other.
-        if named && judged.verdict != Verdict::MissingPhysics {
-            let parts = polished.fitted.parts.len();
-            polished = defend(search, &mut found, polished, &baseline, judge, false);
-            if polished.fitted.parts.len() < parts {
-                judged = judged_of(&found, &polished, &|_| false);
-            }
-        }
-        let scale = residual_scale(&polished.fitted, &found.scale);
-        let scores = judge.scores(&polished.fitted.setup, &polished.fitted.fit.point.parameters, &scale);
         // Where more than noise is left, every model of the machine errs, and output errors do not compare them.
-        let errs = !leaves_noise(&scores, &polished.origin, &scale);
+        let leaves_more = |found: &Found, polished: &WholeRecordFit| {
+            let scale = residual_scale(&polished.fitted, &found.scale);
+            let parameters = &polished.fitted.fit.point.parameters;
+            !leaves_noise(&judge.scores(&polished.fitted.setup, parameters, &scale), &polished.origin, &scale)
+        };
+        let mut errs = leaves_more(&found, &polished);
         let names = judged.verdict == Verdict::MissingPhysics;
         let agreed: Vec<_> = match errs && names {
             true => polished.fitted.parts.iter().map(|p| named_as(p, library, &nominal.model)).collect(),
@@ -122,6 +117,15 @@ impl Answer {
         let unnamed = polished.fitted.parts.is_empty();
         if errs || judged.verdict == Verdict::Unexplained || unnamed && judged.left.significant(0) {
             let closed = Closed::of(search, &found, &polished, &baseline, judge);
+            // What is not named is a proposal, and predicts what it was not fitted to, as any other.
+            if named && judged.verdict != Verdict::MissingPhysics {
+                let parts = polished.fitted.parts.len();
+                polished = defend(search, &mut found, polished, &baseline, judge, false);
+                if polished.fitted.parts.len() < parts {
+                    judged = judged_of(&found, &polished, &|_| false);
+                    errs = leaves_more(&found, &polished);
+                }
+            }
             // What reaches the noise leaves no error of the model to be believed beside.
             if errs && !options.terms_only && !closed.as_ref().is_ok_and(|closed| closed.leaves_noise) {
                 let in_both =
