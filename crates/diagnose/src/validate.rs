@@ -66,8 +66,13 @@ pub(crate) fn folds(data: &Data) -> Vec<Fold> {
 /// What is judged of the training data: the folds, or their parts where there are fewer than a single recording has blocks.
 pub(crate) fn judged(data: &Data) -> Vec<Fold> {
     let folds = folds(data);
-    let count = (FOLDS - 1).div_ceil(folds.len().max(1));
+    let count = parts_each(&folds);
     folds.iter().flat_map(|fold| parts(fold, count)).collect()
+}
+
+/// Parts of each fold, so that there are no fewer than blocks of a single recording.
+fn parts_each(folds: &[Fold]) -> usize {
+    (FOLDS - 1).div_ceil(folds.len().max(1))
 }
 
 /// A fold in contiguous parts of as many samples each, none of them shorter than what is fitted.
@@ -101,7 +106,7 @@ pub(crate) fn errors(fitted: &FittedModel, scale: &[f64], criterion: Criterion, 
         Criterion::Windowed => window,
     };
     let folds = folds(&setup.data);
-    let count = (FOLDS - 1).div_ceil(folds.len().max(1));
+    let count = parts_each(&folds);
     folds
         .par_iter()
         .flat_map_iter(|fold| {

@@ -250,6 +250,16 @@ pub(crate) fn run(arguments: &Arguments) -> Result<Answer, Failure> {
     Ok(Answer::new(text, results.json))
 }
 
+/// An option that belongs to another method, or another observer, than the one that was chosen.
+fn of_another(option: &str, choice: &str, (other, own): (impl ValueEnum, impl ValueEnum)) -> Failure {
+    let name = |value: Option<clap::builder::PossibleValue>| {
+        value.map_or_else(String::new, |v| v.get_name().to_owned())
+    };
+    let (other, own) = (name(other.to_possible_value()), name(own.to_possible_value()));
+    Failure::input(format!("`{option}` belongs to `--{choice} {other}`, and `{own}` is chosen"))
+        .help(format!("leave it out, or add `--{choice} {other}`"))
+}
+
 fn request(arguments: &Arguments) -> Result<Request, Failure> {
     let named = |option: &str, what: &str, list: &[String]| -> Result<Vec<(String, f64)>, Failure> {
         let one = |text: &String| {
@@ -307,32 +317,15 @@ fn request(arguments: &Arguments) -> Result<Request, Failure> {
         ("--eta", Way::Smc, arguments.eta.is_some()),
         ("--compensate-friction", Way::Smc, arguments.compensate_friction),
     ];
-    let name = |way: &dyn Fn() -> Option<clap::builder::PossibleValue>| {
-        way().map_or_else(String::new, |value| value.get_name().to_owned())
-    };
-    if let Some((option, method, _)) =
-        of_a_method.iter().find(|(_, method, given)| *given && *method != arguments.method)
-    {
-        let (own, other) =
-            (name(&|| arguments.method.to_possible_value()), name(&|| method.to_possible_value()));
-        return Err(Failure::input(format!(
-            "`{option}` belongs to `--method {other}`, and this law is `{own}`"
-        ))
-        .help(format!("leave it out, or add `--method {other}`")));
+    if let Some((option, method, _)) = of_a_method.iter().find(|o| o.2 && o.1 != arguments.method) {
+        return Err(of_another(option, "method", (*method, arguments.method)));
     }
     let of_an_observer = [
         ("--disturbance", Observer::Kalman, arguments.disturbance.is_some()),
         ("--bandwidth", Observer::Eso, arguments.bandwidth.is_some()),
     ];
-    if let Some((option, observer, _)) =
-        of_an_observer.iter().find(|(_, observer, given)| *given && *observer != arguments.observer)
-    {
-        let (own, other) =
-            (name(&|| arguments.observer.to_possible_value()), name(&|| observer.to_possible_value()));
-        return Err(Failure::input(format!(
-            "`{option}` belongs to `--observer {other}`, and this observer is `{own}`"
-        ))
-        .help(format!("leave it out, or add `--observer {other}`")));
+    if let Some((option, observer, _)) = of_an_observer.iter().find(|o| o.2 && o.1 != arguments.observer) {
+        return Err(of_another(option, "observer", (*observer, arguments.observer)));
     }
     Ok(Request {
         method: arguments.method.into(),
