@@ -10,6 +10,7 @@
 
 use std::fmt::Write as _;
 use std::fs;
+use std::io::{BufRead as _, BufReader};
 use std::path::Path;
 use std::process::{Command, Stdio};
 use std::thread;
@@ -233,24 +234,26 @@ fn every_bad_input_is_answered_as_before() {
     });
 }
 
-/// Killed while it works: nothing is there, and the same command runs.
+/// Killed while it works, at the first step that it logs: nothing is there, and the same command runs.
 #[test]
 fn a_run_that_is_killed_leaves_nothing_and_runs_again() {
     let bench = bench();
-    bench.write("run.csv", &recording(4000, 0.0));
+    bench.write("run.csv", &recording(40_000, 0.0));
     let before = tree(&bench.path(""));
     let arguments = ["diagnose", "model.toml", "run.csv", "--out", "out"];
     let mut child = Command::new(env!("CARGO_BIN_EXE_greybox"))
         .current_dir(bench.path(""))
         .args(arguments)
+        .arg("--log")
         .stdout(Stdio::null())
-        .stderr(Stdio::null())
+        .stderr(Stdio::piped())
         .spawn()
         .unwrap();
-    thread::sleep(Duration::from_millis(300));
-    assert!(child.try_wait().unwrap().is_none(), "it ended before it could be killed");
+    let mut step = String::new();
+    BufReader::new(child.stderr.take().unwrap()).read_line(&mut step).unwrap();
+    assert!(!step.is_empty(), "it ended without a step");
     child.kill().unwrap();
-    child.wait().unwrap();
+    assert!(!child.wait().unwrap().success(), "it ended before it could be killed");
     assert_eq!(tree(&bench.path("")), before);
     let again = bench.greybox(&[&arguments[..], &["--work", "1"]].concat());
     assert_eq!(again.code, 0, "{}", again.stderr);
