@@ -2,9 +2,10 @@
 //!
 //! Each equation has a coordinate of its own (matched through the mass matrix). Beyond that, every
 //! parameter p whose derivative of the equations is rank one, ∂(equations)/∂p = w·g with constant w
-//! and g linear in the coordinates (or rates), shows an element of the machine: a spring or a damper
+//! and g affine in the coordinates (or rates), shows an element of the machine: a spring or a damper
 //! that acts on the motion d = g with the weights w on the equations, so that action equals reaction.
-//! A missing force F(d, d') at that element enters equation e as w_e F.
+//! What stands in g beside the coordinates is a reference: the ambient temperature of a heat loss, the
+//! road under a tire. A missing force F(d, d') at that element enters equation e as w_e F.
 //!
 //! The other places: an equation as a whole, an input, a measurement, a parameter (that may drift), a
 //! spring (a parameter k whose element is a position, so that its term is w k d), a pair of coordinates
@@ -12,7 +13,7 @@
 
 use greybox_model::{Dimension, Expr, Model};
 
-use crate::library::Domain;
+use crate::library::{Domain, arbitrary};
 
 /// A place of the model.
 #[derive(Debug, Clone, PartialEq)]
@@ -234,8 +235,8 @@ pub fn own_coordinates(model: &Model) -> Vec<Option<usize>> {
 pub fn places(model: &Model) -> Vec<Place> {
     let n = model.states.len();
     let mut motions: Vec<Motion> = Vec::new();
-    let mut add = |weights: Vec<f64>, coefficients: Vec<f64>| {
-        if let Some(motion) = motion(model, weights, coefficients)
+    let mut add = |motion: Option<Motion>| {
+        if let Some(motion) = motion
             && !motions.iter().any(|m| same(m, &motion))
         {
             motions.push(motion);
@@ -251,7 +252,7 @@ pub fn places(model: &Model) -> Vec<Place> {
         own_coordinates(model).into_iter().enumerate().filter_map(|(e, own)| own.map(|j| (e, j))).collect();
     for &(e, j) in &own {
         let (w, c) = alone(e, j);
-        add(w, c);
+        add(motion(model, w, c));
     }
     let mut springs = Vec::new();
     for (index, parameter) in model.parameters.iter().enumerate() {
@@ -265,13 +266,12 @@ pub fn places(model: &Model) -> Vec<Place> {
                         parameter: index,
                         factor: element.factor,
                         level: element.level,
-                        alone: element.alone,
+                        alone: element.reference == Reference::None,
                     });
                 }
             }
-            if element.alone {
-                add(element.weights, element.coefficients);
-            }
+            let motion = motion(model, element.weights, element.coefficients);
+            add(motion.and_then(|m| m.about(model, element.reference, element.level)));
         }
     }
     let mut out: Vec<Place> = motions.into_iter().map(Place::Motion).collect();
@@ -363,8 +363,15 @@ fn same(a: &Motion, b: &Motion) -> bool {
     let close = |x: &[f64], y: &[f64]| x.iter().zip(y).all(|(x, y)| (x - y).abs() < 1e-9);
     let flipped: Vec<f64> = b.coefficients.iter().map(|c| -c).collect();
     let against: Vec<f64> = b.weights.iter().map(|c| -c).collect();
-    (close(&a.coefficients, &b.coefficients) && close(&a.weights, &b.weights))
-        || (close(&a.coefficients, &flipped) && close(&a.weights, &against))
+    let about = |sign: f64| {
+        let pairs = [(&a.position, &b.position), (&a.rate, &b.rate)];
+        pairs.into_iter().all(|(a, b)| match (a, b) {
+            (Some(a), Some(b)) => agree(a, &(Expr::Num(sign) * b.clone())),
+            (a, b) => a.is_none() && b.is_none(),
+        })
+    };
+    (close(&a.coefficients, &b.coefficients) && close(&a.weights, &b.weights) && about(1.0))
+        || (close(&a.coefficients, &flipped) && close(&a.weights, &against) && about(-1.0))
 }
 
 /// An element of the machine behind a parameter p: its term in equation e is `factor`·w_e·p·(g + rest).
@@ -374,31 +381,43 @@ struct Element {
     factor: f64,
     /// Primes of the states in g.
     level: u8,
-    /// Nothing but states in it (no reference that a feedback compares with).
-    alone: bool,
+    reference: Reference,
+}
+
+/// What stands beside the states in the motion of an element.
+#[derive(Debug, Clone, PartialEq)]
+enum Reference {
+    /// Nothing.
+    None,
+    /// What is added to the motion: −Ta in T − Ta.
+    Of(Expr),
+    /// Not the same in all equations.
+    Several,
 }
 
 /// The element behind a parameter, if it is one.
 fn rank_one(model: &Model, parameter: &str) -> Option<Element> {
     let n = model.states.len();
-    let mut rows: Vec<Option<(u8, Vec<f64>)>> = Vec::new();
-    let mut alone = true;
+    let mut rows: Vec<Option<(u8, Vec<f64>, Expr)>> = Vec::new();
     for equation in &model.equations {
         let g = equation.residual().derivative(parameter, 0).simplify();
         if g == Expr::Num(0.0) {
             rows.push(None);
             continue;
         }
-        let (level, form, pure) = linear_form(model, &g)?;
-        alone &= pure;
-        rows.push(Some((level, form)));
+        rows.push(Some(affine_form(model, &g)?));
     }
-    let (level, form) = rows.iter().flatten().next()?.clone();
+    let (level, form, rest) = rows.iter().flatten().next()?.clone();
     let lead = form.iter().copied().find(|c| *c != 0.0)?;
     let coefficients: Vec<f64> = form.iter().map(|c| c / lead).collect();
+    let beside = |rest: &Expr, w: f64| (Expr::Num(1.0 / w) * rest.clone()).simplify();
+    let mut reference = match beside(&rest, lead) {
+        Expr::Num(0.0) => Reference::None,
+        other => Reference::Of(other),
+    };
     let mut weights = vec![0.0; n];
     for (e, row) in rows.iter().enumerate() {
-        if let Some((l, form)) = row {
+        if let Some((l, form, rest)) = row {
             if *l != level {
                 return None;
             }
@@ -408,6 +427,14 @@ fn rank_one(model: &Model, parameter: &str) -> Option<Element> {
                 return None;
             }
             weights[e] = w;
+            let is_same = match &reference {
+                Reference::None => rest.simplify() == Expr::Num(0.0),
+                Reference::Of(one) => agree(one, &beside(rest, w)),
+                Reference::Several => true,
+            };
+            if !is_same {
+                reference = Reference::Several;
+            }
         }
     }
     // A parameter of the inertia is no place for a force.
@@ -417,27 +444,70 @@ fn rank_one(model: &Model, parameter: &str) -> Option<Element> {
     // Force per unit weight: make the largest weight one, so that F is the force itself.
     let factor = weights.iter().fold(0.0f64, |m, w| m.max(w.abs()));
     let weights = weights.iter().map(|w| w / factor).collect();
-    Some(Element { weights, coefficients, factor, level, alone })
+    Some(Element { weights, coefficients, factor, level, reference })
 }
 
-/// `g` as a linear form with constant coefficients in the states' derivatives of one common level, and
-/// whether nothing stands beside them.
-fn linear_form(model: &Model, g: &Expr) -> Option<(u8, Vec<f64>, bool)> {
+/// Whether two expressions have the same value, at a few arbitrary points.
+fn agree(a: &Expr, b: &Expr) -> bool {
+    (0..4).all(|point| {
+        let of = |e: &Expr| e.eval(&|name, primes| Some(arbitrary(point, name, primes)));
+        of(a).zip(of(b)).is_some_and(|(a, b)| (a - b).abs() <= 1e-9 * a.abs().max(b.abs()))
+    })
+}
+
+/// `g` as an affine form: constant coefficients in the states' derivatives of one common level, and what
+/// stands beside them, without states.
+fn affine_form(model: &Model, g: &Expr) -> Option<(u8, Vec<f64>, Expr)> {
     for level in 0..2u8 {
         let symbols: Vec<(&str, u8)> = model.states.iter().map(|s| (s.name.as_str(), level)).collect();
         if let Some((coefficients, rest)) = g.affine_in(&symbols)
             && !rest.variables().iter().any(|(n, _)| model.state(n).is_some())
         {
-            let pure = rest.simplify() == Expr::Num(0.0);
             let numbers: Option<Vec<f64>> = coefficients.iter().map(|c| c.simplify().constant()).collect();
             if let Some(numbers) = numbers
                 && numbers.iter().any(|c| *c != 0.0)
             {
-                return Some((level, numbers, pure));
+                return Some((level, numbers, rest));
             }
         }
     }
     None
+}
+
+impl Motion {
+    /// The motion about a reference that stands beside its states at this level. A force may depend on what of it is known:
+    /// the derivative of a reference that moves is not.
+    fn about(self, model: &Model, reference: Reference, level: u8) -> Option<Motion> {
+        let reference = match reference {
+            Reference::None => return Some(self),
+            Reference::Of(reference) => reference,
+            Reference::Several => return None,
+        };
+        let beside = |d: Option<Expr>| d.map(|d| (d + reference.clone()).simplify());
+        let moves =
+            reference.variables().iter().any(|(name, _)| &**name == "t" || model.input(name).is_some());
+        let still = |d: Option<Expr>| d.filter(|_| !moves);
+        // (A first-order velocity stands at level 0, and is the rate of its motion.)
+        let is_rate = self.position.is_none();
+        match (level, is_rate) {
+            (0, false) => Some(Motion {
+                position: beside(self.position),
+                rate: still(self.rate),
+                acceleration: still(self.acceleration),
+                ..self
+            }),
+            (0, true) => {
+                Some(Motion { rate: beside(self.rate), acceleration: still(self.acceleration), ..self })
+            }
+            // Where a second-order motion is relative to a speed, its position is not known.
+            _ => Some(Motion {
+                position: None,
+                rate: beside(self.rate),
+                acceleration: still(self.acceleration),
+                ..self
+            }),
+        }
+    }
 }
 
 /// The expressions of a motion. A first-order state whose unit is a velocity (m/s, 1/s) is the rate of
@@ -552,5 +622,61 @@ mod tests {
             .collect();
         let bare = Model::from_toml(&bare, "bare.toml").unwrap();
         assert!((0..6).all(|e| Place::Equation(e).admits(Some(Domain::Mechanical), &bare)));
+    }
+    /// The motions of a model beside those of its own coordinates: position, rate, acceleration.
+    fn elements(model: &str) -> Vec<[Option<String>; 3]> {
+        let model = Model::from_toml(model, "model.toml").unwrap();
+        let text = |e: &Option<Expr>| e.as_ref().map(|e| e.to_string());
+        let of = |place: Place| match place {
+            Place::Motion(m) => Some([text(&m.position), text(&m.rate), text(&m.acceleration)]),
+            _ => None,
+        };
+        places(&model).into_iter().filter_map(of).skip(model.states.len()).collect()
+    }
+
+    #[test]
+    fn an_element_moves_about_its_reference() {
+        let known = |names: [&str; 3]| names.map(|n| (!n.is_empty()).then(|| n.to_owned()));
+        // A loss to the room, whose temperature is a parameter or measured.
+        let heater = |room: &str| {
+            elements(&format!(
+                "{room}[states]\nT = {{ unit = \"degC\" }}\n[equations]\nblock = \"C*T' + h*(T - Ta) = 0\"\n"
+            ))
+        };
+        let parameters =
+            "[parameters]\nC = { value = 80, unit = \"J/K\" }\nh = { value = 0.3, unit = \"W/K\" }\n";
+        let constant = format!("{parameters}Ta = {{ value = 22, unit = \"degC\" }}\n");
+        let measured = format!("[inputs]\nTa = {{ unit = \"degC\" }}\n{parameters}");
+        for room in [constant, measured] {
+            assert_eq!(heater(&room), [known(["T - Ta", "", ""])]);
+        }
+        // A tire on a road that moves: how fast, the model does not know. A hanger that stands is no such reference.
+        let mass = |reference: &str| {
+            elements(&format!(
+                "{reference}[states]\nx = {{}}\n[parameters]\nm = {{ value = 1 }}\nk = {{ value = 100 }}\n[equations]\nbody = \"m*x'' + k*(x - r) = 0\"\n"
+            ))
+        };
+        assert_eq!(mass("[inputs]\nr = {}\n"), [known(["x - r", "", ""])]);
+        let hanger = elements(
+            "[states]\nx = {}\n[parameters]\nm = { value = 1 }\nk = { value = 100 }\nx0 = { value = 0.1 }\n[equations]\nbody = \"m*x'' + 2*k*(x0 - x) = 0\"\n",
+        );
+        assert_eq!(hanger, [known(["x - x0", "x'", "x''"])]);
+        // A slider on a belt.
+        let belt = elements(
+            "[inputs]\nv = {}\n[states]\nx = {}\n[parameters]\nm = { value = 1 }\nb = { value = 2 }\n[equations]\nbody = \"m*x'' + b*(x' - v) = 0\"\n",
+        );
+        assert_eq!(belt, [known(["", "x' - v", ""])]);
+        let cart = elements(
+            "[inputs]\nwind = { unit = \"m/s\" }\n[states]\nv = { unit = \"m/s\" }\n[parameters]\nm = { value = 1, unit = \"kg\" }\nb = { value = 2, unit = \"N s/m\" }\n[equations]\nbody = \"m*v' + b*(v - wind) = 0\"\n",
+        );
+        assert_eq!(cart, [known(["", "v - wind", ""])]);
+        // Between two bodies the same in both equations, or no element.
+        let pair = |second: &str| {
+            elements(&format!(
+                "[states]\nx = {{}}\ny = {{}}\n[parameters]\nk = {{ value = 100 }}\nl = {{ value = 0.1 }}\n[equations]\none = \"x'' + k*(x - y - l) = 0\"\nother = \"y'' - k*(x - y - {second}) = 0\"\n"
+            ))
+        };
+        assert_eq!(pair("l"), [known(["x - y - l", "x' - y'", "x'' - y''"])]);
+        assert!(pair("2*l").is_empty());
     }
 }
