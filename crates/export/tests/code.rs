@@ -327,12 +327,10 @@ fn an_observer_starts_at_a_machine_at_rest() {
             println!("skipped: no C compiler here");
             continue;
         }
-        let main = format!(
-            "#include \"observer.c\"\n#include <math.h>\n#include <stdio.h>\nint main(void)\n{{\n    static const double y[2] = {{2.0, 2.0}}, \
-             none[2] = {{NAN, 2.0}}, r[1] = {{2.0}};\n    observer_memory m;\n    const int found = observer_start_at(&m, y, 0.7);\n    \
+        let main = "#include \"observer.c\"\n#include <math.h>\n#include <stdio.h>\nint main(void)\n{\n    static const double y[2] = {2.0, 2.0}, \
+             none[2] = {NAN, 2.0}, r[1] = {2.0};\n    observer_memory m;\n    const int found = observer_start_at(&m, y, 0.7);\n    \
              printf(\"%d %g \", found, found ? observer_step(&m, y, r) : 0.0);\n    printf(\"%d \", observer_start_at(&m, none, 0.7));\n    \
-             printf(\"%d \", observer_start_at(&m, y, INFINITY));\n    return 0;\n}}\n"
-        );
+             printf(\"%d \", observer_start_at(&m, y, INFINITY));\n    return 0;\n}\n";
         std::fs::write(path("law.c"), law.code(Language::C99).unwrap()).unwrap();
         std::fs::write(path("observer.c"), code.code(Language::C99).unwrap()).unwrap();
         std::fs::write(path("main.c"), main).unwrap();
