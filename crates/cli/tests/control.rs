@@ -292,7 +292,7 @@ fn output_feedback_gives_code_that_repeats_the_loop() {
                 && html.contains("What is measured")
         );
         assert!(!html.contains("There is no integral action"));
-        repeats(&folder.path().join(&place), &read("observer_vectors.csv"));
+        repeats(&folder.path().join(&place), &read("observer_vectors.csv"), None);
     }
     // What belongs to an observer is not for the full state.
     let more = ["--noise", "theta=0.1", "--out", "o"];
@@ -377,7 +377,7 @@ fn integral_action_at_rest_is_in_the_code() {
         let html = read("report.html");
         assert!(html.contains("its integral action is the error of a machine at rest"), "{place}");
         assert!(read("observer.c").contains("memory->offset"));
-        repeats(&folder.path().join(&place), &read("observer_vectors.csv"));
+        repeats(&folder.path().join(&place), &read("observer_vectors.csv"), None);
     }
     for other in [&["--feedback", "output", "--no-integral"][..], &[]] {
         let all = [&["control", "arm.toml", "--integral-at-rest", "--out", "o"], other].concat();
@@ -386,8 +386,9 @@ fn integral_action_at_rest_is_in_the_code() {
     }
 }
 
-/// Runs the observer's code over the measurements, in C and in Rust.
-fn repeats(folder: &Path, vectors: &str) {
+/// Runs the observer's code over the measurements, in C and in Rust; it starts at the first of them where a command is held, or
+/// at zero.
+fn repeats(folder: &Path, vectors: &str, held: Option<f64>) {
     let rows: Vec<Vec<f64>> =
         vectors.lines().skip(1).map(|line| line.split(',').map(|v| v.parse().unwrap()).collect()).collect();
     // Time, angle, the reference with what derivatives the law reads, the command.
@@ -406,12 +407,16 @@ fn repeats(folder: &Path, vectors: &str) {
         "#![allow(dead_code)]\nmod libm {{\n pub fn sin(x: f64) -> f64 {{ x.sin() }}\n pub fn cos(x: f64) -> f64 {{ x.cos() }}\n \
          pub fn pow(x: f64, y: f64) -> f64 {{ x.powf(y) }}\n pub fn fabs(x: f64) -> f64 {{ x.abs() }}\n}}\n\
          mod law {{\n use super::libm;\n include!(\"law.rs\");\n}}\nmod observer {{\n use super::libm;\n include!(\"observer.rs\");\n}}\n\
-         static IN: [[f64; {width}]; {n}] = [{}];\nfn main() {{\n for missing in [false, true] {{\n  let mut o = observer::Observer::new();\n  \
+         static IN: [[f64; {width}]; {n}] = [{}];\nfn main() {{\n for missing in [false, true] {{\n  let mut o = {start};\n  \
          for (k, given) in IN.iter().enumerate() {{\n   let y = if missing && k % 50 == 7 {{ f64::NAN }} else {{ given[0] }};\n   \
          let r = core::array::from_fn(|i| given[i + 1]);\n   \
          println!(\"{{:?}}\", o.step(&[y], &r, law::control_law));\n  }}\n }}\n}}\n",
         cells("[", "]"),
-        width = last - 1
+        width = last - 1,
+        start = match held {
+            Some(held) => format!("observer::Observer::start_at(&[IN[0][0]], {held:?}).unwrap()"),
+            None => "observer::Observer::new()".into(),
+        }
     );
     std::fs::write(folder.join("main.rs"), rust).unwrap();
     let run = |program: &str| -> Vec<f64> {
@@ -445,14 +450,23 @@ fn repeats(folder: &Path, vectors: &str) {
     let kind = head.split("typedef struct").nth(1).unwrap().split("observer_memory;").next().unwrap();
     let main = format!(
         "#include <math.h>\n#include <stdio.h>\ntypedef struct{kind}observer_memory;\nvoid observer_start(observer_memory *memory);\n\
+         int observer_start_at(observer_memory *memory, const double measured[1], double command);\n\
          double observer_step(observer_memory *memory, const double measured[1], const double set_point[{references}]);\n\
          static const double in[{n}][{width}] = {{{}}};\nint main(void) {{\n for (int missing = 0; missing < 2; missing++) {{\n  \
-         observer_memory m;\n  observer_start(&m);\n  for (int i = 0; i < {n}; i++) {{\n   double y[1];\n   \
+         observer_memory m;\n  {start}\n  for (int i = 0; i < {n}; i++) {{\n   double y[1];\n   \
          y[0] = missing && i % 50 == 7 ? NAN : in[i][0];\n   printf(\"%.17g\\n\", observer_step(&m, y, in[i] + 1));\n  }}\n }}\n \
          return 0;\n}}\n",
         cells("{", "}"),
         width = last - 1,
-        references = last - 2
+        references = last - 2,
+        start = match held {
+            // What is no number is refused.
+            Some(held) => format!(
+                "double none[1] = {{NAN}};\n  if (observer_start_at(&m, none, 0.0) || observer_start_at(&m, in[0], INFINITY)) return 1;\n  \
+                 if (!observer_start_at(&m, in[0], {held:?})) return 1;"
+            ),
+            None => "observer_start(&m);".into(),
+        }
     );
     std::fs::write(folder.join("main.c"), main).unwrap();
     let strict = [
@@ -554,5 +568,86 @@ fn a_trajectory_is_followed() {
     agrees(&folder.path().join("state"), &read("state", "vectors.csv"));
     let observed = read("output", "observer_vectors.csv");
     assert_eq!(observed.lines().next(), Some("t,theta,set_point,set_point',set_point'',command"));
-    repeats(&folder.path().join("output"), &observed);
+    repeats(&folder.path().join("output"), &observed, Some(0.0));
+}
+
+/// A flexible joint, or an arm, that rests away from zero is not thrown when its controller is switched on: the observer starts at
+/// what is measured and at the command that holds it, in the simulated loop and in its code.
+#[test]
+fn a_machine_that_rests_is_not_thrown() {
+    const JOINT: &str = r#"name = "joint"
+
+[inputs]
+v = { unit = "V" }
+
+[states]
+theta = { unit = "rad" }
+phi = { unit = "rad", measured = false }
+
+[parameters]
+Jm = { value = 0.004, unit = "kg m^2" }
+Jl = { value = 0.01, unit = "kg m^2" }
+bm = { value = 0.05, unit = "N m s/rad" }
+bl = { value = 0.002, unit = "N m s/rad" }
+k = { value = 4.0, unit = "N m/rad" }
+mgl = { value = 0.3, unit = "N m" }
+kt = { value = 0.4, unit = "N m/V" }
+
+[equations]
+motor = "Jm*theta'' + bm*theta' + k*(theta - phi) = kt*v"
+link = "Jl*phi'' + bl*phi' + k*(phi - theta) + mgl*sin(phi) = 0"
+"#;
+    let folder = tempfile::tempdir().unwrap();
+    let late = MODEL.replace("= kt*v", "= kt*delay(v, tau)");
+    let late = late.replace("\n[eq", "tau = { value = 0.005, unit = \"s\" }\n\n[eq");
+    for (name, text) in [("joint", JOINT), ("arm", MODEL), ("late", &late)] {
+        std::fs::write(folder.path().join(format!("{name}.toml")), text).unwrap();
+    }
+    // At rest for a second, then two tenths of a radian on.
+    let mut reference = "t [s],theta [rad]\n".to_owned();
+    for k in 0..=120 {
+        let t = 0.02 * f64::from(k);
+        let share = ((t - 1.0) / 1.0).clamp(0.0, 1.0);
+        reference +=
+            &format!("{t},{}\n", 0.4 + 0.2 * share.powi(3) * (10.0 - 15.0 * share + 6.0 * share * share));
+    }
+    std::fs::write(folder.path().join("move.csv"), reference).unwrap();
+    for (model, observer, rest) in [
+        ("joint", "kalman", &[][..]),
+        ("arm", "eso", &[]),
+        ("late", "kalman", &["--integral-at-rest"]),
+        ("late", "eso", &["--integral-at-rest"]),
+    ] {
+        let place = format!("{model}-{observer}");
+        let settings = "--reference move.csv --track theta --size theta=0.4 --size theta'=4 --input-size 5 --dt 0.002 --members 0 \
+                        --json --feedback output --noise theta=1e-6";
+        let file = format!("{model}.toml");
+        let own = ["--observer", observer, "--out", &place];
+        let all: Vec<&str> = ["control", &file]
+            .into_iter()
+            .chain(settings.split_whitespace())
+            .chain(own)
+            .chain(rest.iter().copied())
+            .collect();
+        let (code, out, err) = greybox(folder.path(), &all);
+        assert_eq!(code, Some(0), "{place}: {err}");
+        let report: serde_json::Value = serde_json::from_str(&out).unwrap();
+        let held = report["closed_loop"]["held_command"].as_f64().unwrap();
+        assert!(held > 0.1, "{place}: {held}");
+        let start = &report["observer"]["start"];
+        assert_eq!((start.is_null(), start["matrix"].is_null()), (observer == "eso", observer == "eso"));
+        let read = |name: &str| std::fs::read_to_string(folder.path().join(&place).join(name)).unwrap();
+        let table: Vec<Vec<f64>> = read("closed_loop.csv")
+            .lines()
+            .skip(1)
+            .map(|line| line.split(',').map(|v| v.parse().unwrap()).collect())
+            .collect();
+        let resting = table.iter().take_while(|row| row[0] < 0.9);
+        let (moved, command) = resting.fold((0.0f64, 0.0f64), |(moved, command), row| {
+            (moved.max((row[3] - 0.4).abs()), command.max((row[2] - held).abs()))
+        });
+        println!("{place}: {moved:.1e} rad, {command:.1e} V");
+        assert!(moved < 1e-4, "{place}: {moved}");
+        repeats(&folder.path().join(&place), &read("observer_vectors.csv"), Some(held));
+    }
 }

@@ -9,9 +9,9 @@ use std::path::Path;
 
 pub use greybox_control::Integral;
 use greybox_control::{
-    ClosedLoop, Controller, DesignOptions, FamilyOptions, Feedback, LoopOptions, Method, ObserverMethod,
-    OutputFeedback, OutputOptions, Plant, PlantOptions, Reference, Run, Sensor, Trajectory, UNSTATED_NOISE,
-    design, equilibrium,
+    ClosedLoop, Controller, DesignOptions, Equilibrium, FamilyOptions, Feedback, LoopOptions, Method,
+    ObserverMethod, OutputFeedback, OutputOptions, Plant, PlantOptions, Reference, Run, Sensor, Trajectory,
+    UNSTATED_NOISE, design, equilibrium,
 };
 use greybox_export::Language;
 use greybox_model::Model;
@@ -218,9 +218,13 @@ pub fn control(
     let output = request.observer.as_ref().map(|o| output_feedback(o, request, &controller)).transpose();
     let output = output.map_err(refused)?;
     let feedback = output.clone().map_or(Feedback::FullState, |o| Feedback::Output(Box::new(o)));
+    let rest = start(request, &controller).map_err(refused)?;
+    // What the actuator is given; the equilibrium is behind its dead zone.
+    let held = rest.as_ref().map(|at| plant.before_dead_zone(at.input));
     let options = LoopOptions {
-        start: start(request, &controller).map_err(refused)?,
+        start: rest.map(|at| at.state),
         feedback,
+        held,
         delay: request.delay,
         seed: request.seed,
         ..LoopOptions::default()
@@ -262,6 +266,7 @@ pub fn control(
         controller: &controller,
         output: output.as_ref(),
         delay: request.delay,
+        held: output.as_ref().and(held),
         run: &run,
         family: family.as_ref(),
     };
@@ -376,11 +381,11 @@ fn set_points(request: &Request) -> [f64; 2] {
 fn start(
     request: &Request,
     controller: &Controller,
-) -> Result<Option<Vec<f64>>, greybox_control::ControlError> {
+) -> Result<Option<Equilibrium>, greybox_control::ControlError> {
     let Some(trajectory) = &request.trajectory else { return Ok(None) };
     let near = &controller.design_point().equilibrium;
     let at = equilibrium(controller.plant(), controller.tracked(), trajectory.at(0.0)[0], near)?;
-    Ok(Some(at.state))
+    Ok(Some(at))
 }
 
 /// The files of a request.

@@ -52,8 +52,7 @@ impl Examined<'_> {
 
     pub(crate) fn check(&self, set_point: f64, at: Equilibrium) -> Result<Check, ControlError> {
         let (low, high) = self.limits;
-        let swallowed = self.plant.dead_zone() * if at.input == 0.0 { 0.0 } else { at.input.signum() };
-        let input = at.input + swallowed;
+        let input = self.plant.before_dead_zone(at.input);
         if !(low <= input && input <= high) {
             let tracked = self.names.to_owned();
             return Err(ControlError::Unholdable { tracked, value: set_point, input, low, high });

@@ -14,6 +14,8 @@ pub use crate::run::{MOST_SAMPLES, Reference, Run};
 
 /// A state this many times its size, start or set point has run away.
 const FAR: f64 = 1e9;
+/// What the rounding of forces leaves of a state, over its size: a smaller error of the integration means nothing.
+const ROUNDED: f64 = 64.0 * f64::EPSILON;
 
 /// What the law is given of the state.
 #[derive(Debug, Clone, Default)]
@@ -34,6 +36,9 @@ pub struct LoopOptions {
     pub start: Option<Vec<f64>>,
     /// What the law is given.
     pub feedback: Feedback,
+    /// The command that holds the machine at its start: an observer begins there at its first measurements
+    /// ([`OutputFeedback::start_at`]); where there is none, at zero ([`OutputFeedback::start`]).
+    pub held: Option<f64>,
     /// The law is given the state of so long ago, s: sensors, network and computing together. Between two samples it is
     /// on the line through them.
     pub delay: f64,
@@ -46,7 +51,7 @@ pub struct LoopOptions {
 impl Default for LoopOptions {
     fn default() -> Self {
         let integration = Integration::Adaptive { rtol: 1e-7, atol: 1e-10 };
-        Self { start: None, feedback: Feedback::FullState, delay: 0.0, seed: 0, integration }
+        Self { start: None, feedback: Feedback::FullState, held: None, delay: 0.0, seed: 0, integration }
     }
 }
 
@@ -83,6 +88,8 @@ pub struct ClosedLoop<'a> {
     pub(crate) parameters: Vec<f64>,
     states: Vec<String>,
     start: Vec<f64>,
+    /// Magnitudes of the states of which rounding is the absolute tolerance; zero where no size is stated.
+    magnitudes: Vec<f64>,
     /// Where the law's states stand in the model's state vector.
     places: Vec<usize>,
     /// For each of the law's states by differences: the state that it is the rate of.
@@ -92,6 +99,7 @@ pub struct ClosedLoop<'a> {
     integration: Integration,
     delays: bool,
     pub(crate) output: Option<OutputFeedback>,
+    held_command: Option<f64>,
     pub(crate) delay: f64,
     seed: u64,
 }
@@ -154,6 +162,12 @@ impl<'a> ClosedLoop<'a> {
             }
         }
         let delays = !system.rhs.delays.is_empty();
+        let mut magnitudes = vec![0.0; system.nx];
+        if let Integration::Adaptive { atol, .. } = options.integration {
+            for (&place, size) in places.iter().zip(plant.sizes()) {
+                magnitudes[place] = ROUNDED * size / atol.max(ROUNDED);
+            }
+        }
         Ok(ClosedLoop {
             controller,
             parameters: model.parameters.iter().map(|p| p.value).collect(),
@@ -161,6 +175,7 @@ impl<'a> ClosedLoop<'a> {
             system,
             states,
             start,
+            magnitudes,
             places,
             rates,
             input,
@@ -171,6 +186,7 @@ impl<'a> ClosedLoop<'a> {
                 Feedback::Output(output) => Some(OutputFeedback::clone(output)),
                 _ => None,
             },
+            held_command: options.held,
             delay: options.delay,
             seed: options.seed,
         })
@@ -185,7 +201,7 @@ impl<'a> ClosedLoop<'a> {
     /// A run with the model's own parameters.
     ///
     /// # Errors
-    /// [`ControlError::Option`] for a reference that is none.
+    /// [`ControlError::Option`] for a reference that is none, [`ControlError::NoStart`].
     pub fn run(&self, reference: &Reference) -> Result<Run, ControlError> {
         self.run_with(&self.parameters, reference)
     }
@@ -193,7 +209,7 @@ impl<'a> ClosedLoop<'a> {
     /// A run with other values (SI) of the model's parameters, in the model's order.
     ///
     /// # Errors
-    /// [`ControlError::Option`] for a reference that is none, [`ControlError::Size`].
+    /// [`ControlError::Option`] for a reference that is none, [`ControlError::Size`], [`ControlError::NoStart`].
     pub fn run_with(&self, parameters: &[f64], reference: &Reference) -> Result<Run, ControlError> {
         if parameters.len() != self.system.np {
             let (found, wanted) = (parameters.len(), self.system.np);
@@ -250,6 +266,9 @@ impl<'a> ClosedLoop<'a> {
                     let sensors = output.observer().measured().iter().zip(output.sensors());
                     let y: Vec<f64> = sensors.map(|(&i, s)| s.read(known[i], &mut random)).collect();
                     run.y.iter_mut().zip(&y).for_each(|(series, y)| series.push(*y));
+                    if let (0, Some(held)) = (k, self.held_command) {
+                        *memory = output.start_at(&y, held)?;
+                    }
                     output.command_along(memory, &y, &given)
                 }
                 _ => self.controller.command_along(&known, &given),
@@ -338,9 +357,13 @@ impl<'a> ClosedLoop<'a> {
         };
         let at = k - first;
         let every: Vec<usize> = (0..self.system.nx).collect();
+        // A sample on its own remembers nothing but what is rounding.
+        let (before, carried) = match carry.filter(|_| self.delays) {
+            Some(carry) => (carry, every.as_slice()),
+            None => (Carry::remembered(&self.system, at, dt, &[]).reaching(&self.magnitudes), [].as_slice()),
+        };
         // Both ends are recorded: only so does a divergence between them show.
-        let (trajectory, after) =
-            simulation.run_on(x, at..at + 2, carry.as_ref().filter(|_| self.delays), &every);
+        let (trajectory, after) = simulation.run_on(x, at..at + 2, Some(&before), carried);
         let next: Vec<f64> = trajectory.x.chunks(2).filter_map(|ends| ends.get(1).copied()).collect();
         let lost =
             trajectory.diverged.is_some() || next.len() != x.len() || !next.iter().all(|x| x.is_finite());

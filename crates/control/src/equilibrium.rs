@@ -8,11 +8,11 @@ use crate::plant::Plant;
 /// Newton steps allowed; four or five are usual.
 const MOST_STEPS: usize = 60;
 /// A step this small, counted in the stated sizes, is the last.
-const LAST_STEP: f64 = 1e-10;
+pub(crate) const LAST_STEP: f64 = 1e-10;
 /// The shortest share of a Newton step that is tried.
 const LEAST_SHARE: f64 = 1e-4;
 /// Reciprocal condition, rows and columns scaled, below which the equations do not determine the unknowns.
-const LEAST_CONDITION: f64 = 1e-12;
+pub(crate) const LEAST_CONDITION: f64 = 1e-12;
 
 /// A state that a constant input holds: f(x) + g(x) u = 0.
 #[derive(Debug, Clone, PartialEq)]

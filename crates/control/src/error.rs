@@ -219,6 +219,17 @@ pub enum ControlError {
         /// The last step.
         step: f64,
     },
+    /// No state of rest belongs to what is measured.
+    #[error(
+        "no state of rest was found that belongs to the measurements {measured:?} under the command {command}: start the \
+         observer from zero, bring the machine nearer to the set points, or state sizes nearer to those of the motion"
+    )]
+    NoStart {
+        /// What is measured.
+        measured: Vec<f64>,
+        /// The command that is held.
+        command: f64,
+    },
     /// Resting there needs more than the actuator gives.
     #[error(
         "resting at {tracked} = {value} takes an input of {input}, and the actuator gives {low} to {high}: narrow \

@@ -1,6 +1,7 @@
 //! State and disturbance from the measured states.
 
 mod chains;
+mod start;
 mod tangent;
 
 use greybox_hjb::{Linear, dare};
@@ -10,6 +11,7 @@ use rand_pcg::Pcg64Mcg;
 
 pub use self::chains::EsoStep;
 use self::chains::{AnyChain, Chains};
+pub use self::start::Start;
 pub(crate) use self::tangent::{Prediction, Tangent};
 use crate::check::Check;
 use crate::equilibrium::Equilibrium;
@@ -115,6 +117,7 @@ enum Kind {
     Kalman {
         /// L, (states and d) × measured.
         gain: DMatrix<f64>,
+        start: Start,
     },
     Eso(Chains),
 }
@@ -126,6 +129,8 @@ pub enum Form {
     Kalman {
         /// L, row by row.
         gain: Vec<Vec<f64>>,
+        /// Where it starts at a machine at rest.
+        start: Start,
     },
     /// The chains.
     Eso(Vec<EsoStep>),
@@ -201,9 +206,10 @@ impl Observer {
     #[must_use]
     pub fn form(&self) -> Form {
         match &self.kind {
-            Kind::Kalman { gain } => {
-                Form::Kalman { gain: gain.row_iter().map(|row| row.iter().copied().collect()).collect() }
-            }
+            Kind::Kalman { gain, start } => Form::Kalman {
+                gain: gain.row_iter().map(|row| row.iter().copied().collect()).collect(),
+                start: start.clone(),
+            },
             Kind::Eso(chains) => Form::Eso(chains.steps(&self.plant)),
         }
     }
@@ -217,6 +223,25 @@ impl Observer {
         Memory { estimate: vec![0.0; self.plant.order() + 1], chains, past, started: false }
     }
 
+    /// What is remembered at a machine that rests at the measurements `y` under the command `u` (behind the dead zone): the next
+    /// sample with the same measurements and the same command leaves it as it is. None where no state of rest is found.
+    pub(crate) fn start_at(&self, y: &[f64], u: f64) -> Option<Memory> {
+        if y.len() != self.measured.len() || !y.iter().chain([&u]).all(|v| v.is_finite()) {
+            return None;
+        }
+        let mut memory = self.start();
+        memory.past.fill(u);
+        memory.started = true;
+        match &self.kind {
+            Kind::Kalman { start, .. } => memory.estimate = start.at(&self.plant, &self.measured, y, u)?,
+            Kind::Eso(chains) => {
+                let memory = (memory.estimate.as_mut_slice(), memory.chains.as_mut_slice());
+                chains.rest(&self.plant, &self.measured, memory, y, u);
+            }
+        }
+        memory.estimate.iter().all(|v| v.is_finite()).then_some(memory)
+    }
+
     /// The estimate at a sample from its measurements `y` and the last command `u` (behind the dead zone). The first
     /// sample finds the machine at rest. A measurement that is not a number is left out.
     pub(crate) fn update(&self, memory: &mut Memory, y: &[f64], u: f64) {
@@ -228,7 +253,7 @@ impl Observer {
             }
         }
         match &self.kind {
-            Kind::Kalman { gain } => {
+            Kind::Kalman { gain, .. } => {
                 if memory.started {
                     let InputDelay { samples, remainder } = self.input_delay;
                     self.predict(&mut memory.estimate, memory.past[samples + 1], remainder);
@@ -298,7 +323,7 @@ impl Observer {
         let n = self.plant.order();
         let plant = self.plant.frictionless_tangent(&at.state, at.input);
         match &self.kind {
-            Kind::Kalman { gain } => {
+            Kind::Kalman { gain, .. } => {
                 let held = self.held(&plant, self.dt, set_point)?;
                 let all = extended(&held.a, &held.b);
                 let [older, newer] = self.inputs(&plant, self.input_delay.remainder, set_point)?;
@@ -405,5 +430,6 @@ fn kalman(
     let innovation = read.transpose() * &predicted * &read + unit;
     let weights = innovation.cholesky().ok_or_else(none)?.solve(&(read.transpose() * &predicted));
     let gain = DMatrix::from_fn(n + 1, measured.len(), |i, k| weights[(k, i)] * size(i) / deviations[k]);
-    Ok(Kind::Kalman { gain })
+    let start = Start::design(plant, point, measured, &deviations).ok_or_else(none)?;
+    Ok(Kind::Kalman { gain, start })
 }

@@ -266,7 +266,62 @@ impl OutputFeedback {
     /// What there is to remember before the first sample.
     #[must_use]
     pub fn start(&self) -> OutputMemory {
-        OutputMemory { observer: self.observer.start(), rest: Rest::start(), command: 0.0 }
+        OutputMemory { observer: self.observer.start(), rest: Rest::start(0.0), command: 0.0 }
+    }
+
+    /// What there is to remember at a machine that rests at its measurements `y` (in the order of [`Observer::measured`]) under
+    /// a held command ([`observer::Start`](crate::observer::Start)): the estimate is that state of rest, its disturbance is the integral's,
+    /// and every command on its way is the held one. With the set point where the machine rests the first command is the held one:
+    /// the law of that place is u_e = u + d̂, and d̂ is taken off. Without integral action it is u + d̂. Friction that
+    /// holds the machine is a disturbance.
+    ///
+    /// ```
+    /// # use greybox_control::{
+    /// #     DesignOptions, Integral, Method, ObserverMethod, OutputFeedback, OutputOptions, Plant, PlantOptions, design,
+    /// # };
+    /// # let model = greybox_model::Model::from_toml(r#"
+    /// # [inputs]
+    /// # tau = { unit = "N m" }
+    /// # [states]
+    /// # theta = { unit = "rad" }
+    /// # [parameters]
+    /// # J = { value = 0.02, unit = "kg m^2" }
+    /// # k = { value = 0.5, unit = "N m/rad" }
+    /// # [equations]
+    /// # arm = "J*theta'' + k*theta = tau"
+    /// # "#, "arm.toml")?;
+    /// let plant = Plant::of(&model, "tau", &PlantOptions::default())?;
+    /// let law = design(&plant, &Method::Lqr, &DesignOptions::new("theta", &[-0.5, 0.5], 1e-3))?;
+    /// let output = OutputFeedback::new(&law, &OutputOptions {
+    ///     method: ObserverMethod::Kalman { disturbance: 1.0 },
+    ///     sensors: Vec::new(),
+    ///     integral: Integral::Disturbance,
+    /// })?;
+    /// // Held at 0.4 rad by 0.3 N m, where the model says that 0.2 would do.
+    /// let mut memory = output.start_at(&[0.4], 0.3)?;
+    /// assert!((memory.state()[0] - 0.4).abs() < 1e-12 && (memory.disturbance() + 0.1).abs() < 1e-12);
+    /// assert!((output.command(&mut memory, &[0.4], 0.4) - 0.3).abs() < 1e-9);
+    /// # Ok::<(), Box<dyn std::error::Error>>(())
+    /// ```
+    ///
+    /// # Errors
+    /// [`ControlError::Size`], [`ControlError::NoStart`] where no state of rest is found: [`start`](Self::start) is there for it.
+    pub fn start_at(&self, y: &[f64], command: f64) -> Result<OutputMemory, ControlError> {
+        let wanted = self.observer.measured().len();
+        if y.len() != wanted {
+            return Err(ControlError::Size { what: "the measurements", found: y.len(), wanted });
+        }
+        let observer = self
+            .observer
+            .start_at(y, self.behind_dead_zone(command))
+            .ok_or_else(|| ControlError::NoStart { measured: y.to_vec(), command })?;
+        let offset = if self.rest.is_some() { observer.estimate[self.observer.order()] } else { 0.0 };
+        Ok(OutputMemory { observer, rest: Rest::start(offset), command })
+    }
+
+    /// What a command does.
+    fn behind_dead_zone(&self, u: f64) -> f64 {
+        u - u.clamp(-self.dead_zone, self.dead_zone)
     }
 
     /// The command at a sample, from its measurements (in the order of [`Observer::measured`]) and the set point. A
@@ -280,7 +335,7 @@ impl OutputFeedback {
     /// the time at which it acts.
     pub fn command_along(&self, memory: &mut OutputMemory, y: &[f64], reference: &[f64; 3]) -> f64 {
         let u = memory.command;
-        let behind = if u.is_finite() { u - u.clamp(-self.dead_zone, self.dead_zone) } else { 0.0 };
+        let behind = if u.is_finite() { self.behind_dead_zone(u) } else { 0.0 };
         self.observer.update(&mut memory.observer, y, behind);
         let estimate = self.observer.ahead(&memory.observer);
         let (x, d) = estimate.split_at(self.observer.order());

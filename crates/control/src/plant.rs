@@ -234,6 +234,12 @@ impl Plant {
         self.dead_zone
     }
 
+    /// The command of which so much is left behind the dead zone.
+    #[must_use]
+    pub fn before_dead_zone(&self, input: f64) -> f64 {
+        input + self.dead_zone * if input == 0.0 { 0.0 } else { input.signum() }
+    }
+
     /// How late the command acts, s, where [`PlantOptions::predict_input_delay`] took the delay out of f and g.
     #[must_use]
     pub fn input_delay(&self) -> f64 {

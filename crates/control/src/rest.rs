@@ -138,8 +138,8 @@ impl Rest {
         self.step / self.time
     }
 
-    pub(crate) fn start() -> RestMemory {
-        RestMemory { offset: 0.0, reading: f64::NAN, reference: f64::NAN, stayed: 0, held: None }
+    pub(crate) fn start(offset: f64) -> RestMemory {
+        RestMemory { offset, reading: f64::NAN, reference: f64::NAN, stayed: 0, held: None }
     }
 
     /// The command from the estimate `x` of the states, the measurements and the reference; `law` is κ(x, r) − o
@@ -203,7 +203,7 @@ mod tests {
         };
         let law = |x: &[f64], offset: f64| -2.0 * x[0] + 7.0 * x[2] - offset;
         let run = |y: &dyn Fn(usize) -> f64, velocity: f64| {
-            let mut memory = Rest::start();
+            let mut memory = Rest::start(0.0);
             let u: Vec<f64> = (0..20)
                 .map(|k| rest.command(&mut memory, (&[0.0, velocity, k as f64], &[y(k)], 0.0), law))
                 .collect();

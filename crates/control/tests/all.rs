@@ -9,4 +9,5 @@ mod loops;
 mod output;
 mod plants;
 mod rest;
+mod start;
 mod trajectories;

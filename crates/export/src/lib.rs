@@ -17,5 +17,5 @@ pub use function::{Constant, Function, Group, Member, Vector};
 pub use language::Language;
 pub use latex::{latex, latex_document};
 pub use modelica::modelica;
-pub use observer::{ChainForm, ObserverCode, ObserverForm, RestForm};
+pub use observer::{ChainForm, ObserverCode, ObserverForm, RestForm, StartForm};
 pub use python::python;

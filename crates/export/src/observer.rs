@@ -13,7 +13,7 @@ use crate::language::{Language, number};
 /// disturbance d adds to the command.
 ///
 /// ```
-/// use greybox_export::{Function, Group, Language, Member, ObserverCode, ObserverForm};
+/// use greybox_export::{Function, Group, Language, Member, ObserverCode, ObserverForm, StartForm};
 /// use greybox_model::parse;
 /// let group = |name: &str, member: &str| Group { name: name.into(), members: vec![Member::new(member, 0, "")] };
 /// let function = |name: &str, arguments: Vec<Group>, output: &str| -> Result<Function, Box<dyn std::error::Error>> {
@@ -31,10 +31,22 @@ use crate::language::{Language, number};
 ///     dead_zone: 0.0,
 ///     substeps: 1,
 ///     input_delay: (0, 0.0),
-///     form: ObserverForm::Kalman { gain: vec![vec![0.4], vec![3.0]] },
+///     form: ObserverForm::Kalman {
+///         gain: vec![vec![0.4], vec![3.0]],
+///         // At rest x = y and d = y − u.
+///         start: StartForm {
+///             point: vec![0.0, 0.0],
+///             sizes: vec![1.0, 1.0],
+///             matrix: vec![vec![0.0, 1.0], vec![1.0, 1.0]],
+///             most_steps: 50,
+///             last_step: 1e-10,
+///             close: 1e-6,
+///         },
+///     },
 ///     rest: None,
 /// };
 /// assert!(code.code(Language::C99)?.contains("double observer_step(observer_memory *memory, const double measured[1]"));
+/// assert!(code.code(Language::C99)?.contains("int observer_start_at(observer_memory *memory, const double measured[1], double command)"));
 /// assert!(code.code(Language::Rust)?.contains("pub struct Observer"));
 /// # Ok::<(), Box<dyn std::error::Error>>(())
 /// ```
@@ -89,9 +101,33 @@ pub enum ObserverForm {
     Kalman {
         /// (n + 1) rows, one entry for each measurement.
         gain: Vec<Vec<f64>>,
+        /// Where it starts at a machine at rest.
+        start: StartForm,
     },
     /// Chains z⁺ = A z + b₀ y + b₁ y⁺ + g u; the last entry of each, with b u, is what its highest derivative is.
     Chains(Vec<ChainForm>),
+}
+
+/// Where a Kalman filter starts at a machine that rests at measurements y under a held command u: the state of rest and the
+/// disturbance z = (x, d) that belong to them, from `point` − (0, u) by
+///
+/// ```text
+/// z ← z − matrix (rate(x, u + d), C x − y)
+/// ```
+#[derive(Debug, Clone, PartialEq)]
+pub struct StartForm {
+    /// The states and the command of a rest: (n + 1).
+    pub point: Vec<f64>,
+    /// What a step is counted in: (n + 1), positive.
+    pub sizes: Vec<f64>,
+    /// (n + 1) rows of n and as many entries as there are measurements.
+    pub matrix: Vec<Vec<f64>>,
+    /// Most steps; one that is not shorter than the last is left out and ends them.
+    pub most_steps: usize,
+    /// A step this small is the last.
+    pub last_step: f64,
+    /// Largest last step of a rest that was found.
+    pub close: f64,
 }
 
 /// The observer of one coordinate and its derivatives.
@@ -225,9 +261,37 @@ impl RestForm {
     }
 }
 
+impl StartForm {
+    /// `text`, of a language, with the gaps filled.
+    fn write(&self, text: &str, row: fn(&[f64]) -> String, code: &ObserverCode) -> String {
+        let (n, m) = (code.states(), code.measured.len());
+        fill(
+            text,
+            &[
+                ("N", &n),
+                ("N1", &(n + 1)),
+                ("M", &m),
+                ("NM", &(n + m)),
+                ("PLACES", &list(code.measured.iter().map(usize::to_string))),
+                ("POINT", &row(&self.point)),
+                ("SIZES", &row(&self.sizes)),
+                ("MATRIX", &list(self.matrix.iter().map(|entries| row(entries)))),
+                ("STEPS", &self.most_steps),
+                ("LAST", &number(self.last_step)),
+                ("CLOSE", &number(self.close)),
+                ("RATE", &code.rate.name),
+            ],
+        )
+    }
+}
+
 /// How a language writes extended-state observers.
 struct ChainText {
+    /// What finds the disturbance from the chains.
+    explain: &'static str,
     whole: &'static str,
+    /// The chain of a machine at rest.
+    rest: &'static str,
     chain: &'static str,
     disturbance: &'static str,
     /// A list of numbers.
@@ -237,6 +301,47 @@ struct ChainText {
 }
 
 impl ChainText {
+    /// The chains of a machine at rest.
+    fn at_rest(&self, code: &ObserverCode, chains: &[ChainForm]) -> String {
+        let at_rest = |(k, (chain, start)): (usize, (&ChainForm, &usize))| {
+            fill(
+                self.rest,
+                &[
+                    ("START", start),
+                    ("LAST", &(start + chain.a.len() - 1)),
+                    ("AT", &code.measurement(chain)),
+                    ("K", &k),
+                    ("FIRST", &chain.first),
+                    ("AGAINST", &number(-chain.gain)),
+                ],
+            )
+        };
+        chains.iter().zip(&code.starts()).enumerate().map(at_rest).collect()
+    }
+
+    /// What finds the disturbance from the chains.
+    fn explained(&self, code: &ObserverCode, chains: &[ChainForm]) -> String {
+        let disturbance = |(chain, start): (&ChainForm, &usize)| {
+            fill(
+                self.disturbance,
+                &[
+                    ("LAST", &(start + chain.a.len() - 1)),
+                    ("GAIN", &number(chain.gain)),
+                    ("WEIGHT", &number(chain.weight)),
+                    ("ROW", &(chain.first + chain.a.len() - 2)),
+                ],
+            )
+        };
+        fill(
+            self.explain,
+            &[
+                ("N", &code.states()),
+                ("RATE", &code.rate.name),
+                ("DISTURBANCES", &chains.iter().zip(&code.starts()).map(disturbance).collect::<String>()),
+            ],
+        )
+    }
+
     fn write(&self, code: &ObserverCode, chains: &[ChainForm]) -> String {
         let starts = code.starts();
         let step = |(k, (chain, start)): (usize, (&ChainForm, &usize))| {
@@ -257,25 +362,11 @@ impl ChainText {
                 ],
             )
         };
-        let disturbance = |(chain, start): (&ChainForm, &usize)| {
-            fill(
-                self.disturbance,
-                &[
-                    ("LAST", &(start + chain.a.len() - 1)),
-                    ("GAIN", &number(chain.gain)),
-                    ("WEIGHT", &number(chain.weight)),
-                    ("ROW", &(chain.first + chain.a.len() - 2)),
-                ],
-            )
-        };
         fill(
             self.whole,
             &[
                 ("ACTING", &code.acting(self.past)),
-                ("N", &code.states()),
-                ("RATE", &code.rate.name),
                 ("CHAINS", &chains.iter().zip(&starts).enumerate().map(step).collect::<String>()),
-                ("DISTURBANCES", &chains.iter().zip(&starts).map(disturbance).collect::<String>()),
             ],
         )
     }

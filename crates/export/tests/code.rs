@@ -4,7 +4,10 @@ use std::fmt::Write as _;
 use std::path::Path;
 use std::process::Command;
 
-use greybox_export::{Constant, ExportError, Function, Group, Language, Member, Vector};
+use greybox_export::{
+    ChainForm, Constant, ExportError, Function, Group, Language, Member, ObserverCode, ObserverForm,
+    StartForm, Vector,
+};
 use greybox_model::parse;
 use rand::{RngExt, SeedableRng};
 use rand_pcg::Pcg64Mcg;
@@ -229,4 +232,116 @@ fn what_cannot_be_written_is_refused() {
     assert!(matches!(refused(infinite), ExportError::NotFinite { .. }));
     assert!(function(&["q"]).vectors(&[vec![1.0, 2.0]]).is_err());
     assert!(function(&["q"]).vectors(&[vec![1.0, f64::NAN, 0.0, 0.0]]).is_err());
+}
+
+/// A tank, x' = ±u − x + d, under a law that holds it: the first command after a start at rest is the held one, of a Kalman filter of two
+/// sensors and of a chain whose gain is negative, in both languages; what is no number, or has no rest, is refused.
+#[test]
+fn an_observer_starts_at_a_machine_at_rest() {
+    let group =
+        |name: &str, member: &str| Group { name: name.into(), members: vec![Member::new(member, 0, "")] };
+    let function = |name: &str, arguments: Vec<Group>, output: &str| Function {
+        name: name.into(),
+        summary: vec![],
+        arguments,
+        constants: vec![],
+        outputs: vec![(String::new(), parse(output).unwrap().expr)],
+    };
+    let observer = |rate: &str, law: &str, measured: &[usize], form: ObserverForm| ObserverCode {
+        summary: vec!["A tank.".into()],
+        rate: function("plant_rate", vec![group("state", "x"), group("command", "u")], rate),
+        law: function(
+            "control_law",
+            vec![group("state", "x"), group("disturbance", "d"), group("set_point", "r")],
+            law,
+        ),
+        dt: 0.01,
+        measured: measured.to_vec(),
+        dead_zone: 0.1,
+        substeps: 1,
+        input_delay: (1, 0.004),
+        form,
+        rest: None,
+    };
+    let start = StartForm {
+        point: vec![1.0, 1.0],
+        sizes: vec![1.0, 1.0],
+        matrix: vec![vec![0.0, 0.5, 0.5], vec![1.0, 0.5, 0.5]],
+        most_steps: 50,
+        last_step: 1e-10,
+        close: 1e-6,
+    };
+    // A matrix that goes away from what is measured.
+    let astray = StartForm { matrix: vec![vec![0.0, -0.5, -0.5], vec![1.0, 0.5, 0.5]], ..start.clone() };
+    let chain = ChainForm {
+        first: 0,
+        a: vec![vec![0.0, 0.0], vec![0.0, 1.0]],
+        before: vec![0.0, 0.0],
+        now: vec![1.0, 0.0],
+        input: vec![0.0, 0.0],
+        gain: -1.0,
+        weight: 1.0,
+    };
+    let (up, down) = (("u - x", "r - 2*(x - r) - d"), ("-u - x", "-r + 2*(x - r) - d"));
+    let kalman = |start: &StartForm| ObserverForm::Kalman {
+        gain: vec![vec![0.2, 0.2], vec![1.0, 1.0]],
+        start: start.clone(),
+    };
+    let cases = [
+        (up, &[0, 0][..], kalman(&start), "1 0.7 0 0 "),
+        (up, &[0, 0], kalman(&astray), "0 0 0 0 "),
+        (down, &[0], ObserverForm::Chains(vec![chain]), "1 0.7 0 0 "),
+    ];
+    for ((rate, law), measured, form, wanted) in cases {
+        let code = observer(rate, law, measured, form);
+        let m = measured.len();
+        // (The code of a dead zone is the law's matter: 0.7 is held, of which 0.6 acts.)
+        let law = Function {
+            outputs: vec![(String::new(), parse(&format!("{law} + 0.1")).unwrap().expr)],
+            ..code.law.clone()
+        };
+        let folder = tempfile::tempdir().unwrap();
+        let path = |name: &str| folder.path().join(name);
+        let run =
+            |program: &str| String::from_utf8(Command::new(path(program)).output().unwrap().stdout).unwrap();
+        let main = format!(
+            "mod libm {{}}\n#[allow(unused_imports)]\nmod law {{ use super::libm; include!(\"law.rs\"); }}\n#[allow(unused_imports)]\n\
+             mod observer {{ use super::libm; include!(\"observer.rs\"); }}\nuse observer::Observer;\nfn main() {{\n \
+             match Observer::start_at(&[2.0; {m}], 0.7) {{\n  Some(mut o) => print!(\"1 {{:.3}} \", \
+             (o.step(&[2.0; {m}], &[2.0], law::control_law) * 1e6).round() / 1e6),\n  None => print!(\"0 0 \"),\n }}\n \
+             print!(\"{{}} \", u8::from(Observer::start_at(&[f64::NAN; {m}], 0.7).is_some()));\n \
+             print!(\"{{}} \", u8::from(Observer::start_at(&[2.0; {m}], f64::INFINITY).is_some()));\n}}\n"
+        );
+        std::fs::write(path("law.rs"), law.code(Language::Rust).unwrap()).unwrap();
+        std::fs::write(path("observer.rs"), code.code(Language::Rust).unwrap()).unwrap();
+        std::fs::write(path("main.rs"), main.replace("{:.3}", "{}")).unwrap();
+        let rustc = std::env::var_os("RUSTC").unwrap_or_else(|| "rustc".into());
+        let made = Command::new(&rustc)
+            .current_dir(folder.path())
+            .args(["--edition", "2024", "-A", "dead_code", "-o", "run_rust", "main.rs"])
+            .output()
+            .unwrap();
+        assert!(made.status.success(), "{}", String::from_utf8_lossy(&made.stderr));
+        assert_eq!(run("run_rust"), wanted);
+        if Command::new("gcc").arg("--version").output().is_err() {
+            println!("skipped: no C compiler here");
+            continue;
+        }
+        let main = "#include \"observer.c\"\n#include <math.h>\n#include <stdio.h>\nint main(void)\n{\n    static const double y[2] = {2.0, 2.0}, \
+             none[2] = {NAN, 2.0}, r[1] = {2.0};\n    observer_memory m;\n    const int found = observer_start_at(&m, y, 0.7);\n    \
+             printf(\"%d %g \", found, found ? observer_step(&m, y, r) : 0.0);\n    printf(\"%d \", observer_start_at(&m, none, 0.7));\n    \
+             printf(\"%d \", observer_start_at(&m, y, INFINITY));\n    return 0;\n}\n";
+        std::fs::write(path("law.c"), law.code(Language::C99).unwrap()).unwrap();
+        std::fs::write(path("observer.c"), code.code(Language::C99).unwrap()).unwrap();
+        std::fs::write(path("main.c"), main).unwrap();
+        let strict = ["-std=c99", "-O2", "-Wall", "-Wextra", "-Wpedantic", "-Wconversion", "-Werror"];
+        let made = Command::new("gcc")
+            .current_dir(folder.path())
+            .args(strict)
+            .args(["main.c", "law.c", "-lm", "-o", "run_c"])
+            .output()
+            .unwrap();
+        assert!(made.status.success(), "{}", String::from_utf8_lossy(&made.stderr));
+        assert_eq!(run("run_c"), wanted);
+    }
 }

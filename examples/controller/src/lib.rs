@@ -7,7 +7,7 @@ use greybox_control::{
     Controller, DesignOptions, Integral, Method, ObserverMethod, OutputFeedback, OutputOptions, Plant,
     PlantOptions, Sensor, design,
 };
-use greybox_export::{Constant, Function, Group, Member, ObserverCode, ObserverForm};
+use greybox_export::{Constant, Function, Group, Member, ObserverCode, ObserverForm, StartForm};
 use greybox_model::{Expr, Model};
 
 /// A geared motor turns an arm; θ from hanging down.
@@ -58,7 +58,9 @@ pub fn designed(model: &Model) -> Result<(Controller, OutputFeedback), Box<dyn E
 /// # Errors
 /// Where the observer is no Kalman filter.
 pub fn code(law: &Controller, output: &OutputFeedback) -> Result<ObserverCode, Box<dyn Error>> {
-    let Form::Kalman { gain } = output.observer().form() else { return Err("no Kalman filter".into()) };
+    let Form::Kalman { gain, start } = output.observer().form() else {
+        return Err("no Kalman filter".into());
+    };
     let plant = law.plant();
     let group =
         |name: &str, member: &str| Group { name: name.into(), members: vec![Member::new(member, 0, "SI")] };
@@ -100,7 +102,17 @@ pub fn code(law: &Controller, output: &OutputFeedback) -> Result<ObserverCode, B
         dead_zone: plant.dead_zone(),
         substeps: output.observer().substeps(),
         input_delay: (0, 0.0),
-        form: ObserverForm::Kalman { gain },
+        form: ObserverForm::Kalman {
+            gain,
+            start: StartForm {
+                point: start.point,
+                sizes: start.sizes,
+                matrix: start.matrix,
+                most_steps: start.most_steps,
+                last_step: start.last_step,
+                close: start.close,
+            },
+        },
         rest: None,
     })
 }

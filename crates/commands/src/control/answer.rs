@@ -81,6 +81,7 @@ pub(super) fn report(page: &ControlPage, designed: &Designed<'_>) -> Value {
         })).collect::<Vec<_>>(),
         "closed_loop": {
             "diverged": run.diverged.is_some(),
+            "held_command": designed.held,
             "set_points": run.metrics.iter().map(metrics).collect::<Vec<_>>(),
             "tracking": run.tracking.as_ref().map(tracking),
         },
@@ -107,12 +108,21 @@ fn observer_report(plant: &Plant, output: &OutputFeedback) -> Value {
         ObserverMethod::Kalman { disturbance } => ("kalman", json!({ "disturbance": disturbance })),
         ObserverMethod::Eso { bandwidth } => ("eso", json!({ "bandwidth": bandwidth })),
     };
-    let gain = match output.observer().form() {
-        observer::Form::Kalman { gain, .. } => json!(gain),
-        observer::Form::Eso(_) => Value::Null,
+    let (gain, start) = match output.observer().form() {
+        observer::Form::Kalman { gain, start } => {
+            let command = start.point.last();
+            (
+                json!(gain),
+                json!({
+                    "state": start.point[..plant.order()], "command": command, "matrix": start.matrix,
+                }),
+            )
+        }
+        observer::Form::Eso(_) => (Value::Null, Value::Null),
     };
     json!({
         "kind": kind, "setting": setting, "integral": output.integral() != Integral::Off, "gain": gain,
+        "start": start,
         "rest": output.rest().map(|rest| json!({
             "time": rest.time, "step": rest.step, "velocity": rest.velocity(), "integral_time": rest.integral_time,
         })),

@@ -3,7 +3,9 @@
 use std::fmt::Write as _;
 
 use greybox_control::{Controller, OutputFeedback, Plant, Run, observer};
-use greybox_export::{ChainForm, Constant, Function, Group, Member, ObserverCode, ObserverForm, RestForm};
+use greybox_export::{
+    ChainForm, Constant, Function, Group, Member, ObserverCode, ObserverForm, RestForm, StartForm,
+};
 use greybox_model::Model;
 use greybox_recording::write_csv;
 
@@ -70,7 +72,17 @@ pub(super) fn observer_code(
             .collect(),
     };
     let form = match output.observer().form() {
-        observer::Form::Kalman { gain } => ObserverForm::Kalman { gain },
+        observer::Form::Kalman { gain, start } => ObserverForm::Kalman {
+            gain,
+            start: StartForm {
+                point: start.point,
+                sizes: start.sizes,
+                matrix: start.matrix,
+                most_steps: start.most_steps,
+                last_step: start.last_step,
+                close: start.close,
+            },
+        },
         observer::Form::Eso(chains) => ObserverForm::Chains(
             chains
                 .into_iter()

@@ -14,6 +14,8 @@ pub(super) struct Designed<'a> {
     pub(super) output: Option<&'a OutputFeedback>,
     /// Of the loop, beside the model's, s.
     pub(super) delay: f64,
+    /// The command under which the observer starts at the machine; at zero where there is none.
+    pub(super) held: Option<f64>,
     pub(super) run: &'a Run,
     pub(super) family: Option<&'a Family>,
 }

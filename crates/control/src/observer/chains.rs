@@ -150,9 +150,36 @@ impl Chains {
             estimate[coordinate.first..][..coordinate.order].copy_from_slice(&z[..coordinate.order]);
             lumped.push(z[coordinate.order] + coordinate.input * u);
         }
-        let x = &estimate[..n];
+        estimate[n] = self.disturbance(plant, &estimate[..n], &lumped, u);
+    }
+
+    /// The chains, x̂ and d̂ at a machine that rests at its measurements under a command: z = (y, 0, …, −b u).
+    pub(super) fn rest(
+        &self,
+        plant: &Plant,
+        measured: &[usize],
+        (estimate, chains): (&mut [f64], &mut [AnyChain]),
+        y: &[f64],
+        u: f64,
+    ) {
+        let n = plant.order();
+        for (coordinate, chain) in self.coordinates.iter().zip(chains) {
+            let at = measured.iter().position(|i| *i == coordinate.first);
+            let y = at.and_then(|at| y.get(at)).copied().unwrap_or(f64::NAN);
+            let mut z = vec![0.0; coordinate.order + 1];
+            z[0] = y;
+            z[coordinate.order] = -coordinate.input * u;
+            chain.start_at(&z, y);
+            estimate[coordinate.first..][..coordinate.order].copy_from_slice(&z[..coordinate.order]);
+        }
+        let lumped = vec![0.0; self.coordinates.len()];
+        estimate[n] = self.disturbance(plant, &estimate[..n], &lumped, u);
+    }
+
+    /// d̂ from what the highest derivatives are, the command included.
+    fn disturbance(&self, plant: &Plant, x: &[f64], lumped: &[f64], u: f64) -> f64 {
         let modelled = plant.frictionless_rate(x, u);
-        let mut g = vec![0.0; n];
+        let mut g = vec![0.0; x.len()];
         plant.frictionless_input(x, &mut g);
         let (mut above, mut below) = (0.0, 0.0);
         for (coordinate, lumped) in self.coordinates.iter().zip(lumped) {
@@ -161,7 +188,7 @@ impl Chains {
             above += weight * (lumped - modelled[row]);
             below += weight * g[row];
         }
-        estimate[n] = if below > 0.0 { above / below } else { 0.0 };
+        if below > 0.0 { above / below } else { 0.0 }
     }
 
     /// The tangent at a state of rest of the plant; the older of two commands acts for a share of a sample.

@@ -15,6 +15,7 @@ typedef struct {
 @CHAINS@@REST@} observer_memory;
 
 void observer_start(observer_memory *memory);
+int observer_start_at(observer_memory *memory, const double measured[@M@], double command);
 double observer_step(observer_memory *memory, const double measured[@M@], const double set_point[@R@]);
 
 /* Before the first sample. */
@@ -60,6 +61,67 @@ static void predict(double x[@N1@], double command, double time, int steps)
 
 ";
 
+const START_AT: &str = "/* In the place of observer_start at a machine that rests at its measurements under a held command: the estimate is that state of
+   rest, and what else holds it is the disturbance. With the set point where the machine rests, observer_step then
+   begins with that command. 1, or 0 and as observer_start where a number is none, or no state of rest is found. */
+int observer_start_at(observer_memory *memory, const double measured[@M@], double command)
+{
+    const double gap = @GAP@;
+    const double held = command > gap ? command - gap : command < -gap ? command + gap : 0.0;
+    int i;
+    observer_start(memory);
+    if (command - command != 0.0) return 0;
+    for (i = 0; i < @M@; i++) {
+        if (measured[i] - measured[i] != 0.0) return 0;
+    }
+@BALANCE@    for (i = 0; i < @PAST@; i++) memory->past[i] = held;
+    memory->command = command;
+    memory->started = 1;
+@OFFSET@    return 1;
+}
+
+";
+
+const BALANCE: &str = "    {
+        static const int place[@M@] = {@PLACES@};
+        static const double point[@N1@] = @POINT@, size[@N1@] = @SIZES@;
+        static const double toward[@N1@][@NM@] = {@MATRIX@};
+        double x[@N1@], off[@NM@], change[@N1@], input[1], length, last = -1.0;
+        int j, k;
+        for (i = 0; i < @N1@; i++) x[i] = point[i];
+        x[@N@] -= held;
+        for (k = 0; k < @STEPS@; k++) {
+            input[0] = held + x[@N@];
+            @RATE@(x, input, off);
+            for (j = 0; j < @M@; j++) off[@N@ + j] = x[place[j]] - measured[j];
+            length = 0.0;
+            for (i = 0; i < @N1@; i++) {
+                change[i] = 0.0;
+                for (j = 0; j < @NM@; j++) change[i] += toward[i][j] * off[j];
+                length += change[i] / size[i] * (change[i] / size[i]);
+            }
+            if (length - length != 0.0 || (last >= 0.0 && length >= last)) break;
+            for (i = 0; i < @N1@; i++) x[i] -= change[i];
+            last = length;
+            if (length <= @LAST@ * @LAST@) break;
+        }
+        if (last < 0.0 || last > @CLOSE@ * @CLOSE@) return 0;
+        for (i = 0; i < @N1@; i++) memory->estimate[i] = x[i];
+    }
+";
+
+const CHAIN_AT_REST: &str =
+    "    memory->chain[@START@] = memory->estimate[@FIRST@] = memory->last[@K@] = measured[@AT@];
+    memory->chain[@LAST@] = @AGAINST@ * held;
+    memory->begun[@K@] = 1;
+";
+
+const EXPLAINED: &str = "    explain(memory, held);
+";
+
+const OFFSET: &str = "    memory->offset = memory->estimate[@N@];
+";
+
 const STEP: &str = "/* Once a sample, every @DT@ s: the command from the measurements and the set point. A measurement that is not a
    number is left out. */
 double observer_step(observer_memory *memory, const double measured[@M@], const double set_point[@R@])
@@ -92,15 +154,24 @@ const KALMAN: &str = " else {
     }
 ";
 
+const EXPLAIN: &str = "/* The disturbance: what the equations do not explain of the highest derivatives. */
+static void explain(observer_memory *memory, double acting)
+{
+    double *x = memory->estimate;
+    double lumped, above = 0.0, below = 0.0, rest[@N@], moved[@N@], input[1];
+    input[0] = acting;
+    @RATE@(x, input, rest);
+    input[0] = acting + 1.0;
+    @RATE@(x, input, moved);
+@DISTURBANCES@    x[@N@] = below > 0.0 ? above / below : 0.0;
+}
+
+";
+
 const ESO: &str = "
     {
         const double acting = @ACTING@;
-        double lumped, above = 0.0, below = 0.0, rest[@N@], moved[@N@], input[1];
-@CHAINS@        input[0] = acting;
-        @RATE@(x, input, rest);
-        input[0] = acting + 1.0;
-        @RATE@(x, input, moved);
-@DISTURBANCES@        x[@N@] = below > 0.0 ? above / below : 0.0;
+@CHAINS@        explain(memory, acting);
     }
 ";
 
@@ -129,9 +200,9 @@ const CHAIN: &str = "        {
         }
 ";
 
-const DISTURBANCE: &str = "        lumped = memory->chain[@LAST@] + @GAIN@ * acting;
-        above += @WEIGHT@ * (moved[@ROW@] - rest[@ROW@]) * (lumped - rest[@ROW@]);
-        below += @WEIGHT@ * (moved[@ROW@] - rest[@ROW@]) * (moved[@ROW@] - rest[@ROW@]);
+const DISTURBANCE: &str = "    lumped = memory->chain[@LAST@] + @GAIN@ * acting;
+    above += @WEIGHT@ * (moved[@ROW@] - rest[@ROW@]) * (lumped - rest[@ROW@]);
+    below += @WEIGHT@ * (moved[@ROW@] - rest[@ROW@]) * (moved[@ROW@] - rest[@ROW@]);
 ";
 
 const AHEAD: &str = "    /* The law acts on the states that its command will meet. */
@@ -224,21 +295,44 @@ pub(super) fn write(code: &ObserverCode) -> String {
     if code.predicts() {
         out.push_str(&fill(PREDICT, &[("N", &n), ("N1", &n1), ("RATE", rate)]));
     }
-    let estimate = match &code.form {
-        ObserverForm::Kalman { gain } => fill(
-            KALMAN,
-            &[
-                ("N1", &n1),
-                ("M", &m),
-                ("GAIN", &list(gain.iter().map(|row| braces(row)))),
-                ("PREDICTIONS", &code.over_a_sample(&predict("x"))),
-            ],
-        ),
+    let text = ChainText {
+        explain: EXPLAIN,
+        whole: ESO,
+        rest: CHAIN_AT_REST,
+        chain: CHAIN,
+        disturbance: DISTURBANCE,
+        row: braces,
+        past: "past",
+    };
+    let (estimate, balance) = match &code.form {
+        ObserverForm::Kalman { gain, start } => {
+            let estimate = fill(
+                KALMAN,
+                &[
+                    ("N1", &n1),
+                    ("M", &m),
+                    ("GAIN", &list(gain.iter().map(|row| braces(row)))),
+                    ("PREDICTIONS", &code.over_a_sample(&predict("x"))),
+                ],
+            );
+            (estimate, start.write(BALANCE, braces, code))
+        }
         ObserverForm::Chains(chains) => {
-            ChainText { whole: ESO, chain: CHAIN, disturbance: DISTURBANCE, row: braces, past: "past" }
-                .write(code, chains)
+            out.push_str(&text.explained(code, chains));
+            (text.write(code, chains), text.at_rest(code, chains) + EXPLAINED)
         }
     };
+    let offset = code.rest.as_ref().map_or_else(String::new, |_| fill(OFFSET, &[("N", &n)]));
+    out.push_str(&fill(
+        START_AT,
+        &[
+            ("M", &m),
+            ("GAP", &number(code.dead_zone)),
+            ("PAST", &past),
+            ("BALANCE", &balance),
+            ("OFFSET", &offset),
+        ],
+    ));
     let call = if code.is_delayed() {
         let predictions = code.over_the_delay(&predict("ahead"), "i - 1", &|call| {
             format!("        for (i = {delay}; i > 0; i--) {}", call.trim_start())

@@ -49,6 +49,23 @@ impl Observer {
 @ZEROS@@UNMOVED@        }
     }
 
+    /// In the place of `new` at a machine that rests at its measurements under a held command: the estimate is that state of
+    /// rest, and what else holds it is the disturbance. With the set point where the machine rests, `step` then begins
+    /// with that command. None where a number is none, or no state of rest is found.
+    #[must_use]
+    pub fn start_at(measured: &[f64; @M@], command: f64) -> Option<Observer> {
+        const GAP: f64 = @GAP@;
+        let held = if command > GAP { command - GAP } else if command < -GAP { command + GAP } else { 0.0 };
+        if !command.is_finite() || !measured.iter().all(|y| y.is_finite()) {
+            return None;
+        }
+        let mut start = Observer::new();
+@BALANCE@        start.past = [held; @PAST@];
+        start.command = command;
+        start.started = true;
+@OFFSET@        Some(start)
+    }
+@EXPLAIN@
     /// Once a sample, every @DT@ s: the command from the measurements and the set point. A measurement that is not a
     /// number is left out. `law` is `@LAW@`.
     pub fn step(
@@ -103,14 +120,72 @@ const KALMAN: &str = " else {
         }
 ";
 
-const ESO: &str = "
-        let acting = @ACTING@;
-@CHAINS@        let mut x = [0.0; @N@];
+const BALANCE: &str = "        const PLACE: [usize; @M@] = [@PLACES@];
+        const SIZE: [f64; @N1@] = @SIZES@;
+        const TOWARD: [[f64; @NM@]; @N1@] = [@MATRIX@];
+        let mut estimate: [f64; @N1@] = @POINT@;
+        estimate[@N@] -= held;
+        let mut last = f64::INFINITY;
+        for _ in 0..@STEPS@ {
+            let mut x = [0.0; @N@];
+            x.copy_from_slice(&estimate[..@N@]);
+            let mut off = [0.0; @NM@];
+            off[..@N@].copy_from_slice(&@RATE@(&x, &[held + estimate[@N@]]));
+            for j in 0..@M@ {
+                off[@N@ + j] = x[PLACE[j]] - measured[j];
+            }
+            let (mut change, mut length) = ([0.0; @N1@], 0.0);
+            for i in 0..@N1@ {
+                for j in 0..@NM@ {
+                    change[i] += TOWARD[i][j] * off[j];
+                }
+                length += change[i] / SIZE[i] * (change[i] / SIZE[i]);
+            }
+            if !length.is_finite() || length >= last {
+                break;
+            }
+            for i in 0..@N1@ {
+                estimate[i] -= change[i];
+            }
+            last = length;
+            if length <= @LAST@ * @LAST@ {
+                break;
+            }
+        }
+        if last > @CLOSE@ * @CLOSE@ {
+            return None;
+        }
+        start.estimate = estimate;
+";
+
+const CHAIN_AT_REST: &str = "        start.chain[@START@] = measured[@AT@];
+        start.chain[@LAST@] = @AGAINST@ * held;
+        start.estimate[@FIRST@] = measured[@AT@];
+        start.last[@K@] = measured[@AT@];
+        start.begun[@K@] = true;
+";
+
+const EXPLAINED: &str = "        start.explain(held);
+";
+
+const OFFSET: &str = "        start.offset = start.estimate[@N@];
+";
+
+const EXPLAIN: &str = "
+    /// The disturbance: what the equations do not explain of the highest derivatives.
+    fn explain(&mut self, acting: f64) {
+        let mut x = [0.0; @N@];
         x.copy_from_slice(&self.estimate[..@N@]);
         let rest = @RATE@(&x, &[acting]);
         let moved = @RATE@(&x, &[acting + 1.0]);
         let (mut above, mut below) = (0.0, 0.0);
 @DISTURBANCES@        self.estimate[@N@] = if below > 0.0 { above / below } else { 0.0 };
+    }
+";
+
+const ESO: &str = "
+        let acting = @ACTING@;
+@CHAINS@        self.explain(acting);
 ";
 
 const CHAIN: &str = "        {
@@ -231,19 +306,31 @@ pub(super) fn write(code: &ObserverCode) -> String {
     if code.predicts() {
         out.push_str(&fill(PREDICT, &[("N", &n), ("N1", &n1), ("RATE", &code.rate.name)]));
     }
-    let estimate = match &code.form {
-        ObserverForm::Kalman { gain } => fill(
-            KALMAN,
-            &[
-                ("N1", &n1),
-                ("M", &m),
-                ("GAIN", &list(gain.iter().map(|row| brackets(row)))),
-                ("PREDICTIONS", &code.over_a_sample(&predict("            ", "self.estimate"))),
-            ],
-        ),
+    let text = ChainText {
+        explain: EXPLAIN,
+        whole: ESO,
+        rest: CHAIN_AT_REST,
+        chain: CHAIN,
+        disturbance: DISTURBANCE,
+        row: brackets,
+        past: "self.past",
+    };
+    let (estimate, balance, explain) = match &code.form {
+        ObserverForm::Kalman { gain, start } => {
+            let estimate = fill(
+                KALMAN,
+                &[
+                    ("N1", &n1),
+                    ("M", &m),
+                    ("GAIN", &list(gain.iter().map(|row| brackets(row)))),
+                    ("PREDICTIONS", &code.over_a_sample(&predict("            ", "self.estimate"))),
+                ],
+            );
+            (estimate, start.write(BALANCE, brackets, code), String::new())
+        }
         ObserverForm::Chains(chains) => {
-            ChainText { whole: ESO, chain: CHAIN, disturbance: DISTURBANCE, row: brackets, past: "self.past" }
-                .write(code, chains)
+            let balance = text.at_rest(code, chains) + EXPLAINED;
+            (text.write(code, chains), balance, text.explained(code, chains))
         }
     };
     let resting = |text: &str| code.rest.as_ref().map_or_else(String::new, |_| fill(text, &[("N", &n)]));
@@ -269,6 +356,9 @@ pub(super) fn write(code: &ObserverCode) -> String {
             ("COMMAND", &command),
             ("RESTING", &resting(RESTING)),
             ("UNMOVED", &resting(UNMOVED)),
+            ("BALANCE", &balance),
+            ("EXPLAIN", &explain),
+            ("OFFSET", &resting(OFFSET)),
             ("FIELDS", &chained(FIELDS)),
             ("ZEROS", &chained(ZEROS)),
             ("R", &code.references()),

@@ -196,6 +196,41 @@ impl Carry {
         &self.dx
     }
 
+    /// The same, where the states are known to reach these magnitudes (one for each entry of the state vector): the absolute tolerance
+    /// of [`Method::Adaptive`](crate::Method::Adaptive) is relative to them, where the states have not been larger. A
+    /// motion that begins at rest in many short stretches would else be integrated to the rounding of its forces.
+    ///
+    /// ```
+    /// # use greybox_model::{Model, System};
+    /// use greybox_simulate::{Carry, Environment, Method, Seeds, Simulation};
+    /// # let model = Model::from_toml(r#"
+    /// # [parameters]
+    /// # a = { value = 1.0, unit = "1/s" }
+    /// # [states]
+    /// # x = { unit = "m" }
+    /// # [equations]
+    /// # decay = "x' + a*x = 0"
+    /// # "#, "model.toml").unwrap();
+    /// # let system = System::compile(&model).unwrap();
+    /// let environment = Environment { start: 0.0, dt: 1.0, len: 2, inputs: vec![], forces: vec![] };
+    /// let simulation = Simulation {
+    ///     system: &system,
+    ///     environment: &environment,
+    ///     parameters: &[1.0],
+    ///     method: Method::Adaptive { rtol: 1e-9, atol: 1e-9 },
+    ///     seeds: &Seeds::default(),
+    /// };
+    /// // Beside a metre, a micrometre takes fewer steps.
+    /// let coarse = Carry::remembered(&system, 0, 1.0, &[]).reaching(&[1.0]);
+    /// let (known, _) = simulation.run_on(&[1e-6], 0..2, Some(&coarse), &[]);
+    /// assert!(known.steps < simulation.run(&[1e-6], 0..2).steps);
+    /// ```
+    #[must_use]
+    pub fn reaching(mut self, magnitudes: &[f64]) -> Carry {
+        self.reach = magnitudes.to_vec();
+        self
+    }
+
     /// What a stretch that starts at `sample` remembers of `states[entry][k]`, samples `dt` apart of which the last
     /// is that of the start; `None` where an entry's past is not known. Delayed expressions of the equations that
     /// are such an entry, and nothing more, read it there; the others hold their initial value, and those of the
