@@ -40,27 +40,30 @@ pub(crate) fn folds(data: &Data) -> Vec<Fold> {
         folds.retain(|f| !f.is_empty());
         return folds;
     }
+    let whole: Fold = data.pieces.iter().enumerate().map(|(i, piece)| (i, 0..piece.len)).collect();
     let total = data.samples();
     let first = total / 2;
     let blocks = ((total - first) / SHORTEST).clamp(1, FOLDS - 1);
-    (0..blocks)
-        .map(|k| {
-            let at = |k: usize| first + k * (total - first) / blocks;
-            let wanted = at(k)..at(k + 1);
-            let mut before = 0;
-            let mut fold = Fold::new();
-            for (i, piece) in data.pieces.iter().enumerate() {
-                let from = wanted.start.clamp(before, before + piece.len) - before;
-                let to = wanted.end.clamp(before, before + piece.len) - before;
-                if to >= from + SHORTEST {
-                    fold.push((i, from..to));
-                }
-                before += piece.len;
-            }
-            fold
-        })
-        .filter(|f| !f.is_empty())
-        .collect()
+    let at = |k: usize| first + k * (total - first) / blocks;
+    let mut folds: Vec<Fold> = (0..blocks).map(|k| cut(&whole, at(k)..at(k + 1))).collect();
+    folds.iter_mut().for_each(|fold| fold.retain(|(_, range)| range.len() >= SHORTEST));
+    folds.retain(|f| !f.is_empty());
+    folds
+}
+
+/// What these of a fold's samples, counted through its stretches, are of each.
+fn cut(fold: &Fold, wanted: Range<usize>) -> Fold {
+    let mut before = 0;
+    let mut part = Fold::new();
+    for (piece, range) in fold {
+        let from = wanted.start.clamp(before, before + range.len()) - before;
+        let to = wanted.end.clamp(before, before + range.len()) - before;
+        if to > from {
+            part.push((*piece, range.start + from..range.start + to));
+        }
+        before += range.len();
+    }
+    part
 }
 
 /// What is judged of the training data: the folds, or their parts where there are fewer than a single recording has blocks.
@@ -79,21 +82,7 @@ fn parts_each(folds: &[Fold]) -> usize {
 fn parts(fold: &Fold, count: usize) -> Vec<Fold> {
     let total: usize = fold.iter().map(|(_, range)| range.len()).sum();
     let count = count.min(total / SHORTEST).max(1);
-    let part = |k: usize| {
-        let wanted = k * total / count..(k + 1) * total / count;
-        let mut before = 0;
-        let mut part = Fold::new();
-        for (piece, range) in fold {
-            let from = wanted.start.clamp(before, before + range.len()) - before;
-            let to = wanted.end.clamp(before, before + range.len()) - before;
-            if to > from {
-                part.push((*piece, range.start + from..range.start + to));
-            }
-            before += range.len();
-        }
-        part
-    };
-    (0..count).map(part).collect()
+    (0..count).map(|k| cut(fold, k * total / count..(k + 1) * total / count)).collect()
 }
 
 /// The mean over the channels of ln(RMS error / spread) on each of the parts that are [judged], left out of the fit with the
