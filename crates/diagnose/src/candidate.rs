@@ -1,5 +1,7 @@
 //! A mechanism at a place: what it adds to the model.
 
+use std::iter;
+
 use greybox_calibrate::{FreeParameter, Prior};
 use greybox_model::{Equation, Expr, Model, Parameter, State, Unit};
 
@@ -61,7 +63,11 @@ pub fn candidates(model: &Model, library: &[Mechanism], places: &[Place]) -> Vec
                 _ => false,
             };
             let candidate = Candidate { mechanism: i, place: place.clone(), mirrored: false };
+            // About a reference that stands, the rate is that of the coordinate.
+            let is_known =
+                |other: &Candidate| other.mechanism == i && candidate.is_as(other, model, mechanism);
             if fits
+                && !out.iter().any(is_known)
                 && place.admits(mechanism.domain, model)
                 && candidate.has_units(model, mechanism)
                 && !candidate.duplicates(model, mechanism)
@@ -132,6 +138,20 @@ impl Candidate {
         let mut with = model.clone();
         self.insert(&mut with, mechanism, &vec![1.0; mechanism.parameters().count()]);
         with.resolve_units().is_ok() || model.clone().resolve_units().is_err()
+    }
+
+    /// Whether the same mechanism is the same force on a motion as another.
+    fn is_as(&self, other: &Candidate, model: &Model, mechanism: &Mechanism) -> bool {
+        let (Place::Motion(one), Place::Motion(two)) = (&self.place, &other.place) else { return false };
+        let keep = |n: &str| n.to_owned();
+        let law = |c: &Candidate| -> Vec<Expr> {
+            let of_states = mechanism.states.iter().flat_map(|s| [&s.lhs, &s.rhs]);
+            iter::once(&mechanism.law)
+                .chain(of_states)
+                .map(|e| c.translate(model, e, &keep).simplify())
+                .collect()
+        };
+        one.weights == two.weights && law(self) == law(other)
     }
 
     /// Whether it is collinear with a free parameter of the model: its force is in every equation the
@@ -409,6 +429,19 @@ mod tests {
         let is_offered = |kind: &str| all.iter().any(|c| library[c.mechanism].kind == kind);
         assert!(!is_offered("viscous_friction") && !is_offered("linear_stiffness"));
         assert!(is_offered("asymmetric_damping") && is_offered("asymmetric_stiffness"));
+    }
+
+    /// About a reference that stands, a law of the position is another one, and a law of the rate is not.
+    #[test]
+    fn a_law_of_the_rate_knows_no_reference() {
+        let text = "[states]\nx = { unit = \"m\" }\n[parameters]\nm = { value = 1.0, unit = \"kg\" }\n\
+                    k = { value = 9.0, unit = \"N/m\" }\nx0 = { value = 0.1, unit = \"m\" }\n\
+                    [equations]\nmass = \"m*x'' + k*(x - x0) = 0\"\n";
+        let model = Model::from_toml(text, "mass.toml").unwrap();
+        let library = crate::built_in().unwrap();
+        let all = candidates(&model, &library, &places(&model));
+        let offered = |kind: &str| all.iter().filter(|c| library[c.mechanism].kind == kind).count();
+        assert_eq!(["cubic_stiffness", "coulomb_friction", "presliding_friction"].map(offered), [2, 1, 1]);
     }
 
     /// The force of a spring is a load as that of an input is, and only the latter drives, a torque that falls with the speed

@@ -4,8 +4,8 @@
 //! parameter p whose derivative of the equations is rank one, ∂(equations)/∂p = w·g with constant w
 //! and g affine in the coordinates (or rates), shows an element of the machine: a spring or a damper
 //! that acts on the motion d = g with the weights w on the equations, so that action equals reaction.
-//! What stands in g beside the coordinates is a reference: the ambient temperature of a heat loss, the
-//! road under a tire. A missing force F(d, d') at that element enters equation e as w_e F.
+//! What stands in g beside the coordinates is a reference, a parameter or an input: the ambient
+//! temperature of a heat loss, the road under a tire. A missing force F(d, d') at that element enters equation e as w_e F.
 //!
 //! The other places: an equation as a whole, an input, a measurement, a parameter (that may drift), a
 //! spring (a parameter k whose element is a position, so that its term is w k d), a pair of coordinates
@@ -483,6 +483,11 @@ impl Motion {
             Reference::Of(reference) => reference,
             Reference::Several => return None,
         };
+        // A bare number is where the coordinate has its origin, nothing that something moves about.
+        let named = |name: &str| model.parameter(name).is_some() || model.input(name).is_some();
+        if !reference.variables().iter().any(|(name, _)| named(name)) {
+            return None;
+        }
         let beside = |d: Option<Expr>| d.map(|d| (d + reference.clone()).simplify());
         let moves =
             reference.variables().iter().any(|(name, _)| &**name == "t" || model.input(name).is_some());
@@ -661,6 +666,9 @@ mod tests {
             "[states]\nx = {}\n[parameters]\nm = { value = 1 }\nk = { value = 100 }\nx0 = { value = 0.1 }\n[equations]\nbody = \"m*x'' + 2*k*(x0 - x) = 0\"\n",
         );
         assert_eq!(hanger, [known(["x - x0", "x'", "x''"])]);
+        // An origin of the coordinate is no reference.
+        let origin = "[states]\nx = {}\n[parameters]\nk = { value = 100 }\n[equations]\nbody = \"x'' + k*(x - 3.14) = 0\"\n";
+        assert!(elements(origin).is_empty());
         // A slider on a belt.
         let belt = elements(
             "[inputs]\nv = {}\n[states]\nx = {}\n[parameters]\nm = { value = 1 }\nb = { value = 2 }\n[equations]\nbody = \"m*x'' + b*(x' - v) = 0\"\n",
