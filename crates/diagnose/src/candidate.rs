@@ -441,7 +441,7 @@ mod tests {
         let library = crate::built_in().unwrap();
         let all = candidates(&model, &library, &places(&model));
         let offered = |kind: &str| all.iter().filter(|c| library[c.mechanism].kind == kind).count();
-        assert_eq!(["cubic_stiffness", "coulomb_friction", "presliding_friction"].map(offered), [2, 1, 1]);
+        assert_eq!(["cubic_stiffness", "coulomb_friction", "quadratic_drag"].map(offered), [2, 1, 1]);
     }
 
     /// The force of a spring is a load as that of an input is, and only the latter drives, a torque that falls with the speed
