@@ -10,7 +10,7 @@ use std::time::Duration;
 use common::Bench;
 use greybox_recording::Zone;
 use running::{Broker, Running, Watching};
-use serde_json::Value;
+use serde_json::{Value, json};
 
 #[allow(dead_code, reason = "not every test file uses all of it")]
 mod common;
@@ -229,6 +229,91 @@ fn a_state_in_a_file_is_gone_on_from() {
     let second = bench.greybox_fed(&watch, &throttle::csv(&samples[10_000..]));
     assert_eq!(first.stdout + &second.stdout, whole.stdout);
     assert_eq!(bench.names(), ["state.json", "throttle.toml"]);
+}
+
+/// A throttle that stands still for 70 s: that nothing was told of its parameters is said, its first motion is outside what was
+/// learned, and it learns anew; then its friction grows.
+#[test]
+fn a_machine_that_stands_still_at_first_is_learned_anew_when_it_moves() {
+    const REST: f64 = 70.0;
+    let bench = bench();
+    let mut noise = noise::Noise(9);
+    let mut samples: Vec<[f64; 3]> =
+        (0..7000).map(|k| [f64::from(k) / 100.0, 0.0, 0.002 * noise.normal()]).collect();
+    samples.extend(throttle::samples(190.0).iter().map(|[t, u, y]| [t + REST, *u, *y]));
+    let input = throttle::csv(&samples);
+    let watch = ["watch", "throttle.toml", "--json", "--state", "state.json"];
+    let said = bench.greybox_fed(&watch, &input);
+    assert_eq!(said.code, 0, "{}", said.stderr);
+    let mut events = events(&said.stdout);
+    events.retain(|e| e["event"] != "estimates");
+    let kinds: Vec<&str> = events.iter().map(|e| e["event"].as_str().unwrap()).collect();
+    assert_eq!(kinds, ["learned", "outside", "learned", "changed", "settled"], "{events:?}");
+    let outside = &events[1];
+    assert!((0.0..2.0).contains(&(outside["t"].as_f64().unwrap() - REST)), "{outside}");
+    assert!(!outside["parameters"].as_array().unwrap().is_empty(), "{outside}");
+    assert_eq!(
+        (&events[0]["undetermined"], &events[2]["undetermined"]),
+        (&json!(["b", "c", "k"]), &json!([]))
+    );
+    assert!((0.0..6.0).contains(&(events[3]["t"].as_f64().unwrap() - REST - 150.0)), "{}", events[3]);
+    assert_eq!(events[4]["name"], "c");
+    // A state that ends while it learns anew is what was learned before.
+    let part = bench.greybox_fed(&["watch", "throttle.toml"], &throttle::csv(&samples[..8000]));
+    assert_eq!(part.code, 0, "{}", part.stderr);
+    for words in
+        ["N·m, not told by these seconds\n", ": outside what was learned: these samples say more of "]
+    {
+        assert!(part.stdout.contains(words), "{}", part.stdout);
+    }
+}
+
+/// Values that nothing can be computed with, and one that stands alone, while it learns and afterwards: the watch goes on, and
+/// every line is JSON. A block in which nothing was measured has no innovations.
+#[test]
+fn values_that_cannot_be_end_no_watch() {
+    let bench = bench();
+    let mut samples = throttle::samples(100.0);
+    (samples[1000][2], samples[2010][1], samples[3000][2]) = (1e300, -1e300, 40.0);
+    (samples[7000][2], samples[7510][1], samples[8000][2]) = (1e300, -1e300, 40.0);
+    samples[7200][0] = 1e300;
+    samples[9000..9200].iter_mut().for_each(|s| s[2] = 1e200);
+    let said = bench.greybox_fed(&["watch", "throttle.toml", "--json"], &throttle::csv(&samples));
+    assert_eq!(said.code, 0, "{}", said.stderr);
+    let events = events(&said.stdout);
+    assert!(of(&events, "changed").is_empty(), "{:?}", of(&events, "changed"));
+    let count = |key: &str| of(&events, "irregular").iter().map(|e| e[key].as_u64().unwrap()).sum::<u64>();
+    assert_eq!((count("outliers"), count("input_held"), count("diverged")), (2, 2, 0));
+    // (A clock that jumps there and back.)
+    assert_eq!(of(&events, "restarted").len(), 2);
+    let estimates = of(&events, "estimates");
+    assert!(estimates.iter().any(|e| e["innovations"][0][1].is_null()));
+    assert!(estimates.iter().rev().take(5).all(|e| e["innovations"][0][1].is_number()));
+}
+
+/// A state that was learned with another model is refused, and it is said what differs.
+#[test]
+fn the_state_of_another_model_is_refused() {
+    let bench = bench();
+    let text = throttle::csv(&throttle::samples(20.0));
+    state_after(&bench, &text);
+    for (from, to, part) in [
+        ("0.02,", "0.03,", "the parameter `J` is 0.02 in SI, unit [kg*m^2], fixed there, and 0.03 in SI"),
+        ("k*angle =", "2*k*angle =", "the equation `plate` is "),
+        ("\"zero\"", "\"linear\"", "the input `torque` is channel `torque` in [N*m], hold zero there"),
+    ] {
+        let other = throttle::MODEL.replacen(from, to, 1);
+        assert_ne!(other, throttle::MODEL);
+        bench.write("other.toml", &other);
+        let said = bench.greybox_fed(&["watch", "other.toml", "--state", "fed.json"], &text);
+        assert_eq!(said.code, 2, "{}", said.stderr);
+        assert!(
+            said.stderr.contains("fed.json: the saved state belongs to another model: "),
+            "{}",
+            said.stderr
+        );
+        assert!(said.stderr.contains(part), "{}", said.stderr);
+    }
 }
 
 /// While it learns, a clock that jumps back begins anew, and one that jumps on leaves a gap.

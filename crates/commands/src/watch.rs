@@ -1,6 +1,8 @@
 //! Lines of samples while a machine runs, and what a watch says of them.
 
-use greybox_recording::{Channel, Recording, Rename};
+use std::path::Path;
+
+use greybox_recording::{Channel, Recording, Rename, SIZES};
 use greybox_report::format;
 use greybox_watch::{Clock as Jump, Event, Options, Saved, Watch, WatchError};
 use serde::de::IgnoredAny;
@@ -38,6 +40,8 @@ pub struct Session {
     /// That of the samples, from the first of them on.
     clock: Option<Clock>,
     stage: Stage,
+    /// Whether it has learned before.
+    learned: bool,
     /// Lines one after the other that could not be read.
     unreadable: usize,
 }
@@ -123,7 +127,7 @@ pub enum Output {
 }
 
 impl Session {
-    /// A session on a model; `saved` is a state to go on from.
+    /// A session on a model; `saved` is a state to go on from, and the file that errors say it is in.
     ///
     /// # Errors
     /// Bad input: options that make no sense, or the state of another model.
@@ -131,18 +135,24 @@ impl Session {
         model: LoadedModel,
         map: &[Rename],
         options: Options,
-        saved: Option<State>,
+        saved: Option<(State, &Path)>,
     ) -> Result<Session, Failure> {
         options.check().map_err(|e| failure(&model, e))?;
+        let learned = saved.is_some();
         let (clock, stage) = match saved {
-            Some(State { clock, watch }) => {
-                let watch = Watch::restore(&model.model, watch).map_err(|e| failure(&model, e))?;
+            Some((State { clock, watch }, path)) => {
+                let watch = Watch::restore(&model.model, watch).map_err(|e| match e {
+                    WatchError::OtherModel { .. } => Failure::file(path, e)
+                        .help("delete the file to learn anew, or name another one after `--state`"),
+                    e => failure(&model, e),
+                })?;
                 (Some(clock), Stage::Watching(Box::new(watch)))
             }
             None => (None, Stage::Learning(First::default())),
         };
         let map = map.to_vec();
-        Ok(Session { model, map, options, line: 0, lines: None, columns: None, clock, stage, unreadable: 0 })
+        let (line, lines, columns, unreadable) = (0, None, None, 0);
+        Ok(Session { model, map, options, line, lines, columns, clock, stage, learned, unreadable })
     }
 
     /// The same on rows of CSV that have no header, whose columns have these names: `t [s],t [ns],_,angle [deg]`, as
@@ -231,6 +241,9 @@ impl Session {
     /// Bad input: they ended before anything was learned.
     pub fn end(&self) -> Result<(), Failure> {
         let Stage::Learning(First { seconds, .. }) = &self.stage else { return Ok(()) };
+        if self.learned {
+            return Ok(());
+        }
         Err(Failure::input(format!(
             "the samples ended after {} s, before the {} s from which is learned what is usual",
             format::number(*seconds),
@@ -285,6 +298,10 @@ impl Session {
                 Added::Enough => self.learn()?,
             },
         };
+        // (What was learned says nothing of what the machine does now.)
+        if events.iter().any(|event| matches!(event, Event::Outside(_))) {
+            self.stage = Stage::Learning(First::default());
+        }
         let clock = self.clock.unwrap_or_default();
         Ok(events.into_iter().map(|event| Output::Event { event, clock }).collect())
     }
@@ -300,14 +317,17 @@ impl Session {
             if channels.iter().any(|c| c.name == column.channel) {
                 continue;
             }
-            let values = rows.iter().map(|r| column.unit.from_si(r[k + 1])).collect();
+            // (What cannot be computed with is not measured, as afterwards.)
+            let value =
+                |r: &Vec<f64>| Some(column.unit.from_si(r[k + 1])).filter(|v| v.abs() <= *SIZES.end());
+            let values = rows.iter().map(|r| value(r).unwrap_or(f64::NAN)).collect();
             let unit = Some(column.unit.text.clone()).filter(|u| !u.is_empty());
             channels.push(Channel { name: column.channel.clone(), unit, values });
         }
         let recording = Recording::from_columns(LABEL, time, channels)?;
         let (watch, event) = Watch::learn(&self.model.model, &recording, &self.options)
             .map_err(|e| failure(&self.model, e))?;
-        self.stage = Stage::Watching(Box::new(watch));
+        (self.stage, self.learned) = (Stage::Watching(Box::new(watch)), true);
         Ok(vec![event])
     }
 }

@@ -73,7 +73,7 @@ fn check_channel(recording: &Recording, c: usize, role: Role, driven: bool) -> V
     // Levels that somebody set, and pulses between them, are what was commanded.
     if role == Role::Output || !is_set_level_by_level(longest) {
         findings.extend(quantisation(channel, longest));
-        findings.extend(outliers(recording, c, &rails));
+        findings.extend(stands_out(recording, c, &rails));
     }
     let full = fill_missing(longest);
     if full.len() < 16 || finite_range(&full).is_none_or(|(low, high)| low == high) {
@@ -298,8 +298,32 @@ fn quantisation(channel: &Channel, y: &[f64]) -> Option<Finding> {
     Some(finding)
 }
 
+/// Rows of a channel that stand out of their neighbours on either side, away from the values at which the signal is clipped: single
+/// faults of a measurement, by no model but a polynomial of a few samples. None near a gap or the ends of the recording.
+///
+/// ```
+/// use greybox_recording::{Channel, Recording, health};
+/// let time: Vec<f64> = (0..200).map(|k| 0.01 * f64::from(k)).collect();
+/// let mut values: Vec<f64> = (0..200).map(|k| (0.1 * f64::from(k)).sin() + 1e-3 * f64::from(k * k * 7919 % 101)).collect();
+/// values[120] = 25.0;
+/// let channel = Channel { name: "x".into(), unit: None, values };
+/// let log = Recording::from_columns("log.csv", time, vec![channel])?;
+/// assert_eq!(health::outliers(&log, 0), [120]);
+/// # Ok::<(), greybox_recording::RecordingError>(())
+/// ```
+pub fn outliers(recording: &Recording, channel: usize) -> Vec<usize> {
+    let Some(channel) = recording.channels.get(channel) else { return Vec::new() };
+    let rows = recording.pieces.iter().map(|piece| piece.rows.clone());
+    rows.flat_map(|rows| {
+        let values = &channel.values[rows.clone()];
+        let rails: Vec<f64> = clipping(channel, values).iter().filter_map(|finding| finding.value).collect();
+        crate::outliers::outliers(values, &rails).into_iter().map(move |k| rows.start + k)
+    })
+    .collect()
+}
+
 /// Single samples that stand out of their neighbours, away from the values at which the signal is clipped.
-fn outliers(recording: &Recording, c: usize, rails: &[f64]) -> Option<Finding> {
+fn stands_out(recording: &Recording, c: usize, rails: &[f64]) -> Option<Finding> {
     let (mut count, mut first) = (0usize, None);
     for piece in &recording.pieces {
         for k in crate::outliers::outliers(&piece.columns[c], rails) {

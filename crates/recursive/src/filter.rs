@@ -140,6 +140,17 @@ impl Filter {
         &self.sensitivity
     }
 
+    /// √s: the standard deviation of the error of a value that is measured with these derivatives by the state and this noise. Not
+    /// a number where the derivatives are not those of n entries.
+    pub fn deviation_of(&self, by_state: &[f64], noise: f64) -> f64 {
+        if by_state.len() != self.n {
+            return f64::NAN;
+        }
+        let of = |row: &[f64]| row.iter().zip(by_state).map(|(u, h)| u * h).sum::<f64>();
+        let known: f64 = self.root.chunks_exact(self.n.max(1)).map(|row| of(row) * of(row)).sum();
+        libm::sqrt(known + noise * noise)
+    }
+
     /// Standard deviation of each entry of the state.
     pub fn deviations(&self) -> Vec<f64> {
         let n = self.n;

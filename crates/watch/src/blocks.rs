@@ -122,6 +122,25 @@ impl Block {
         (0..self.effects).map(|j| self.channels.iter().map(|c| c.product(effect, j)).sum()).collect()
     }
 
+    /// By how much what is not known of the first parameters, with the covariance P (row by row), makes each score scatter, over
+    /// its own variance:
+    ///
+    /// ```text
+    /// ℓᵢ = uᵢᵀ P uᵢ / Σψᵢ²,     uᵢⱼ = Σ ψᵢψⱼ,   j a parameter
+    /// ```
+    pub(crate) fn leverages(&self, covariance: &[f64]) -> Vec<f64> {
+        let parameters = covariance.len().isqrt();
+        (0..self.effects)
+            .map(|i| {
+                let u = self.information(i);
+                let known =
+                    |a: usize| (0..parameters).map(|b| covariance[a * parameters + b] * u[b]).sum::<f64>();
+                let unknown: f64 = (0..parameters).map(|a| u[a] * known(a)).sum();
+                if u[i] > 0.0 { unknown / u[i] } else { 0.0 }
+            })
+            .collect()
+    }
+
     /// RMS of each channel's innovations; NaN where none were measured.
     pub(crate) fn rms(&self) -> Vec<f64> {
         let last = self.effects;
@@ -227,6 +246,39 @@ mod tests {
         assert!((4..=16).contains(&count), "{count}");
         // Few are left: no longer ones, however correlated they are.
         assert_eq!(together(&slow[..30], 16), 1);
+    }
+
+    /// Of blocks that were learned, no leverage is above one, whatever they are; one that moves as none of them did says more of a
+    /// parameter than all of them.
+    #[test]
+    fn a_block_that_was_learned_has_no_leverage_above_one() {
+        let mut seed = 3;
+        let mut block = |amplitudes: [f64; 3]| {
+            let mut block = Block::new(3, 1);
+            for _ in 0..20 {
+                let row = amplitudes.map(|a| a * noise(&mut seed));
+                block.push(0, &Innovation { value: noise(&mut seed), row: &row, deviation: 1.0 });
+            }
+            block
+        };
+        let mut learned: Vec<Block> = (0..30).map(|_| block([1.0, 1e-3, 1.0])).collect();
+        learned.push(block([50.0, 0.01, 3.0]));
+        let mut fit = LeastSquares::new(&[0.0; 2], &[1e3; 2]).unwrap();
+        for (row, value) in learned.iter().flat_map(Block::all) {
+            fit.update(&row[..2], value);
+        }
+        let known = fit.covariance();
+        for block in &learned {
+            assert!(
+                block.leverages(&known).iter().all(|l| (0.0..=1.0).contains(l)),
+                "{:?}",
+                block.leverages(&known)
+            );
+        }
+        // The one that moved the first parameter has said most of what is known of it.
+        assert!(learned[30].leverages(&known)[0] > 0.8);
+        let outside = block([1.0, 1.0, 1.0]).leverages(&known);
+        assert!(outside[1] > 100.0, "{outside:?}");
     }
 
     /// Innovations that one effect of size 3 makes, on noise: the score, its size, and the scatter that is left.

@@ -4,7 +4,7 @@ use greybox_model::Unit;
 use greybox_recursive::Direction;
 
 use crate::blocks::Ended;
-use crate::event::{Change, Estimates, Learned, Parameter, Subject};
+use crate::event::{Change, Estimates, Learned, Outside, Parameter, Subject};
 use crate::learn::Place;
 use crate::naming::{Explanation, alternatives, dispersion, likeliest};
 use crate::saved::Known;
@@ -107,7 +107,33 @@ impl Watch {
             alarms_per_day: self.now.alarms_per_day,
             charts: self.now.charts.len(),
             parameters: self.parameters(&self.now.fit.deviations()),
+            undetermined: self.undetermined(),
         }
+    }
+
+    /// Parameters of which the learned seconds hold less information than what was known beforehand: their variance is still more
+    /// than half of the prior's.
+    fn undetermined(&self) -> Vec<String> {
+        let (free, covered) = (&self.now.usual.free, &self.now.covered);
+        let n = free.len();
+        let told = |k: usize| covered[k * n + k] <= 0.5 * free[k].std.powi(2);
+        (0..n).filter(|k| !told(*k)).map(|k| free[k].name.clone()).collect()
+    }
+
+    /// What a block says more of than all that was learned. A score is judged by the parameters that were learned; where what is not
+    /// known of them makes it scatter more than the noise does, nothing is known of how it is distributed. Of the blocks that were
+    /// learned none is such a one ([`Block::leverages`](crate::blocks::Block::leverages)): P⁻¹ is the sum of their information.
+    pub(crate) fn outside(&self, ended: &Ended) -> Option<Outside> {
+        let (free, covered) = (&self.now.usual.free, &self.now.covered);
+        if ended.block.leverages(covered).iter().all(|leverage| *leverage <= 1.0) {
+            return None;
+        }
+        let n = free.len();
+        let shares = (0..n).map(|k| ended.scores.information[k] * covered[k * n + k]);
+        let mut shares: Vec<(usize, f64)> = shares.enumerate().collect();
+        shares.sort_by(|a, b| b.1.total_cmp(&a.1));
+        let named = shares.iter().enumerate().filter(|(place, (_, share))| *place == 0 || *share > 1.0);
+        Some(Outside { t: ended.t, parameters: named.map(|(_, (k, _))| free[*k].name.clone()).collect() })
     }
 
     pub(crate) fn estimates(&self, ended: &Ended) -> Estimates {

@@ -53,7 +53,7 @@ pub enum WatchError {
     )]
     Diverged,
     /// A saved state of another model.
-    #[error("the saved state belongs to another model: {what}. Delete it, or name another file")]
+    #[error("the saved state belongs to another model: {what}")]
     OtherModel {
         /// What differs.
         what: String,

@@ -17,6 +17,9 @@ pub enum Event {
     /// What changed has settled, and is usual from here on: the same change, known better. Where something else has changed on
     /// the way, it is told just before that.
     Settled(Change),
+    /// The machine does what it did not while it was learned what is usual: nothing is said of it, and it is time to learn anew,
+    /// from samples that have this ([`Watch::learn`](crate::Watch::learn)).
+    Outside(Outside),
     /// Samples were not as they should be.
     Irregular(Irregular),
     /// The clock jumped, or samples were missing for longer than a block: the state begins anew.
@@ -51,6 +54,8 @@ pub struct Learned {
     pub charts: usize,
     /// Parameters as learned.
     pub parameters: Vec<Parameter>,
+    /// Those of which the learned seconds tell less than was known beforehand: nothing that they do not excite is watched.
+    pub undetermined: Vec<String>,
 }
 
 /// Where the parameters are now.
@@ -141,9 +146,12 @@ pub struct Irregular {
     pub repeated: u64,
     /// Samples missing between two that came.
     pub missing: u64,
-    /// Measured values that are no number: not used.
+    /// Measured values that are no number, or none that can be computed with: not used.
     pub not_measured: u64,
-    /// Inputs that are no number: the value before held on.
+    /// Measured values that stand alone, far from what was predicted or from their neighbours: not used.
+    #[serde(default)]
+    pub outliers: u64,
+    /// Inputs that are no number, or none that can be computed with: the value before held on.
     pub input_held: u64,
     /// Times the simulation left every bound and the state began anew.
     pub diverged: u64,
@@ -154,6 +162,15 @@ impl Irregular {
     pub fn is_empty(&self) -> bool {
         *self == Irregular::default()
     }
+}
+
+/// What was not part of what was learned.
+#[derive(Debug, Clone, PartialEq, Serialize)]
+pub struct Outside {
+    /// Time of the last sample of the block, s.
+    pub t: f64,
+    /// Parameters of which the block says more than all that was learned, that of which it says most first.
+    pub parameters: Vec<String>,
 }
 
 /// A clock that jumped.

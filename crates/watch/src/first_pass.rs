@@ -38,7 +38,7 @@ struct Short {
 
 /// Runs the filter over the learned seconds.
 fn short_blocks(first: &First, options: &Options) -> Result<Short, WatchError> {
-    let First { machine, usual, start, samples } = first;
+    let First { machine, usual, start, samples, .. } = first;
     let mut tracker = Tracker::new(machine, (&start.0, &start.1), Effects::Everything)?;
     let effects = tracker.count(machine);
     let seconds = samples[samples.len() - 1].t - samples[0].t;
@@ -60,7 +60,7 @@ fn short_blocks(first: &First, options: &Options) -> Result<Short, WatchError> {
             (began, first) = (pair[1].t, k + 1);
             continue;
         }
-        if !tracker.advance(&by, (&pair[0], &pair[1]), &mut scratch, |c, i| block.push(c, &i)) {
+        if !tracker.advance(&by, (&pair[0], &pair[1]), &mut scratch, None, |c, i| block.push(c, &i)) {
             return Err(WatchError::Diverged);
         }
         count += 1.0;

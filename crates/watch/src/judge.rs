@@ -34,6 +34,12 @@ impl Watch {
             (wait, _) => (wait - 1, next),
         };
         events.push(Event::Estimates(self.estimates(ended)));
+        if self.now.settling.is_none()
+            && let Some(outside) = self.outside(ended)
+        {
+            events.push(Event::Outside(outside));
+            return;
+        }
         if self.is_far(ended.t) {
             return;
         }

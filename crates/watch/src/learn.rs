@@ -5,11 +5,12 @@ use std::sync::Arc;
 use greybox_calibrate::stochastic::{Filter, Fitted, RateNoise, Stochastic};
 use greybox_calibrate::{Data, Prior, Setup, free_parameters};
 use greybox_model::Model;
-use greybox_recording::Recording;
+use greybox_recording::{Channel, Recording, health};
 use greybox_simulate::Method;
 use serde::{Deserialize, Serialize};
 
 use crate::error::WatchError;
+use crate::event::Irregular;
 use crate::machine::Machine;
 use crate::options::{BLOCK_SAMPLES, BLOCKS, Options};
 use crate::sample::Sample;
@@ -159,10 +160,14 @@ pub(crate) struct First {
     /// First state and its standard deviations.
     pub(crate) start: (Vec<f64>, Vec<f64>),
     pub(crate) samples: Vec<Sample>,
+    /// What was not as it should be.
+    pub(crate) irregular: Irregular,
 }
 
 /// Fits the model with its own error and the sensors' noise to the first seconds.
 pub(crate) fn learn(model: &Model, recording: &Recording, options: &Options) -> Result<First, WatchError> {
+    let (recording, irregular) = without_outliers(model, recording);
+    let recording = &recording;
     let data = Arc::new(Data::new(model, std::slice::from_ref(recording))?);
     let longest = data.pieces.iter().map(|p| p.len).max().unwrap_or(0);
     let needed = BLOCKS.0 * BLOCK_SAMPLES;
@@ -192,7 +197,40 @@ pub(crate) fn learn(model: &Model, recording: &Recording, options: &Options) -> 
     let indices = setup.free.iter().map(|f| f.index).collect();
     let (system, steps) = (setup.system.clone(), usual.steps.method());
     let machine = Machine::new(model.clone(), system, steps, indices, &usual.place.values);
-    Ok(First { machine, usual, start: (x, deviations), samples: samples(&data, recording.time[0]) })
+    Ok(First {
+        machine,
+        usual,
+        start: (x, deviations),
+        samples: samples(&data, recording.time[0]),
+        irregular,
+    })
+}
+
+/// The recording without the measured values that stand out of their neighbours, which are not measured then, and what is not as
+/// it should be in it. The likelihood of the fit is that of normal innovations, which one such value among n moves without bound:
+/// the variance by its square over n. That rejection needs no model, so that what a model leaves is no outlier (a hard rejection by
+/// a robust scale: F. R. Hampel et al., *Robust Statistics*, 1986, §1.4). What inputs do is no fault of a measurement.
+fn without_outliers(model: &Model, recording: &Recording) -> (Recording, Irregular) {
+    let unmeasured = |name: &str| recording.channel(name).map_or(&[][..], |c: &Channel| &c.values[..]);
+    let missing = |name: &str| unmeasured(name).iter().filter(|v| v.is_nan()).count() as u64;
+    let mut irregular = Irregular {
+        not_measured: model.measurements.iter().map(|m| missing(&m.channel)).sum(),
+        input_held: model.inputs.iter().map(|i| missing(&i.channel)).sum(),
+        ..Irregular::default()
+    };
+    let is_input = |name: &str| model.inputs.iter().any(|i| i.column(|_| true) == name);
+    let mut channels = recording.channels.clone();
+    for m in model.measurements.iter().filter(|m| !is_input(&m.channel)) {
+        let Some(c) = recording.channel_index(&m.channel) else { continue };
+        for row in health::outliers(recording, c) {
+            channels[c].values[row] = f64::NAN;
+            irregular.outliers += 1;
+        }
+    }
+    let cleaned = (irregular.outliers > 0)
+        .then(|| Recording::from_columns(&recording.name, recording.time.clone(), channels).ok())
+        .flatten();
+    (cleaned.unwrap_or_else(|| recording.clone()), irregular)
 }
 
 /// Samples from one to the next that the fit takes: as long as enough are left, and many in a period of the fastest channel.

@@ -5,6 +5,7 @@ mod changes;
 mod error;
 mod event;
 mod first_pass;
+mod identity;
 mod judge;
 mod learn;
 mod machine;
@@ -17,7 +18,7 @@ mod tracker;
 mod watch;
 
 pub use error::WatchError;
-pub use event::{Change, Clock, Estimates, Event, Irregular, Learned, Parameter, Subject};
+pub use event::{Change, Clock, Estimates, Event, Irregular, Learned, Outside, Parameter, Subject};
 pub use options::Options;
 pub use saved::Saved;
 pub use watch::Watch;

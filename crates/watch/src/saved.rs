@@ -6,11 +6,12 @@ use serde::{Deserialize, Deserializer, Serialize};
 
 use crate::blocks::{Block, Scores};
 use crate::event::Irregular;
+use crate::identity::Identity;
 use crate::learn::{Place, Usual};
 use crate::machine::Machine;
 use crate::released::{Louder, Released};
 use crate::sample::Sample;
-use crate::tracker::{Effects, Tracker};
+use crate::tracker::{self, Effects, Tracker};
 
 /// The state of a watch as data: what [`Watch::restore`](crate::Watch::restore) goes on from.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
@@ -18,6 +19,8 @@ pub struct Saved {
     /// (It comes first, so that a state of another version is refused as such.)
     #[serde(deserialize_with = "this_version")]
     pub(crate) version: u32,
+    /// The model that it was learned with.
+    pub(crate) model: Identity,
     pub(crate) alarms_per_day: f64,
     pub(crate) memory: f64,
     /// Seconds of a block.
@@ -35,6 +38,10 @@ pub struct Saved {
     pub(crate) values: Vec<f64>,
     /// How far every effect may be from where it is.
     pub(crate) wide: Vec<f64>,
+    /// What the learned seconds tell of the parameters that may move: their covariance, row by row.
+    pub(crate) covered: Vec<f64>,
+    /// Per channel, what its last value was like.
+    pub(crate) gate: Vec<tracker::Before>,
     /// What is usual moves for a while after a change.
     pub(crate) released: Option<Released>,
     pub(crate) louder: Option<Louder>,
@@ -94,7 +101,7 @@ pub(crate) struct Known {
 }
 
 /// Version of [`Saved`].
-pub(crate) const VERSION: u32 = 3;
+pub(crate) const VERSION: u32 = 4;
 
 /// The version, where it is this one.
 fn this_version<'de, D: Deserializer<'de>>(deserializer: D) -> Result<u32, D::Error> {
@@ -163,6 +170,10 @@ impl Saved {
             && self.usual.noise.iter().all(|v| *v > 0.0)
             && self.wide.len() == effects
             && self.wide.iter().all(|v| v.is_finite() && *v > 0.0)
+            && self.covered.len() == np * np
+            && self.covered.iter().all(|v| v.is_finite())
+            && self.gate.len() == ny
+            && self.gate.iter().all(tracker::Before::is_consistent)
             && self.released.iter().all(|r| r.is_consistent(effects))
             && self.louder.is_none_or(|l| l.channel < ny)
             && self.rest.1.len() == nx

@@ -54,6 +54,62 @@ pub(crate) struct Scratch {
     noise: Vec<f64>,
     before: Vec<f64>,
     after: Vec<f64>,
+    errors: Vec<f64>,
+}
+
+/// Size from which on a value is far from what is expected, in standard deviations: the least size of an outlier of a recording too
+/// ([`greybox_recording::health::outliers`]).
+const FAR: f64 = 6.0;
+/// Samples whose innovations tell how large they are nearby, as many as on either side of an outlier of a recording.
+const NEARBY: f64 = 32.0;
+
+/// The last values of a channel, as a [`Gate`] saw them.
+#[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
+pub(crate) struct Before {
+    /// Innovation of the last value that was taken, in standard deviations.
+    innovation: f64,
+    /// Mean square of those of the last [`NEARBY`] values.
+    square: f64,
+    /// Whether the last value was not taken.
+    refused: bool,
+}
+
+impl Default for Before {
+    fn default() -> Before {
+        Before { innovation: 0.0, square: 1.0, refused: false }
+    }
+}
+
+impl Before {
+    pub(crate) fn is_consistent(&self) -> bool {
+        self.innovation.is_finite() && self.square.is_finite() && self.square >= 0.0
+    }
+}
+
+/// Keeps out measured values that stand alone: those whose innovation jumps from that of the value before by more than innovations
+/// nearby do. What a machine does moves innovations from sample to sample by little, by √2 standard deviations where nothing changes.
+/// Where the value after such a jump is far too, it is taken: a sensor's zero that moves costs one sample.
+pub(crate) struct Gate<'a> {
+    /// Per channel.
+    pub(crate) before: &'a mut [Before],
+    /// Per channel, whether this value stands alone.
+    pub(crate) alone: &'a mut [bool],
+}
+
+impl Gate<'_> {
+    /// Whether a channel's value with this innovation (in standard deviations) is taken.
+    fn takes(&mut self, channel: usize, innovation: f64) -> bool {
+        let before = &mut self.before[channel];
+        let most = FAR * (2.0 * before.square.max(1.0)).sqrt();
+        before.refused = !before.refused && (innovation - before.innovation).abs() > most;
+        self.alone[channel] = before.refused;
+        if !before.refused && innovation.is_finite() {
+            before.innovation = innovation;
+            // (One that is confirmed is no measure of those nearby yet.)
+            before.square += (innovation.abs().min(most).powi(2) - before.square) / NEARBY;
+        }
+        !before.refused
+    }
 }
 
 /// What one sample is predicted with.
@@ -116,6 +172,7 @@ impl Tracker {
         by: &Conditions<'_>,
         (from, to): (&Sample, &Sample),
         scratch: &mut Scratch,
+        gate: Option<Gate<'_>>,
         learn: impl FnMut(usize, Innovation<'_>),
     ) -> bool {
         // As many steps as samples should have been.
@@ -131,7 +188,7 @@ impl Tracker {
             }
             std::mem::swap(&mut scratch.before, &mut scratch.after);
         }
-        self.correct(by, to, scratch, learn);
+        self.correct(by, to, scratch, gate, learn);
         self.filter.state().iter().all(|v| v.is_finite())
     }
 
@@ -183,6 +240,7 @@ impl Tracker {
         by: &Conditions<'_>,
         to: &Sample,
         scratch: &mut Scratch,
+        mut gate: Option<Gate<'_>>,
         learn: impl FnMut(usize, Innovation<'_>),
     ) {
         let Scratch { step, rows, .. } = scratch;
@@ -199,9 +257,21 @@ impl Tracker {
                 row[system.nz + c] += 1.0;
             }
         }
+        let by_state = |c: usize| &step.outputs_by_state[c * nx..(c + 1) * nx];
+        let errors = &mut scratch.errors;
+        errors.clear();
+        errors.extend((0..ny).map(|c| {
+            let error = to.measured[c].map_or(f64::NAN, |y| y - step.outputs[c] - by.place.offsets[c]);
+            let innovation = |noise| error / self.filter.deviation_of(by_state(c), noise);
+            let taken = match &mut gate {
+                Some(gate) if error.is_finite() => gate.takes(c, innovation(by.usual.noise[c])),
+                _ => true,
+            };
+            if taken { error } else { f64::NAN }
+        }));
         let measured = (0..ny).map(|c| Measured {
-            error: to.measured[c].map_or(f64::NAN, |y| y - step.outputs[c] - by.place.offsets[c]),
-            by_state: &step.outputs_by_state[c * nx..(c + 1) * nx],
+            error: errors[c],
+            by_state: by_state(c),
             by_parameters: &rows[c * width..(c + 1) * width],
             noise: by.usual.noise[c],
         });
@@ -220,5 +290,34 @@ fn count(machine: &Machine, effects: Effects) -> usize {
     match effects {
         Effects::Parameters => parameters,
         Effects::Everything => parameters + machine.system.nz + machine.system.ny,
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    /// Which of a channel's innovations are taken.
+    fn taken(innovations: &[f64]) -> Vec<bool> {
+        let (mut before, mut alone) = ([Before::default()], [false]);
+        let mut gate = Gate { before: &mut before, alone: &mut alone };
+        innovations.iter().map(|v| gate.takes(0, *v)).collect()
+    }
+
+    #[test]
+    fn a_value_that_stands_alone_is_not_taken() {
+        // One value, and every other one.
+        assert_eq!(taken(&[0.5, 50.0, -1.0, 0.3]), [true, false, true, true]);
+        assert_eq!(taken(&[0.5, -1e99, 1.0, 1e99, 0.0]), [true, false, true, false, true]);
+        assert_eq!(taken(&[0.5, 1e99, 1e99, 0.0, 1.0, 1.0]), [true, false, true, false, true, true]);
+        // What grows is what the machine does, and what stays is what the sensor does now.
+        assert!(taken(&[0.0, 3.0, 9.0, 17.0, 24.0, 20.0, 12.0, 4.0]).iter().all(|t| *t));
+        assert_eq!(taken(&[0.0, 30.0, 29.0, 31.0, 0.0, 0.5]), [true, false, true, true, false, true]);
+        // Where all are large, so must one be that stands alone.
+        let loud: Vec<f64> = (0..200).map(|k| if k % 2 == 0 { 4.0 } else { -4.0 }).chain([25.0]).collect();
+        assert!(taken(&loud).iter().all(|t| *t));
+        // White innovations of a standard deviation that is half as large again.
+        assert!(taken(&[4.0, -4.0, 4.2, -3.9]).iter().all(|t| *t));
+        assert_eq!(taken(&[f64::NAN, 0.0]), [true, true]);
     }
 }

@@ -1,19 +1,20 @@
 //! The watch: two filters, one that keeps to what is usual and one that follows the machine, and the charts.
 
 use greybox_model::{Model, System};
-use greybox_recording::Recording;
+use greybox_recording::{Recording, SIZES};
 use greybox_recursive::{Chart, LeastSquares};
 
 use crate::blocks::{Block, Ended};
 use crate::error::WatchError;
-use crate::event::{Clock, Event, Irregular};
+use crate::event::{Clock, Event};
 use crate::first_pass::first_pass;
+use crate::identity::Identity;
 use crate::learn::{First, Place, learn};
 use crate::machine::Machine;
 use crate::options::Options;
 use crate::sample::Sample;
 use crate::saved::{Known, Saved, VERSION};
-use crate::tracker::{Conditions, Effects, Scratch, Tracker};
+use crate::tracker::{self, Conditions, Effects, Gate, Scratch, Tracker};
 
 /// The change that a chart is quickest for, in standard deviations of one block.
 const CHANGE: f64 = 1.0;
@@ -41,12 +42,15 @@ pub struct Watch {
     followed: Place,
     at: Vec<f64>,
     row: Vec<f64>,
+    /// Per channel, whether the value of a sample stands alone.
+    alone: Vec<bool>,
 }
 
 impl Watch {
     fn new(machine: Machine, now: Saved) -> Watch {
         let followed = now.usual.place.clone();
-        Watch { machine, now, scratch: Scratch::default(), followed, at: Vec::new(), row: Vec::new() }
+        let (at, row, alone) = (Vec::new(), Vec::new(), vec![false; machine.system.ny]);
+        Watch { machine, now, scratch: Scratch::default(), followed, at, row, alone }
     }
 
     /// Learns from the first seconds of a machine what is usual: parameters, noise, model error.
@@ -58,14 +62,19 @@ impl Watch {
         options.check()?;
         let first = learn(model, first, options)?;
         let pass = first_pass(&first, options)?;
-        let First { machine, usual, start, mut samples } = first;
+        let First { machine, usual, start, mut samples, irregular } = first;
         let adaptive = Tracker::new(&machine, (&start.0, &start.1), Effects::Parameters)?;
         let (mean, std): (Vec<f64>, Vec<f64>) =
             usual.free.iter().map(|f| (usual.place.values[f.index], f.std)).unzip();
         let charts = pass.tracker.count(&machine) + machine.system.ny;
+        let mut covered = LeastSquares::new(&mean, &std)?;
+        for (row, value) in pass.blocks.iter().flat_map(Block::all) {
+            covered.update(&row[..mean.len()], value);
+        }
         let between = charts as f64 * 86_400.0 / pass.block_seconds / options.alarms_per_day;
         let now = Saved {
             version: VERSION,
+            model: Identity::of(model),
             alarms_per_day: options.alarms_per_day,
             memory: options.memory,
             block_seconds: pass.block_seconds,
@@ -75,6 +84,8 @@ impl Watch {
             rest: pass.rest,
             inflation: pass.inflation,
             wide: pass.wide,
+            covered: covered.covariance(),
+            gate: vec![tracker::Before::default(); machine.system.ny],
             reference: pass.tracker,
             adaptive,
             released: None,
@@ -86,7 +97,7 @@ impl Watch {
             last: samples.pop().ok_or(WatchError::Diverged)?,
             earlier: within(samples, machine.reach),
             settling: None,
-            irregular: Irregular::default(),
+            irregular,
             wait: (0, 1),
         };
         let mut watch = Watch::new(machine, now);
@@ -129,6 +140,9 @@ impl Watch {
     /// [`WatchError::OtherModel`] where the state is another model's; [`WatchError::Setup`] where the model does not compile.
     pub fn restore(model: &Model, saved: Saved) -> Result<Watch, WatchError> {
         let other = |what: String| Err(WatchError::OtherModel { what });
+        if let Some(what) = saved.model.differs_from(model) {
+            return other(what);
+        }
         let system = System::compile(model).map_err(greybox_calibrate::SetupError::from)?;
         if saved.usual.place.values.len() != system.np || saved.usual.noise.len() != system.ny {
             return other("it has other parameters or channels".to_owned());
@@ -153,12 +167,13 @@ impl Watch {
         &self.now
     }
 
-    /// Takes the next sample: its time, inputs and measured values in SI and in the model's order, NaN for what is missing.
+    /// Takes the next sample: its time, inputs and measured values in SI and in the model's order, NaN for what is missing. A
+    /// value beyond [`SIZES`] is taken for one that is missing.
     pub fn push(&mut self, t: f64, inputs: &[f64], measured: &[f64]) -> Vec<Event> {
         let mut events = Vec::new();
         let (last, dt) = (self.now.last.t, self.now.usual.dt);
-        // (A time that is no number is none.)
-        if !t.is_finite() || t <= last && t > last - self.now.block_seconds {
+        // (A time that is no number, or none that can be computed with, is none.)
+        if !is_usable(t) || t <= last && t > last - self.now.block_seconds {
             let repeated = (t - last).abs() < 1e-6 * dt;
             let count =
                 if repeated { &mut self.now.irregular.repeated } else { &mut self.now.irregular.late };
@@ -168,13 +183,13 @@ impl Watch {
         let mut sample = Sample {
             t,
             inputs: inputs.to_vec(),
-            measured: measured.iter().map(|v| Some(*v).filter(|v| v.is_finite())).collect(),
+            measured: measured.iter().map(|v| Some(*v).filter(|v| is_usable(*v))).collect(),
         };
         sample.inputs.resize(self.machine.system.nu, f64::NAN);
         sample.measured.resize(self.machine.system.ny, None);
         self.now.irregular.not_measured += sample.measured.iter().filter(|v| v.is_none()).count() as u64;
         for (new, old) in sample.inputs.iter_mut().zip(&self.now.last.inputs) {
-            if !new.is_finite() {
+            if !is_usable(*new) {
                 *new = *old;
                 self.now.irregular.input_held += 1;
             }
@@ -204,12 +219,13 @@ impl Watch {
         }
         now.block.clear();
         now.earlier.clear();
+        now.gate.fill(tracker::Before::default());
         (now.began, now.last) = (sample.t, sample);
     }
 
     /// Takes a sample; a block that has ended.
-    fn advance(&mut self, sample: Sample) -> Option<Ended> {
-        let kept = self.keep(&sample);
+    fn advance(&mut self, mut sample: Sample) -> Option<Ended> {
+        let kept = self.keep(&mut sample);
         let kept_up = self.follow(&sample);
         let now = &mut self.now;
         if !kept || !kept_up {
@@ -240,8 +256,9 @@ impl Watch {
         Some(self.end_block(t))
     }
 
-    /// The usual model takes a sample, and while a change settles, what was usual before. `false` where it leaves every bound.
-    fn keep(&mut self, sample: &Sample) -> bool {
+    /// The usual model takes a sample, and while a change settles, what was usual before. `false` where it leaves every bound. A
+    /// measured value that stands alone is not used.
+    fn keep(&mut self, sample: &mut Sample) -> bool {
         let (machine, now, scratch) = (&self.machine, &mut self.now, &mut self.scratch);
         let by = Conditions {
             machine,
@@ -250,12 +267,21 @@ impl Watch {
             memory: now.memory,
             earlier: &now.earlier,
         };
-        let (samples, block) = ((&now.last, sample), &mut now.block);
-        let kept = now.reference.advance(&by, samples, scratch, |c, i| block.push(c, &i));
+        let block = &mut now.block;
+        let alone = &mut self.alone;
+        alone.fill(false);
+        let gate = Some(Gate { before: &mut now.gate, alone });
+        let samples = (&now.last, &*sample);
+        let kept = now.reference.advance(&by, samples, scratch, gate, |c, i| block.push(c, &i));
+        for (value, _) in sample.measured.iter_mut().zip(&self.alone).filter(|(_, alone)| **alone) {
+            *value = None;
+            now.irregular.outliers += 1;
+        }
+        let samples = (&now.last, &*sample);
         if let Some(before) = now.settling.as_mut().and_then(|s| s.before.as_mut()) {
             let (tracker, block) = (&mut before.tracker, &mut before.block);
             let by = Conditions { place: &before.place, ..by };
-            if !tracker.advance(&by, samples, scratch, |c, i| block.push(c, &i)) {
+            if !tracker.advance(&by, samples, scratch, None, |c, i| block.push(c, &i)) {
                 tracker.restart((&now.rest.0, &now.rest.1));
                 block.clear();
             }
@@ -281,7 +307,7 @@ impl Watch {
         let weight = 1.0 / now.inflation.sqrt();
         let row = &mut self.row;
         let by = Conditions { machine, usual: &now.usual, place, memory: now.memory, earlier: &now.earlier };
-        let kept_up = now.adaptive.advance(&by, (&now.last, sample), scratch, |_, i| {
+        let kept_up = now.adaptive.advance(&by, (&now.last, sample), scratch, None, |_, i| {
             row.clear();
             row.extend(i.row.iter().map(|psi| weight * psi));
             let here: f64 = row.iter().zip(&*at).map(|(r, a)| r * a).sum();
@@ -338,6 +364,11 @@ impl Watch {
         }
         Ended { t, scores, deviates, scatter, block }
     }
+}
+
+/// Whether a value can be computed with: a number whose square is one too, as the values of a recording ([`SIZES`]).
+fn is_usable(value: f64) -> bool {
+    value.abs() <= *SIZES.end()
 }
 
 /// Samples that are kept beyond those in reach, so that they are cut but now and then.

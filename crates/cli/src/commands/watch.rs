@@ -106,7 +106,7 @@ pub(crate) fn run(arguments: &Arguments, format: OutputFormat) -> Result<Answer,
     };
     let state = arguments.state.as_deref();
     let saved = state.map(read).transpose()?.flatten();
-    let mut session = Session::new(model, &arguments.names.map, options, saved)?;
+    let mut session = Session::new(model, &arguments.names.map, options, saved.zip(state))?;
     if let Some(columns) = &arguments.columns {
         session = session.with_columns(columns)?;
     }

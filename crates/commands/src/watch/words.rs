@@ -2,6 +2,7 @@
 
 use std::fmt::Write as _;
 
+use greybox_recording::listed;
 use greybox_report::contract::Interval;
 use greybox_report::format;
 use greybox_watch::{Change, Event, Irregular, Parameter, Subject};
@@ -68,7 +69,9 @@ fn in_words(event: &Event, clock: Clock) -> Option<String> {
                 format::number(l.rate)
             );
             l.parameters.iter().for_each(|p| {
-                let _ = writeln!(text, "    {}", parameter(p));
+                let not_told =
+                    if l.undetermined.contains(&p.name) { ", not told by these seconds" } else { "" };
+                let _ = writeln!(text, "    {}{not_told}", parameter(p));
             });
             let _ = writeln!(
                 text,
@@ -90,6 +93,14 @@ fn in_words(event: &Event, clock: Clock) -> Option<String> {
                 at(change.t),
                 extent(change),
                 others(change)
+            );
+        }
+        Event::Outside(outside) => {
+            let _ = writeln!(
+                text,
+                "{}: outside what was learned: these samples say more of {} than all that was learned; learning anew",
+                at(outside.t),
+                listed(outside.parameters.clone())
             );
         }
         Event::Irregular(irregular) => {
@@ -151,6 +162,7 @@ fn irregularities(i: &Irregular) -> String {
         (i.repeated, "repeated"),
         (i.missing, "missing"),
         (i.not_measured, "values not measured"),
+        (i.outliers, "outliers not used"),
         (i.input_held, "inputs held"),
         (i.diverged, "times the simulation diverged"),
     ];
