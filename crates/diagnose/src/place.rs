@@ -492,26 +492,13 @@ impl Motion {
         let moves =
             reference.variables().iter().any(|(name, _)| &**name == "t" || model.input(name).is_some());
         let still = |d: Option<Expr>| d.filter(|_| !moves);
-        // (A first-order velocity stands at level 0, and is the rate of its motion.)
-        let is_rate = self.position.is_none();
-        match (level, is_rate) {
-            (0, false) => Some(Motion {
-                position: beside(self.position),
-                rate: still(self.rate),
-                acceleration: still(self.acceleration),
-                ..self
-            }),
-            (0, true) => {
-                Some(Motion { rate: beside(self.rate), acceleration: still(self.acceleration), ..self })
-            }
-            // Where a second-order motion is relative to a speed, its position is not known.
-            _ => Some(Motion {
-                position: None,
-                rate: beside(self.rate),
-                acceleration: still(self.acceleration),
-                ..self
-            }),
-        }
+        let (position, rate) = match (level, self.position) {
+            (0, Some(position)) => (beside(Some(position)), still(self.rate)),
+            // Relative to a speed the position is not known. (A first-order velocity, at level 0, is the rate of its motion.)
+            _ => (None, beside(self.rate)),
+        };
+        let acceleration = still(self.acceleration);
+        Some(Motion { weights: self.weights, coefficients: self.coefficients, position, rate, acceleration })
     }
 }
 
